@@ -29,10 +29,11 @@ if TYPE_CHECKING:
 __all__ = ["AolinkError", "Rig", "estimate", "exposures", "load_rig", "read", "simulate", "smooth"]
 
 
-if not TYPE_CHECKING:  # the type checker would believe in any name
+if not TYPE_CHECKING:  # the type checker would accept any name
 
     def __getattr__(name: str) -> Any:
-        """Load what needs SciPy, and look up the version, at first use: a command handles signals before that."""
+        """Load names that need SciPy, and the version, at their first use, so that a command handles signals before
+        that."""
         if name in ("Rig", "load_rig"):
             import aolink.rig
 
@@ -45,22 +46,22 @@ if not TYPE_CHECKING:  # the type checker would believe in any name
 
 
 def read(path: str | Path, side: Sequence[str | Path] = ()) -> Recording:
-    """Open a recording: a series of exposures, read when they are asked for.
+    """Open a recording: a series of exposures, read when they are used.
 
     ``len(recording)``, ``recording[7]``, ``recording[-10:]`` and a loop give exposures; ``to_pandas()``,
-    ``to_xarray()`` and ``plot()`` what a notebook needs of them and of the estimates in the file.
+    ``to_xarray()`` and ``plot()`` are for notebooks, and include the estimates in the file.
 
     Parameters
     ----------
     path:
         A file, or a URL that fsspec knows (``pip install 'aolink[remote]'``).
     side:
-        Side files of it, whose estimates stand in the place of its own.
+        Side files of the recording, whose estimates replace its own.
 
     Raises
     ------
     RecordingError
-        It cannot be read, or is not a recording of aolink; a side file is not of this recording.
+        The file cannot be read, or is not a recording of aolink; or a side file is not of this recording.
     """
     from aolink.recording.reader import Recording
 
@@ -105,14 +106,14 @@ def exposures(
     rig:
         A rig, a rig file, or the name of one that comes with aolink.
     inputs:
-        What the mirror held in each fast step from step 0 on, (steps, n_inputs); None: its parked input.
+        Inputs that the mirror held in each fast step from step 0 on, (steps, n_inputs); None: its parked input.
     start_steps:
         Fast step at which each exposure starts; None: each begins a frame period after the one before.
 
     Raises
     ------
     ImportingError
-        They do not fit to the rig or to each other; the message says what was expected.
+        The arrays do not fit the rig or each other; the message says what was expected.
     RigError
         The rig file cannot be read or cannot work.
     """
@@ -128,7 +129,7 @@ def estimate(exposures: Exposures | Series | str | Path, estimator: str) -> list
     Parameters
     ----------
     exposures:
-        What `simulate` gave, or a recording, a slice of one, or its path.
+        The result of `simulate`, or a recording, a slice of one, or its path.
     estimator:
         One of `aolink.estimation.ESTIMATOR_NAMES`.
 
@@ -150,7 +151,7 @@ def estimate(exposures: Exposures | Series | str | Path, estimator: str) -> list
 def smooth(
     exposures: Exposures | Series | str | Path, estimates: list[Estimate], lag: int | None = None
 ) -> list[Estimate]:
-    """Estimates of `estimate`, each corrected by later exposures. Offline only.
+    """Estimates of `estimate`, each corrected by later exposures. It works offline only.
 
     It is the Rauch-Tung-Striebel smoother, or backward simulation for estimators that carry a Gaussian mixture.
 

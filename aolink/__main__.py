@@ -1,4 +1,4 @@
-"""The command ``aolink``: signals are heard before anything else is loaded, which takes a second."""
+"""The command ``aolink``: signals are handled before anything else is loaded, which takes a second."""
 
 from aolink.signals import ending_the_command
 

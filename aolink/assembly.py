@@ -1,9 +1,9 @@
-"""Frames, commands and the mirror's reports become exposures.
+"""The assembly of exposures from frames, commands and the mirror's reports.
 
 The live session and the reader of recordings feed the same `Assembler` with the same messages in the
-same order, so both get the same exposures. It has no clock and needs no time-out. A device sends in
-order, so what is missing shows as soon as something later has come; and where a report is asked for again,
-the session says so with a message that is recorded, and says with another one that it has given up.
+same order, so both get the same exposures. It has no clock and needs no time-out. A device sends in order, so a missing
+message shows as soon as a later one has come. Where a report is requested again, the session records a message that
+says so, and another one when it gives up.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class Frame:
     frame_id: int
     first_step: int
     last_step: int
-    """Inclusive."""
+    """Last fast step of the exposure, inclusive."""
     pixels: NDArray[np.uint16]
     """Counts, zero where nothing arrived, (rows, columns)."""
     mask: NDArray[np.bool_]
@@ -47,18 +47,18 @@ class Frame:
     exposure_offset_ns: int = 0
     """From the beginning of the first fast step to the start of the exposure; less than a fast step."""
     plane: int = 0
-    """Which of the camera's pictures of the exposure this is: 0 the spots, 1 the scene."""
+    """Number of the camera's picture of the exposure: 0 for the spots, 1 for the scene."""
     slopes: NDArray[np.float64] | None = None
-    """As `Exposure.slopes`."""
+    """Slopes of other software, as in `Exposure.slopes`."""
 
 
 class FrameReassembly:
-    """Chunks of frames of ``shape`` (rows, columns) of one plane become frames. Lost chunks leave masked pixels."""
+    """Assembles frames of ``shape`` (rows, columns) of one plane from their chunks. Lost chunks leave masked pixels."""
 
     def __init__(self, shape: tuple[int, int], fast_step_ns: int) -> None:
         self._shape, self._fast_step_ns = shape, fast_step_ns
         self._first: pb.FrameChunk | None = None
-        """First chunk of the frame that is in progress; it stands for what all of its chunks say."""
+        """First chunk of the frame that is in progress; its fields are those of all of the frame's chunks."""
         self._data = np.zeros(0, np.uint8)
         self._arrived = np.zeros(0, bool)
         self._largest = 0
@@ -66,7 +66,7 @@ class FrameReassembly:
         self._first_byte_ns = self._last_byte_ns = 0
         self._last_id: int | None = None
         self.refused = 0
-        """Chunks that made no sense: beyond their frame, of a frame that is over, of another size."""
+        """Number of invalid chunks: beyond their frame, of a frame that is over, of another size."""
 
     def add(self, chunk: pb.FrameChunk, receive_ns: int) -> list[Frame]:
         """Take a chunk; gives the frames that are over with it, at most two."""
@@ -80,7 +80,7 @@ class FrameReassembly:
         if self._first is None:
             self._first, self._first_byte_ns, self._largest = chunk, receive_ns, 0
             self._data, self._arrived = np.zeros(chunk.total, np.uint8), np.zeros(chunk.total, bool)
-        # Each goes to its place at once: however many come, a frame takes no more memory than it has bytes.
+        # Each chunk is copied to its place at once: however many come, a frame takes no more memory than its size.
         end = chunk.offset + len(chunk.data)
         self._data[chunk.offset : end] = np.frombuffer(chunk.data, np.uint8)
         self._arrived[chunk.offset : end] = True
@@ -127,9 +127,8 @@ class FrameReassembly:
 
 
 class PlanesReassembly:
-    """Chunks of all the pictures of an exposure become frames, each plane's with losses of its own.
-
-    A camera sends one plane after the other, so a chunk of one ends what has come of the other.
+    """Assembles the frames of all the pictures of an exposure from their chunks; each plane counts its own losses. A
+    camera sends one plane after the other, so a chunk of one plane ends the frame of the other.
 
     Parameters
     ----------
@@ -143,7 +142,7 @@ class PlanesReassembly:
 
     @property
     def refused(self) -> int:
-        """Chunks that made no sense, including those of planes that the camera does not have."""
+        """Number of invalid chunks, including those of planes that the camera does not have."""
         return self._unknown + sum(plane.refused for plane in self._planes)
 
     def add(self, chunk: pb.FrameChunk, receive_ns: int) -> list[Frame]:
@@ -161,7 +160,7 @@ class PlanesReassembly:
 
 
 class TruthReassembly:
-    """Chunks of truths become truths; one with a missing chunk is dropped."""
+    """Assembles truths from their chunks; a truth with a missing chunk is dropped."""
 
     def __init__(self) -> None:
         self._frame_id = 0
@@ -191,7 +190,7 @@ class InputHistory:
         self._applied: _Blocks = []
         self._commanded: _Blocks = []
         self._awaited: list[tuple[int, int]] = []
-        """First steps and ends of runs of steps whose reports have been asked for again and have not come yet."""
+        """First steps and ends of runs of steps whose reports have been requested again and have not come yet."""
         self._last = mirror.park
         self._reported_until = 0
         """First step that no report covers yet."""
@@ -200,7 +199,8 @@ class InputHistory:
 
     def add_applied(self, message: pb.Applied | Run) -> None:
         first, end = message.first_step, message.first_step + message.n_steps
-        # A mirror reports steps that it was sent: believing a report of steps far beyond them would make all else late.
+        # A mirror reports steps that it was sent: accepting a report of steps far beyond them would make all later ones
+        # late.
         if self._known_until is not None and end > self._known_until + _MOST_LEAD_STEPS:
             return
         source = message.source if isinstance(message, pb.Applied) else pb.Applied.COMMAND
@@ -228,13 +228,13 @@ class InputHistory:
         self._known_until = end if self._known_until is None else max(self._known_until, end)
 
     def _add(self, blocks: _Blocks, message: pb.Applied | pb.CommandBlock | Run) -> bool:
-        """Take the inputs of a run of steps; False where there are not as many as it says."""
+        """Take the inputs of a run of steps; False where their number is not the stated one."""
         n_steps, u = message.n_steps, message.u
         inputs = np.frombuffer(u, _DOUBLE) if isinstance(u, bytes) else np.array(u, dtype=np.float64)
         if not n_steps or inputs.size != n_steps * self._n_inputs:
             return False
         if blocks and blocks[-1][0] == message.first_step and len(blocks[-1][1]) == n_steps:
-            del blocks[-1]  # the same steps again: the last word counts
+            del blocks[-1]  # the same steps again: the last message counts
         blocks.append((message.first_step, inputs.reshape(n_steps, self._n_inputs)))
         # Where no frame comes to use them, inputs are not kept for longer than a frame would look back.
         oldest = message.first_step - _MOST_LEAD_STEPS
@@ -250,8 +250,8 @@ class InputHistory:
     def take(self, first: int, end: int) -> tuple[NDArray[np.float64], int]:
         """Inputs of steps first .. end - 1 and how many are assumed; forgets everything before ``end``.
 
-        The last word on a step counts. A step without a report is taken to hold what was commanded, as the mirror's
-        converter puts it out; one that nothing is known of holds the input of the step before.
+        The last message about a step counts. A step without a report is assumed to hold the commanded input, rounded by
+        the mirror's converter; a step without a command either is assumed to hold the input of the step before.
         """
         n = max(0, end - first)
         if n and self._reports_exactly(first, n):
@@ -276,7 +276,7 @@ class InputHistory:
         return rows, n - int(np.count_nonzero(reported))
 
     def _reports_exactly(self, first: int, n_steps: int) -> bool:
-        """Whether one report is of these steps and no other report is of any of them: no command matters then."""
+        """Whether one report covers these steps and no other report covers any of them, so that no command matters."""
         if not self._applied:
             return False
         start, u = self._applied[0]
@@ -290,14 +290,14 @@ def _after(end: int, blocks: _Blocks) -> _Blocks:
 
 
 _MOST_LEAD_STEPS = 100_000
-"""A longer gap between exposures is not followed input by input; the inputs that are missing show it."""
+"""In a longer gap between exposures the inputs are not kept; their number shows that they are missing."""
 
 _MOST_BLOCKS = 100_000
-"""Runs of steps that wait for their frame; more than one for each step is not to be expected."""
+"""The most runs of steps that wait for their frame: no more than one is expected for each step."""
 
 
 class Assembler:
-    """Frames wait here until the inputs of their steps are known, and leave as exposures, in order."""
+    """Makes exposures: frames wait here until the inputs of their steps are known, and leave as exposures, in order."""
 
     def __init__(self, rig: Rig) -> None:
         self._history = InputHistory(rig.mirror)
@@ -322,7 +322,7 @@ class Assembler:
         return self._ready()
 
     def flush(self) -> list[Exposure]:
-        """The frames that still wait, with the commands for the reports that never came."""
+        """Give the frames that still wait, with commands in place of the reports that never came."""
         exposures = [self._expose(frame) for frame in self._frames]
         self._frames.clear()
         return exposures

@@ -1,4 +1,4 @@
-"""One recording estimated by one call, for batches on whatever engine: see `aolink/jobs/README.md`.
+"""The function that estimates one recording in one call, for batches on any engine: see `aolink/jobs/README.md`.
 
 >>> from aolink.batch import Settings
 >>> Settings(estimator="moments").estimator

@@ -23,7 +23,7 @@ def estimator_colour(name: str) -> Colour:
 
 
 def by_rank(names: list[str]) -> list[str]:
-    """Estimators from the plainest to the one to look at first; those that are not installed here come last."""
+    """Estimators in the order of their ranks; those that are not installed here come last."""
 
     def rank(name: str) -> float:
         try:

@@ -1,4 +1,4 @@
-"""The errors that aolink raises on purpose, one class a kind.
+"""The errors that aolink raises on purpose, with one class for each kind.
 
 Every message says what was found, what was expected and what to do; the command line prints it as
 one line and exits with the class's ``exit_code``.
@@ -42,41 +42,41 @@ class EstimatorError(AolinkError):
 
 
 class ViewerError(AolinkError):
-    """The viewer, or a picture of it, cannot be had on this machine."""
+    """A viewer, or a picture of it, that is not available on this machine."""
 
     exit_code = 7
 
 
 class RendererError(ViewerError):
-    """The machine has no graphics driver that the viewer can draw with: the message names the packages."""
+    """A machine without a graphics driver that the viewer can draw with; the message names the packages."""
 
 
 class CalibrationError(AolinkError):
-    """Frames that are not what a calibration needs."""
+    """Frames that a calibration cannot use."""
 
     exit_code = 8
 
 
 class FrameError(AolinkError):
-    """A frame that does not show what it should: no spots, no grid of them, not a picture."""
+    """A frame that cannot be measured: it has no spots, no grid of them, or is not a picture."""
 
     exit_code = 9
 
 
 class RestorationError(AolinkError):
-    """A picture that cannot be restored: not with this point spread function, or not by this method."""
+    """A picture that cannot be restored with this point spread function, or by this method."""
 
     exit_code = 10
 
 
 class ImportingError(AolinkError):
-    """A film or a telemetry file that cannot be read, or that is not what the rig file describes."""
+    """A film or a telemetry file that cannot be read, or that does not fit the rig file."""
 
     exit_code = 11
 
 
 class ExportError(AolinkError):
-    """Exposures that cannot be given to another program in the form asked for."""
+    """Exposures that cannot be exported in the requested form."""
 
     exit_code = 12
 
@@ -88,6 +88,6 @@ class ControlError(AolinkError):
 
 
 class IdentificationError(AolinkError):
-    """A model that cannot be identified: not from this recording, or not of this kind."""
+    """A model that cannot be identified from this recording, or with this kind of process."""
 
     exit_code = 14

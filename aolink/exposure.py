@@ -1,8 +1,8 @@
-"""`Exposure`: everything that is known about one camera integration, as plain data.
+"""The class `Exposure`: all data of one camera integration.
 
-It is the hinge of aolink. The live session and the reader of recordings both make exposures (through
-`aolink.assembly`), the in-memory simulator makes them directly, and everything after them cannot
-tell which.
+All other parts of aolink meet here. The live session and the reader of recordings both make exposures (through
+`aolink.assembly`), the in-memory simulator makes them directly, and the code that uses them cannot distinguish their
+origin.
 """
 
 from __future__ import annotations
@@ -20,9 +20,8 @@ from aolink.rig import Rig
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Truth:
-    """What really happened in one exposure, as a simulated rig or the single frames of a film tell it.
-
-    No estimator reads it. States that nobody knows are NaN.
+    """The true states and path of one exposure, from a simulated rig or the single frames of a film. No estimator reads
+    it. Unknown states are NaN.
     """
 
     start_state: NDArray[np.float64]
@@ -32,12 +31,13 @@ class Truth:
     path: NDArray[np.float64]
     """Output at each fast step of the exposure, slope units, (n_outputs, n_steps)."""
     path_sd: float = 0.0
-    """Standard deviation of an error in ``path``, slope units: zero of a simulated rig, more where it was measured."""
+    """Standard deviation of an error in ``path``, slope units: zero for a simulated rig, larger where the path was
+    measured."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Picture:
-    """What the picture sensor saw in one exposure."""
+    """The picture of the picture sensor in one exposure."""
 
     pixels: NDArray[np.uint16]
     """Counts, (rows, columns)."""
@@ -47,7 +47,7 @@ class Picture:
 
 @plain_data
 class Exposure:
-    """One camera integration. Its arrays are not to be written to: those of a recording cannot be."""
+    """One camera integration. Its arrays must not be changed; those of a recording cannot be."""
 
     frame_id: int
     """The camera's own count of its frames; a gap is a lost frame."""
@@ -64,20 +64,18 @@ class Exposure:
     lead_inputs: NDArray[np.float64]
     """Inputs from the end of the exposure before this one to its start, (k, n_inputs).
 
-    Empty where exposures follow each other without a gap; a lost frame or dead time makes it longer. Of the first one
-    they go back to the mirror's first command, before which it was at rest.
+    Empty where exposures follow each other without a gap; a lost frame or dead time makes it longer. Those of the first
+    exposure go back to the mirror's first command, before which it was at rest.
     """
     start_offset: float = 0.0
-    """f, how far into its first fast step the exposure starts, in fast steps, 0 <= f < 1.
-
-    It ends equally far into the step after its last: it covers 1 - f of its first step and f of the one after its
-    last. States and path are still those of whole fast steps: the start state at ``first_step``, the end state
-    ``n_steps`` later.
+    """The part f of its first fast step that passes before the exposure starts, 0 <= f < 1. It ends equally far into
+    the step after its last: it covers 1 - f of its first step and f of the one after its last. States and path are
+    still those of whole fast steps: the start state at ``first_step``, the end state ``n_steps`` later.
     """
     inputs_assumed: int = 0
     """Number of steps of ``inputs`` and ``lead_inputs`` for which the mirror's report is missing.
 
-    They hold what was commanded, rounded as the mirror's converter would.
+    They hold the commanded inputs, rounded as the mirror's converter does.
     """
     chunks_lost: int = 0
     """Chunks of the frame that never arrived; their pixels are masked."""
@@ -88,14 +86,14 @@ class Exposure:
     host_start_ns: int = 0
     """The same start on the host's clock, as estimated when the frame came, ns."""
     host_receive_ns: int = 0
-    """When the host had the last chunk, host clock, ns."""
+    """Time at which the host had the last chunk, on the host's clock, ns."""
     clock_sigma_ns: float = float("nan")
     """Standard deviation of ``host_start_ns`` by the clock regression, ns; NaN where there is none."""
     alignment_sigma_ns: float = 0.0
     """Standard deviation of the exposure's start relative to the mirror's fast steps, ns.
 
-    Zero where the camera counts the steps together with its mirror. Of two clocks it is the error of their comparison,
-    which neighbouring exposures have in common: it does not average out.
+    Zero where the camera counts the steps together with its mirror. With two clocks it is the error of their
+    comparison, which neighbouring exposures have in common: it does not average out.
     """
     slopes: NDArray[np.float64] | None = None
     """Slopes that other software measured, slope units, (all outputs of all axes,), NaN where it measured none.
@@ -106,7 +104,7 @@ class Exposure:
     """The picture of the same exposure, where the rig has a picture sensor. It comes after the spot's frame, so
     that an exposure that is estimated live does not have it yet."""
     truth: Truth | None = None
-    """What really happened, where it is known."""
+    """The true states and path, where they are known."""
 
     @property
     def complete(self) -> bool:
@@ -135,7 +133,8 @@ class Exposures(Sequence[Exposure]):
 def step_shares(n_steps: int, offset: float) -> NDArray[np.float64]:
     """Share of an exposure in each of its fast steps, (n_steps,), and in the one after them, (n_steps + 1,), if f > 0.
 
-    ``offset`` is `Exposure.start_offset`, f: the first step loses as much as the one after the last gains, f / n_steps.
+    ``offset`` is `Exposure.start_offset`, f: the first step loses the share f / n_steps, and the one after the last
+    gains it.
     """
     shares = np.full(n_steps, 1 / n_steps)
     if not offset:

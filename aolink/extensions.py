@@ -1,4 +1,5 @@
-"""What other packages add through entry points: loaded when it is used, so that a broken one harms nobody else."""
+"""Extensions that other packages add through entry points. Each is loaded when it is used, so that a broken one does
+not affect the others."""
 
 from __future__ import annotations
 
@@ -26,28 +27,29 @@ def installed(group: str) -> dict[str, EntryPoint]:
 
 
 def loaded(point: EntryPoint, kind: str, error: type[AolinkError]) -> Any:
-    """What an entry point names. Raises ``error``, which says whose ``kind`` of thing it is, where it cannot be had."""
+    """The object that an entry point names. Raises ``error``, which names its package and its ``kind``, where it cannot
+    be loaded."""
     try:
         return point.load()
-    except Exception as why:  # whatever another package does wrong
+    except Exception as why:  # any error of another package
         raise error(f"{described(point, kind)} cannot be loaded: {why!r}") from why
 
 
 def described(point: EntryPoint, kind: str) -> str:
-    """An entry point as an error names it."""
+    """The description of an entry point in an error."""
     package = f" of {point.dist.name}" if point.dist else ""
     return f"the {kind} {point.name}{package} ({point.value})"
 
 
 def names_with(ours: Mapping[str, Any], group: str) -> tuple[str, ...]:
-    """Names of the rows of a registry, aolink's own and those of other packages, of which nothing is loaded for it."""
+    """Names of the rows of a registry, aolink's own and those of other packages, which are not loaded for this."""
     return (*ours, *(name for name in installed(group) if name not in ours))
 
 
 def row_named(name: str, ours: Mapping[str, Row], group: str, kind: str, error: type[AolinkError]) -> Row:
     """The row of a registry that has a name; aolink's own comes first.
 
-    Raises ``error``: there is none, or the installed package that has it is broken.
+    Raises ``error`` if there is none, or if the installed package that has it is broken.
     """
     if name in ours:
         return ours[name]
@@ -61,7 +63,8 @@ def row_named(name: str, ours: Mapping[str, Row], group: str, kind: str, error: 
 
 @contextmanager
 def needs_extra(extra: str, error: type[AolinkError]) -> Iterator[None]:
-    """Around the import of an optional package: raises ``error``, which says what to install, where it is missing."""
+    """A context for the import of an optional package: raises ``error``, which says what to install, where the package
+    is missing."""
     try:
         yield
     except ImportError as missing:

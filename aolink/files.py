@@ -8,8 +8,8 @@ A target is a plain file or a name that is still free. Folders, symbolic links, 
 refused before they are opened, so nothing is written through a link and nothing waits for a pipe.
 
 Whoever writes holds a lock (``flock``) on the unfinished file. A second command that wants the same target sees
-the lock and is refused. The operating system drops the lock when a process ends, however it ends, so what a killed
-command left is known to be dead, and the next command that writes the same target removes it. On a file system
+the lock and is refused. The operating system drops the lock when a process ends, however it ends, so a file that a
+killed command left is known to be dead, and the next command that writes the same target removes it. On a file system
 without such locks two commands still cannot damage the target: each puts a whole file there, or is refused.
 """
 
@@ -30,15 +30,15 @@ from pathlib import Path
 from aolink.errors import AolinkError
 
 _ATTEMPTS = 6
-"""Two commands that begin in the same instant see each other, and both step back: how often they try again."""
+"""Number of attempts: two commands that begin in the same instant see each other's lock, and both try again."""
 _STEP_BACK_S = 0.05
-"""The longest of the random waits in between."""
+"""The longest of the random waits between attempts, s."""
 _LONGEST_NAME = 200
-"""Bytes of the target's name that the unfinished file has in its own; file systems allow 255 for the whole."""
+"""The most bytes of the target's name in that of the unfinished file; file systems allow 255 for the whole name."""
 _UNFINISHED = re.compile(r"[0-9a-f]{16}\.partial")
-"""What their names end with."""
+"""The ending of the names of unfinished files."""
 _NO_LINKS = {errno.EPERM, errno.EOPNOTSUPP, errno.ENOTSUP, errno.ENOSYS, errno.EMLINK}
-"""What a file system says that has no hard links."""
+"""Errors of a file system that has no hard links."""
 _KINDS = {
     stat.S_IFDIR: "a folder: give the name of a file in it",
     stat.S_IFIFO: "a named pipe, and only plain files are written: give another name",
@@ -65,9 +65,9 @@ def check_target(
     sources:
         Files that the new one is made from, which it may never replace.
     suffix:
-        How the name has to end, as ``.png``; empty for any.
+        The required ending of the name, such as ``.png``; empty for any.
     error:
-        The class of what is raised.
+        The class of the error that is raised.
     """
     if suffix and target.suffix.lower() != suffix:
         raise error(f"cannot write {target}: what is written is a {suffix} file; give a name that ends with {suffix}")
@@ -175,12 +175,12 @@ def is_being_written(target: Path) -> bool:
 
 
 def remove_unfinished(target: Path) -> None:
-    """Remove what commands that were killed have left of ``target``."""
+    """Remove the unfinished files of ``target`` that killed commands have left."""
     _others_write(target)
 
 
 def why_not(problem: OSError) -> str:
-    """Why a file cannot be written, in words."""
+    """The reason why a file cannot be written, in words."""
     if problem.errno == errno.EFBIG:
         return "it would be larger than the disk or a limit (ulimit -f) lets a file be"
     full = problem.errno in (errno.ENOSPC, errno.EDQUOT)
@@ -197,7 +197,7 @@ def _in_use(target: Path) -> str:
 
 @contextmanager
 def _unfinished(target: Path, error: type[AolinkError]) -> Iterator[tuple[Path, int]]:
-    """A file of our own beside ``target``, open and locked, which is gone after the block unless it was renamed."""
+    """A temporary file beside ``target``, open and locked, which is removed after the block unless it was renamed."""
     for attempt in range(_ATTEMPTS):
         if attempt:
             time.sleep(random.uniform(0, _STEP_BACK_S))
@@ -223,7 +223,7 @@ def _unfinished(target: Path, error: type[AolinkError]) -> Iterator[tuple[Path, 
 
 
 def _prefix_of(target: Path) -> str:
-    """What the names of unfinished files of a target begin with; 16 random hexadecimal digits and .partial follow."""
+    """The beginning of the names of a target's unfinished files; 16 random hexadecimal digits and .partial follow."""
     return f".{os.fsdecode(os.fsencode(target.name)[:_LONGEST_NAME])}."
 
 
@@ -233,18 +233,19 @@ def _open_new(partial: Path, target: Path) -> int:
         old = target.lstat()
     except FileNotFoundError:
         old = None
-    # A private file is not open to others for a moment either.
+    # A private file must not be open to others even for a moment.
     mode = 0o666 if old is None else 0o600
     descriptor = os.open(partial, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, mode)
     if old is not None:
-        with suppress(PermissionError):  # only the superuser gives files away
+        with suppress(PermissionError):  # only the superuser may change the owner
             os.fchown(descriptor, old.st_uid, old.st_gid)
         os.fchmod(descriptor, old.st_mode & 0o777)
     return descriptor
 
 
 def _lock(descriptor: int) -> bool:
-    """Lock an open file; False if somebody else has. Without locks in the file system everything counts as locked."""
+    """Lock an open file; False if another process has locked it. Where the file system has no locks, every file counts
+    as locked."""
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
@@ -277,14 +278,15 @@ def _others_write(target: Path, but: Path | None = None) -> bool:
     for path in (target.with_name(name) for name in names):
         if path == but:
             continue
-        with suppress(OSError):  # it is of another user, or has just gone
+        with suppress(OSError):  # it belongs to another user, or has just been removed
             if _locked_by_another(path, remove=True):
                 found = True
     return found
 
 
 def _locked_by_another(path: Path, *, remove: bool = False) -> bool:
-    """Whether somebody holds the lock of a plain file; with ``remove`` the file goes if nobody does. Raises OSError."""
+    """Whether another process holds the lock of a plain file; with ``remove`` the file is removed if none does. Raises
+    OSError."""
     if not stat.S_ISREG(path.lstat().st_mode):
         return False
     descriptor = os.open(path, os.O_RDWR | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
@@ -312,7 +314,8 @@ def _put_where_nothing_is(partial: Path, target: Path) -> None:
 
 
 def _sync_folder(folder: Path) -> None:
-    """Bring a new name to the disk. Some file systems do this by themselves and refuse to be asked."""
+    """Synchronise a folder, so that a new name is on the disk. Some file systems do this by themselves and refuse the
+    request."""
     with suppress(OSError):
         descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
         try:

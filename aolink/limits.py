@@ -1,4 +1,4 @@
-"""How much a file may make aolink hold or read. The environment variable AOLINK_LIMITS raises it."""
+"""Limits of the memory and the reading that a file may cause. The environment variable AOLINK_LIMITS raises them."""
 
 from __future__ import annotations
 
@@ -19,33 +19,33 @@ from aolink.errors import AolinkError, RecordingError, RigError
 
 VARIABLE = "AOLINK_LIMITS"
 _FREE_RECORDS = 100_000
-"""Beside those that `Limits.records_per_kilobyte` allows for."""
+"""Records that are allowed beside those of `Limits.records_per_kilobyte`."""
 _FREE_BYTES = 1 << 30
-"""Beside those that `Limits.expansion` allows for."""
+"""Bytes that are allowed beside those of `Limits.expansion`."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Limits:
-    """What is believed of a file. What people record is far below; what is above would cost memory or time.
+    """The sizes that are accepted in a file. Real recordings are far below them; larger ones would cost memory or time.
 
     A file of 38 kB can hold 128 MiB of equal messages, so that some limits grow with the file: the time that its
     reading takes is proportional to its size.
     """
 
     record_bytes: int = 256 << 20
-    """A record of the file. A larger one is taken for damage."""
+    """Bytes of a record of the file. A larger one counts as damage."""
     chunk_bytes: int = 128 << 20
-    """A chunk without its compression: the largest that aolink writes has 64 MiB, and the message that it ends with."""
+    """Bytes of a chunk without its compression: the largest that aolink writes has 64 MiB, and its last message."""
     attachment_bytes: int = 256 << 20
-    """All attachments of a file together; they are kept in memory."""
+    """Bytes of all attachments of a file together; they are kept in memory."""
     records_per_kilobyte: int = 256
     """Messages, channels and schemas in each thousand bytes of a file, beside the first 100,000 of them."""
     expansion: int = 255
     """Bytes without compression in each byte of a file, beside the first GiB. LZ4 cannot exceed it."""
     unpacked_bytes: int = 1 << 30
-    """What a compressed picture or film of the kinds .fits.gz and .npz holds."""
+    """Bytes in a compressed picture or film of the kinds .fits.gz and .npz."""
     picture_pixels: int = 1 << 26
-    """A picture: 8192 rows and columns."""
+    """Pixels of a picture: 8192 rows and columns."""
 
 
 @lru_cache(maxsize=1)
@@ -67,18 +67,18 @@ def _read(text: str) -> Limits:
 
 
 def limits() -> Limits:
-    """The limits that hold in this process.
+    """The limits that apply in this process.
 
     Raises
     ------
     RecordingError
-        AOLINK_LIMITS is set to something else than limits.
+        AOLINK_LIMITS has a value that does not set limits.
     """
     return _read(os.environ.get(VARIABLE, ""))
 
 
 def exceeded(what: str, name: str, error: type[AolinkError] = RecordingError) -> AolinkError:
-    """The error for a file that is above a limit: what it holds, and the limit's name."""
+    """The error for a file beyond a limit, with what the file holds and the limit's name."""
     return error(
         f"{what}, which is above the limit of {getattr(limits(), name)} for {name}. Such a file may be made to fill the"
         f" memory or to waste time; if you trust it, set {VARIABLE}={name}=NUMBER to a larger number and read it again"
@@ -86,7 +86,7 @@ def exceeded(what: str, name: str, error: type[AolinkError] = RecordingError) ->
 
 
 class Budget:
-    """What one reading of a file of ``size`` bytes may still cost."""
+    """The remaining budget for one reading of a file of ``size`` bytes."""
 
     def __init__(self, name: str, size: int) -> None:
         self._what = f"the {size} bytes of {name}"
@@ -94,20 +94,20 @@ class Budget:
         self._bytes = _FREE_BYTES + size * limits().expansion
 
     def take_records(self, count: int) -> None:
-        """Raise RecordingError where a file has more records than its size lets one expect."""
+        """Raise RecordingError where a file has more records than its size allows."""
         self.records -= count
         if self.records < 0:
             raise exceeded(f"{self._what} hold very many tiny records", "records_per_kilobyte")
 
     def take_bytes(self, count: int) -> None:
-        """Raise RecordingError where a file grows more without its compression than one lets it."""
+        """Raise RecordingError where a file expands more than is allowed."""
         self._bytes -= count
         if self._bytes < 0:
             raise exceeded(f"{self._what} become very many more without compression", "expansion")
 
 
 def unpacked(file: IO[bytes], error: type[AolinkError]) -> bytes:
-    """What a gzip file holds. Raises ``error`` above the limit, and as `gzip` does for one that is damaged."""
+    """The content of a gzip file. Raises ``error`` above the limit, and the errors of `gzip` for a damaged file."""
     most = limits().unpacked_bytes
     with gzip.open(file) as opened:
         data = opened.read(most + 1)
@@ -140,7 +140,7 @@ def load_array(source: Path | bytes) -> NDArray[Any]:
     Raises
     ------
     ValueError
-        It is none, or is cut off, or holds Python's objects.
+        The file is not a .npy file, is cut off, or holds Python objects.
     OSError
         The file cannot be read.
     """
@@ -164,9 +164,7 @@ def load_table(path: Path) -> NDArray[np.float64]:
     Raises
     ------
     RigError
-        It is above the limit of unpacked bytes.
-    ValueError
-        It holds something else.
+        The file is above the limit of unpacked bytes. ValueError The file holds something else.
     OSError
         The file cannot be read.
     """

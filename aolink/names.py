@@ -1,6 +1,6 @@
 """Names of a package that are loaded from its modules at their first use (PEP 562).
 
-Whoever imports one module of a package runs the package's own file first: if that imported all modules, reading an
+An import of one module of a package runs the package's own file first: if that imported all modules, reading an
 estimate from a recording would load every estimator, and SciPy with them.
 """
 

@@ -1,4 +1,4 @@
-"""`Series`: exposures of one rig and their estimates, with what a notebook expects of them."""
+"""The class `Series`: exposures of one rig and their estimates, with methods for notebooks."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ if TYPE_CHECKING:
 
 
 class Series(ABC):
-    """Exposures in order, with the estimates that were made of them; nothing is read before it is asked for.
+    """Exposures in order, with the estimates that were made of them; nothing is read before it is used.
 
     ``len(series)``, ``series[7]``, ``series[-10:]`` and a loop over it give exposures. A slice is a series too.
     """
 
     rig: Rig
     path: Any
-    """The file that they are in: a path, or the location of one behind a URL."""
+    """The file of the exposures: a path, or the location of one behind a URL."""
     metadata: dict[str, str]
     """Facts about the session."""
 
@@ -39,7 +39,7 @@ class Series(ABC):
     @property
     @abstractmethod
     def has_truth(self) -> bool:
-        """Whether it is known what really happened, for some exposures at least."""
+        """Whether the truth is known, for some exposures at least."""
 
     @abstractmethod
     def exposures(self) -> Iterator[Exposure]:
@@ -71,7 +71,7 @@ class Series(ABC):
         return list(self.iter_estimates(name))
 
     def with_estimates(self, names: Sequence[str]) -> Iterator[tuple[Exposure, list[Estimate | None]]]:
-        """The exposures, each with its estimates by the estimators ``names``: None where there is none."""
+        """The exposures, each with its estimates by the estimators ``names``, with None for a missing estimate."""
         left = [self.iter_estimates(name) for name in names]
         ahead = [next(each, None) for each in left]
         for exposure in self.exposures():
@@ -92,7 +92,7 @@ class Series(ABC):
     def to_pandas(self, estimators: Sequence[str] | None = None) -> pd.DataFrame:
         """A table with a row for each exposure and axis, indexed by time (UTC).
 
-        The columns are those of `aolink.exporting.table`; estimators are all, or those that are named.
+        The columns are those of `aolink.exporting.table`, for all estimators or for those that are named.
 
         Raises
         ------
@@ -106,9 +106,10 @@ class Series(ABC):
         return to_pandas(self, estimators)
 
     def to_xarray(self, estimators: Sequence[str] | None = None) -> xr.Dataset:
-        """All of it as one dataset along ``time`` (UTC): frames, inputs, truth, and estimates along ``estimator``.
+        """The whole series as one dataset along ``time`` (UTC): frames, inputs, truth, and estimates along
+        ``estimator``.
 
-        The variables are those of `aolink.exporting.arrays`, all in memory: take a slice of what is long.
+        The variables are those of `aolink.exporting.arrays`, all in memory: take a slice of a long recording.
 
         Raises
         ------
@@ -128,16 +129,16 @@ class Series(ABC):
         output: int = 0,
         axes: tuple[Axes, Axes] | None = None,
     ) -> tuple[Axes, Axes]:
-        """Draw with matplotlib what the camera saw of one output with the paths over it, and the NIS of the estimates.
+        """Draw with matplotlib the camera's blur of one output with the paths over it, and the NIS of the estimates.
 
         Parameters
         ----------
         estimators:
-            Whose paths and NIS; all by default.
+            Estimators whose paths and NIS are drawn; all by default.
         output:
             Number of the output (a row of a path).
         axes:
-            Where to draw the two; by default on a new figure.
+            The two axes to draw on; by default those of a new figure.
 
         Returns
         -------
@@ -155,7 +156,7 @@ class Series(ABC):
         return plot_series(self, estimators, output, axes)
 
     def facts(self) -> dict[str, str]:
-        """What there is, in words."""
+        """A summary of the series, in words."""
         timing, (rows, columns) = self.rig.timing, self.rig.sensor.shape
         length = duration(timing.exposure_steps * timing.fast_step_s)
         period = duration(timing.frame_period_steps * timing.fast_step_s)

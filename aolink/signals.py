@@ -1,4 +1,4 @@
-"""What ends a command from outside: Ctrl-C, SIGTERM and SIGHUP, for every command in the same way.
+"""The signals that end a command from outside: Ctrl-C, SIGTERM and SIGHUP, handled in the same way for every command.
 
 Only the standard library is imported here, so that this works while the rest of a command is still being loaded.
 """
@@ -19,15 +19,14 @@ from typing import Any
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _ECHO_S = 0.5
-"""A terminal that closes sends a signal several times; what comes within this time is the same request."""
+"""A terminal that closes sends a signal several times; signals within this time are the same request."""
 _AGAIN_S = 0.02
-"""How long after an interruption was lost it is raised again."""
+"""Time after which a lost interruption is raised again, s."""
 
 
 class Interrupted(BaseException):
-    """A signal ends the command: whatever is open is closed or removed on the way to `ending_the_command`.
-
-    It is no Exception and no KeyboardInterrupt, so that no library takes it for something to be handled.
+    """A signal ends the command: all that is open is closed or removed on the way to `ending_the_command`. It is
+    neither an Exception nor a KeyboardInterrupt, so that no library handles it.
     """
 
     def __init__(self, number: int, what_stays: str = "") -> None:
@@ -38,10 +37,11 @@ class Interrupted(BaseException):
 
 
 class StopRequest:
-    """What Ctrl-C, SIGTERM and SIGHUP do while this is installed.
+    """The handling of Ctrl-C, SIGTERM and SIGHUP while this is installed.
 
     With ``at_once`` the first of them raises `Interrupted`, wherever the program is. Without it, the first only makes
-    the request true, for what ends in good order by itself, as a session does, and the next one raises `Interrupted`.
+    the request true, for a job that ends in good order by itself, as a session does, and the next one raises
+    `Interrupted`.
     """
 
     def __init__(self, *, at_once: bool = False) -> None:
@@ -64,7 +64,7 @@ class StopRequest:
 
     @contextmanager
     def installed(self) -> Iterator[StopRequest]:
-        # SIGHUP that is ignored already stays so: that is what `nohup` does, and a background job may rely on it.
+        # If SIGHUP is ignored already, it stays so: `nohup` ignores it, and a background job may rely on it.
         heard = [n for n in _SIGNALS if n != signal.SIGHUP or signal.getsignal(n) != signal.SIG_IGN]
         before = {number: signal.signal(number, self._handle) for number in heard}
         try:
@@ -75,7 +75,7 @@ class StopRequest:
                 signal.signal(number, handler)
 
     def raise_if_asked(self) -> None:
-        """End the command as one that a signal ended, once it has ended in good order what it was doing."""
+        """End the command as one that a signal has ended, after its work has ended in good order."""
         if self.signal:
             raise Interrupted(self.signal)
 
@@ -102,8 +102,9 @@ def _not_lost(ignored: sys.UnraisableHookArgs, report: Callable[[sys.UnraisableH
 
 @contextmanager
 def _never_lost() -> Iterator[None]:
-    """Where nobody can catch it (a finaliser, a callback of the interpreter's own), an interruption would only be
-    reported as ignored: it is raised again a moment later, out of there, or at the end of the outermost block."""
+    """A guard against lost interruptions. Where no code can catch it (in a finaliser, or a callback of the
+    interpreter's own), an interruption would only be reported as ignored; so it is raised again a moment later,
+    elsewhere, or at the end of the outermost block."""
     report, alarm = sys.unraisablehook, signal.signal(signal.SIGALRM, _raise_again)
     sys.unraisablehook = partial(_not_lost, report=report)
     try:
@@ -141,5 +142,5 @@ def _leave_lost_terminal() -> None:
         try:
             termios.tcgetattr(descriptor)
         except termios.error as error:
-            if error.args[0] == errno.EIO:  # a file or a pipe says that it is no terminal
+            if error.args[0] == errno.EIO:  # a file or a pipe is not a terminal
                 os.dup2(os.open(os.devnull, os.O_WRONLY), descriptor)

@@ -1,4 +1,4 @@
-"""Quantities as people read them."""
+"""Quantities in the form that people read."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ def with_unit(value: float, unit: str, digits: int = 4) -> str:
     if not value or not math.isfinite(value):
         return f"{value:g} {unit}"
     exponent = 3 * math.floor(math.log10(abs(value)) / 3)
-    # Nobody reads a kilosecond or a millibyte.
+    # Kiloseconds and millibytes are not used.
     low, high = {"s": (-12, 0), "B": (0, 12)}.get(unit, (-12, 12))
     exponent = min(max(exponent, low), high)
     return f"{value / 10.0**exponent:.{digits}g} {_PREFIXES[exponent]}{unit}"

@@ -216,7 +216,7 @@ def test_a_demo_that_ends_after_recording_says_where_the_recording_is(tmp_path: 
         code, errors = started.end(signal.SIGINT)
         (folder,) = started.folder.iterdir()
         assert code == 130
-        assert errors == f"aolink: interrupted by SIGINT; what was made until then is in {folder.name}\n"
+        assert errors == f"aolink: interrupted by SIGINT; the files made until then are in {folder.name}\n"
         assert sorted(each.name for each in folder.iterdir()) == ["rig.toml", "session.mcap"]
         started.assert_nothing_half_is_left()
 

@@ -1,4 +1,5 @@
-"""Calibration of the sensor from its own frames, and how its values get into a rig file. Pure: arrays and text."""
+"""Calibration of the sensor from its own frames, and the writing of its values into a rig file. The subpackage is pure:
+it takes arrays and text."""
 
 from aolink.calibration.measure import KINDS, Calibration, Frames, Kind, Measured, calibrate
 from aolink.calibration.rig_text import calibrated_text

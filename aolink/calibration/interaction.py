@@ -1,4 +1,5 @@
-"""The interaction matrix of a rig, measured: every input is pushed and pulled, and the camera tells where spots go."""
+"""The measurement of a rig's interaction matrix: every input is pushed and pulled, and the camera shows where the spots
+go."""
 
 from __future__ import annotations
 
@@ -22,12 +23,12 @@ from aolink.rig import Rig
 _THRESHOLD_SD = 4.0
 _ROUNDING = 1e-9
 _LONGEST_RAMP_S = 60.0
-"""A poke that takes longer to reach is not meant so: drift would count as the mirror's."""
+"""A poke that takes longer to reach is probably a mistake: drift would count as the mirror's motion."""
 
 
 @dataclass(frozen=True, eq=False)
 class Interaction:
-    """Slopes for inputs at rest, and how well they are known."""
+    """Slopes for inputs at rest, and their uncertainty."""
 
     matrix: FloatArray
     """Slope units per input unit, (n_outputs, n_inputs)."""
@@ -38,23 +39,24 @@ class Interaction:
     residual_rms: float
     """Rms of the slopes that the matrix does not explain, slope units."""
     sd: FloatArray
-    """Standard deviation of the matrix's numbers by these residuals, the same for all slopes, (n_inputs,); NaN where
+    """Standard deviation of the matrix's entries by these residuals, the same for all slopes, (n_inputs,); NaN where
     there are no more exposures than unknowns."""
     exposures: int
     """Number of exposures used."""
 
     @property
     def condition(self) -> float:
-        """Largest over smallest singular value: how much weaker the weakest mode of the inputs is."""
+        """Largest over smallest singular value: how much weaker the weakest mirror mode is."""
         return float(self.singular_values[0] / max(self.singular_values[-1], 1e-300))
 
     def control_matrix(self, weakest: float = 0.0) -> FloatArray:
-        """Inputs that make given slopes, (n_inputs, n_outputs), without modes below ``weakest`` times the strongest."""
+        """Matrix that gives the inputs for given slopes, (n_inputs, n_outputs), without mirror modes below ``weakest``
+        times the strongest."""
         return np.asarray(np.linalg.pinv(self.matrix, rcond=weakest))
 
 
 def rest_exposures(rig: Rig, hold_s: float) -> int:
-    """Frame periods that a poke is to rest before it is seen, so that it has rested for ``hold_s``: one at least."""
+    """Frame periods that a poke rests before it is measured, so that it has rested for ``hold_s``: at least one."""
     period_s = rig.timing.frame_period_steps * rig.timing.fast_step_s
     return max(1, math.ceil(hold_s / period_s - _ROUNDING))
 
@@ -62,9 +64,9 @@ def rest_exposures(rig: Rig, hold_s: float) -> int:
 def poke_inputs(rig: Rig, amplitude: FloatArray | float, rest_exposures: int = 1) -> FloatArray:
     """Inputs at each fast step that push each input up and down in turn.
 
-    Each value is held for ``rest_exposures`` frame periods, in which the mirror settles, and one more to be seen. Where
-    the rig file has ``mirror.slew_max_per_s``, a ramp of whole frame periods leads to each value, and from the last to
-    the safe input.
+    Each value is held for ``rest_exposures`` frame periods, in which the mirror settles, and one more to be measured.
+    Where the rig file has ``mirror.slew_max_per_s``, a ramp of whole frame periods leads to each value, and from the
+    last to the safe input.
 
     Raises
     ------
@@ -91,8 +93,8 @@ def _ramp(rig: Rig, begin: FloatArray, end: FloatArray) -> FloatArray:
     needed_s = float(np.abs(end - begin).max()) / slew
     if needed_s > _LONGEST_RAMP_S:
         raise CalibrationError(
-            f"mirror.slew_max_per_s = {slew:g} makes the way from one poke to the next {needed_s:.3g} s long, more than"
-            f" {_LONGEST_RAMP_S:g} s: take a smaller amplitude, or correct the rig file"
+            f"mirror.slew_max_per_s = {slew:g} makes the ramp from one poke to the next {needed_s:.3g} s long, more"
+            f" than {_LONGEST_RAMP_S:g} s: take a smaller amplitude, or correct the rig file"
         )
     n_steps = math.ceil(needed_s / (timing.frame_period_steps * timing.fast_step_s)) * timing.frame_period_steps
     return begin + (end - begin) * np.arange(1, n_steps + 1)[:, None] / max(n_steps, 1)
@@ -104,15 +106,16 @@ def measure_interaction(
     slopes_of: Callable[[Exposure], FloatArray] | None = None,
     rest_exposures: int = 1,
 ) -> Interaction:
-    """Least squares of slopes on inputs, over the exposures whose input had rested since an exposure before began.
+    """Fit slopes to inputs by least squares, over the exposures whose input had rested since the beginning of an
+    earlier exposure.
 
     Parameters
     ----------
     rest_exposures:
-        How many exposures before that was, as `poke_inputs` has it.
+        How many exposures earlier that one is, as for `poke_inputs`.
     slopes_of:
-        Slopes of an exposure in the place of its spots' centroids, (n_outputs,), such as those of the rig file's plant.
-        It is called for every exposure, in order.
+        Function that gives the slopes of an exposure instead of its spots' centroids, (n_outputs,), such as those of
+        the rig file's plant. It is called for every exposure, in order.
 
     Raises
     ------
@@ -139,7 +142,7 @@ def measure_interaction(
     design = np.column_stack([u, np.ones(len(u))])
     if np.linalg.matrix_rank(design) < design.shape[1]:
         raise CalibrationError(
-            f"{len(u)} exposures at rest do not tell {rig.n_inputs} inputs apart: poke each of them alone"
+            f"{len(u)} exposures at rest do not determine {rig.n_inputs} inputs: poke each of them alone"
         )
     solution, *_ = np.linalg.lstsq(design, y, rcond=None)
     matrix, residual = solution[:-1].T, y - design @ solution

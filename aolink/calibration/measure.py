@@ -1,9 +1,8 @@
-"""Calibration of a camera from its own frames: black level, noise, gain, scale, image kernel, standard deviations.
-
-Pure: counts in, a `Calibration` out. Dark frames give the black level and the read noise. The photon
-transfer curve (a pixel's variance against its mean, EMVA 1288) of flats and of the resting spot gives the
-counts that one photo-electron makes. The mean profile of the resting spot gives the counts of a density of
-one and the kernel's width. What was not shown to the camera stays unknown, and `Calibration.notes` says so.
+"""Calibration of a camera from its own frames: black level, noise, gain, scale, image kernel, standard deviations. It
+takes counts and gives a `Calibration`. Dark frames give the black level and the read noise. The photon transfer curve
+(a pixel's variance against its mean, EMVA 1288) of flats and of the resting spot gives the counts that one
+photo-electron makes. The mean profile of the resting spot gives the counts of a density of one and the kernel's width.
+Values for which the camera was not shown the light stay unknown, and `Calibration.notes` says so.
 """
 
 from __future__ import annotations
@@ -27,32 +26,32 @@ Kind = Literal["dark", "flat", "still"]
 KINDS: tuple[Kind, ...] = ("dark", "flat", "still")
 
 LEAST_FRAMES = 10
-"""Fewer give variances too uncertain to check anything with."""
+"""Fewer frames give variances that are too uncertain for the checks."""
 _SURE = 1e-6
-"""Probability by chance below which something is reported, or refused."""
+"""Probability by chance below which a deviation is reported, or refused."""
 _HOT = 6.0
 """Standard deviations from the others at which a dark pixel counts as hot."""
 _MOST_CLIPPED = 0.01
 """Share of a pixel's frames that may be at an end of the scale."""
 _UNEVEN = 0.3
-"""Scatter over the mean from which on a flat is none."""
+"""Scatter over the mean from which on a frame does not count as flat."""
 _ROUNDING = 1 / 12
 """Variance of rounding to whole counts."""
 _VAGUE = 0.3
-"""Share of the kernel's width that its standard deviation may be."""
+"""Largest standard deviation of the kernel's width, as a share of the width."""
 _SEEN = 3.0
-"""Standard deviations from which on shot noise counts as seen."""
+"""Standard deviations from which on shot noise counts as measured."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Frames:
-    """Frames of one recording that show the camera one thing."""
+    """Frames of one recording, all with the same light."""
 
     kind: Kind
     counts: NDArray[np.uint16]
     """(frames, pixels)"""
     source: str
-    """What errors and notes call them."""
+    """The name of the recording in errors and notes."""
 
 
 @dataclass(frozen=True)
@@ -65,33 +64,33 @@ class Measured:
 
 @dataclass(frozen=True, kw_only=True)
 class Calibration:
-    """What was found; None is what these frames cannot tell."""
+    """The measured values; None where these frames do not determine one."""
 
     black_level: Measured
-    """Counts."""
+    """Black level, counts."""
     read_noise: Measured
     """Standard deviation of a pixel, counts, rounding to whole counts included."""
     noise_density: Measured
-    """V, without the rounding to whole counts."""
+    """V, the variance of the noise density, without the rounding to whole counts."""
     gain: Measured | None
     """Counts that one photo-electron makes."""
     photoelectrons: Measured | None
     """Photo-electrons of the whole spot in one exposure; zero where there are too many to be counted."""
     counts_per_density: Measured | None
     kernel_sigma: Measured | None
-    """Slope units, in the rig file's convention: variance sigma^2/2."""
+    """Kernel width, slope units, in the rig file's convention: variance sigma^2/2."""
     spot: Spot | None
     """The fit of the resting spot."""
     frames: dict[Kind, int]
-    """How many of each kind were used."""
+    """Number of frames of each kind that were used."""
     hot_pixels: tuple[int, ...]
     """Pixels that were left out: far too bright, too dark or too noisy in the dark."""
     notes: tuple[str, ...]
-    """What the frames cannot tell, and what in them is odd."""
+    """Notes about values that the frames do not determine, and about oddities in the frames."""
 
     @property
     def values(self) -> dict[str, Measured]:
-        """What was measured, by the rig file's key."""
+        """The measured values, by the rig file's key."""
         found = {
             "sensor.black_level": self.black_level,
             "sensor.noise_density": self.noise_density,
@@ -110,7 +109,8 @@ class PixelStatistics:
     mean: FloatArray
     """Counts, (pixels,)."""
     variance: FloatArray
-    """By differences of successive frames, which neither a fixed pattern nor a slow drift gets into, (pixels,)."""
+    """Variance from differences of successive frames, which neither a fixed pattern nor a slow drift affects,
+    (pixels,)."""
     spread: float
     """Variance of ``variance`` over its square, for Gaussian noise."""
 
@@ -118,7 +118,7 @@ class PixelStatistics:
 def pixel_statistics(series: Sequence[NDArray[np.uint16]], *, steady: bool = True) -> PixelStatistics:
     """Statistics over several series of frames, (frames, pixels) each.
 
-    With ``steady`` False the light may flicker: what all pixels of a frame have in common is taken out first.
+    With ``steady`` False the light may flicker: the common factor of all pixels of a frame is removed first.
     """
     counts = [each.astype(np.float64) for each in series]
     frames = sum(map(len, counts))
@@ -141,26 +141,26 @@ def line_sensor(rig: Rig) -> Sensor:
     """The rig's sensor. Raises CalibrationError where it is not a line: nothing else can be calibrated."""
     if not isinstance(rig.sensor, Sensor):
         raise CalibrationError(
-            f"{rig.name} has no line sensor, and only that can be calibrated: put what is known of this one into the"
-            " rig file by hand"
+            f"{rig.name} has no line sensor, and only that can be calibrated: put the known values of this one into"
+            " the rig file by hand"
         )
     return rig.sensor
 
 
 def calibrate(rig: Rig, recordings: Sequence[Frames]) -> Calibration:
-    """Calibrate a line sensor from frames of what it was shown.
+    """Calibrate a line sensor from frames under known light.
 
     Parameters
     ----------
     rig:
-        Its pixels and field are taken as they are; its other values are where the search begins.
+        The rig; its pixels and field are taken as they are, and its other values are starting points of the search.
     recordings:
         At least one of kind "dark"; flats at any levels, resting spots at any positions.
 
     Raises
     ------
     CalibrationError
-        There are no dark frames or too few frames, they are saturated, or not what they are said to be.
+        There are no dark frames or too few frames, they are saturated, or not of the kind that they are marked with.
     """
     sensor = line_sensor(rig)
     for each in recordings:
@@ -172,7 +172,7 @@ def calibrate(rig: Rig, recordings: Sequence[Frames]) -> Calibration:
     darks, flats, stills = ([each for each in recordings if each.kind == kind] for kind in KINDS)
     if not darks:
         raise CalibrationError(
-            "there are no dark frames, and without the black level nothing else can be known: cover the camera and"
+            "there are no dark frames, and without the black level nothing else can be measured: cover the camera and"
             " record some with --calibration dark"
         )
     notes: list[str] = []
@@ -186,7 +186,7 @@ def calibrate(rig: Rig, recordings: Sequence[Frames]) -> Calibration:
     still_signals = [_signal(pixel_statistics([each.counts]), dark) for each in stills]
     for each, signal in zip(flats, flat_signals, strict=True):
         _check_flat(each, signal, good)
-    # A spot that trembles unseen looks like shot noise, so flats go before it.
+    # A slight trembling of the spot is like shot noise, so flats are preferred.
     curves = flat_signals or still_signals
     gain = _photon_transfer(curves, dark, good, read, notes) if curves else None
     if gain and not flats and gain.value > _SEEN * gain.sd:
@@ -201,7 +201,7 @@ def calibrate(rig: Rig, recordings: Sequence[Frames]) -> Calibration:
         spot = fit_spots(sensor, [(each.source, s.frames, s.mean) for each, s in lit], good, noise, dark.frames)
         for k, (each, signal) in enumerate(lit):
             alone, spread = signal.variance, signal.spread
-            if flats and gain:  # then what a pixel does by itself is known apart from this spot
+            if flats and gain:  # then the pixels' own noise is known independently of this spot
                 alone = read.value + max(gain.value + 2 * gain.sd, 0.0) * np.maximum(signal.mean, 0.0)
                 spread = 0.0
             notes += check_at_rest(sensor, each.source, each.counts[:, good], (alone[good], spread), good, spot, k)
@@ -211,7 +211,7 @@ def calibrate(rig: Rig, recordings: Sequence[Frames]) -> Calibration:
 
 
 def _signal(lit: PixelStatistics, dark: PixelStatistics) -> PixelStatistics:
-    """The same above each pixel's own dark level."""
+    """The statistics above each pixel's own dark level."""
     return replace(lit, mean=lit.mean - dark.mean)
 
 
@@ -219,7 +219,7 @@ def _mean_variance(variances: FloatArray, spread: float) -> Measured:
     """Mean variance of pixels, which need not be alike."""
     # E[s^4] = sigma^4 (1 + spread)
     mean, sd = float(variances.mean()), math.sqrt(spread / (1 + spread) * float((variances**2).sum())) / len(variances)
-    # Noise under half a count comes and goes with where the level lies between two counts.
+    # Noise under half a count depends on where the level lies between two counts.
     return Measured(mean, sd) if mean > 0.25 else Measured(max(mean, _ROUNDING), _ROUNDING)
 
 
@@ -232,7 +232,7 @@ def _good_pixels(dark: PixelStatistics, source: str) -> BoolArray:
     freedom = 2 / dark.spread
     noisy = stats.chi2.sf(dark.variance / typical * freedom, freedom) < 1e-9
     bright = dark.mean > level + _HOT * scatter
-    # Hot pixels stand alone; a spot covers neighbours, a wandering one even more of them.
+    # Hot pixels stand alone; a spot covers neighbouring pixels, a moving spot even more of them.
     alone = bright & ~np.append(bright[1:], False) & ~np.insert(bright[:-1], 0, False)
     light = np.concatenate([[0.0], np.cumsum(np.where(alone, 0.0, dark.mean - level))])
     for length in (2**k for k in range(1, (len(hot) // 2).bit_length())):
@@ -279,7 +279,7 @@ def _black_level(
             f"the black level wanders by {math.sqrt(wander):.2g} counts from frame to frame, more than its noise"
         )
         sd = math.sqrt(wander / dark.frames)
-    # A fixed pattern is an error of every single density, so it is worth a word.
+    # A fixed pattern is an error of every single density, so a note mentions it.
     pattern = float(dark.mean[good].var(ddof=1)) - read.value / dark.frames
     if stats.chi2.sf((pixels - 1) * (pattern / (read.value / dark.frames) + 1), pixels - 1) < _SURE:
         notes.append(f"the pixels' black levels differ by {math.sqrt(pattern):.2g} counts (a fixed pattern)")
@@ -315,9 +315,10 @@ def _photon_transfer(
     target = np.append(y, read.value)
     intercept, slope = read.value, 0.0
     for _ in range(50):
-        # Weights by the model, not by the variances measured: those that came out low would count too much.
+        # Weights follow the model, not the measured variances: otherwise variances that are low by chance would count
+        # too much.
         model = intercept + max(slope, 0.0) * np.maximum(x, 0.0)
-        # The mean is uncertain as well; with Poisson noise the rest of that cancels against the variance's own.
+        # The mean is uncertain as well; with Poisson noise the remaining terms cancel against those of the variance.
         weight = 1 / np.append(spread * model**2 + slope**2 * intercept * over_frames, read.sd**2)
         covariance = np.linalg.inv((design.T * weight) @ design)
         before, (intercept, slope) = slope, covariance @ (design.T @ (weight * target))
@@ -327,7 +328,7 @@ def _photon_transfer(
     misfit = float((weight * (target - design @ [intercept, slope]) ** 2).sum())
     if stats.chi2.sf(misfit, len(x) - 1) < _SURE:
         notes.append(
-            f"variance does not grow in a line with the mean (chi-square {misfit:.0f} for {len(x) - 1}): the light"
+            f"variance does not grow linearly with the mean (chi-square {misfit:.0f} for {len(x) - 1}): the light"
             " flickers, the spot trembles or the camera is not linear, and photoelectrons is doubtful"
         )
     return Measured(float(slope), math.sqrt(covariance[1, 1]))
@@ -393,8 +394,8 @@ def _photoelectrons(rig: Rig, gain: Measured | None, scale: Measured, notes: lis
     told = rig.sensor.photoelectrons
     contradicted = 0 < told < least
     notes.append(
-        f"no shot noise is seen, so there are more than {least:.3g} photo-electrons; photoelectrons"
+        f"no shot noise is measurable, so there are more than {least:.3g} photo-electrons; photoelectrons"
         + (" becomes 0 (shot noise negligible)" if contradicted else " stays as the file has it")
-        + "; brighter flats would tell"
+        + "; brighter flats would show how many"
     )
     return Measured(0.0, math.nan) if contradicted else None

@@ -1,4 +1,4 @@
-"""What a calibration found, written into the text of a rig file."""
+"""A calibration's values, written into the text of a rig file."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def calibrated_text(text: str, rig: Rig, calibration: Calibration, sources: Sequ
     text:
         The file's text, whatever its line ends, which ``rig`` was read from.
     sources:
-        What the calibration comes from, each beginning with its kind.
+        The sources of the calibration, each beginning with its kind.
     """
     for key, value in calibration.values.items():
         text = with_value(text, key, tomlkit.value(written(value)), may_be_new=True)
@@ -43,7 +43,7 @@ def written(measured: Measured) -> str:
 
 
 def _updated_table(rig: Rig, calibration: Calibration, sources: Sequence[str]) -> dict[str, Any]:
-    """What is known now; of what was not measured this time, what was known before."""
+    """The table with the new values; values that were not measured this time stay as before."""
     table = rig.calibration or CalibrationTable()
     sds = {
         key.removeprefix("sensor.").replace(".", "_") + "_sd": float(f"{value.sd:.3g}")

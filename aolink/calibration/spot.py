@@ -19,11 +19,11 @@ from aolink.optics.sensor import Kernel, Sensor
 _UNSTEADY = 1e-5
 """Probability by chance below which a spot counts as moving or flickering."""
 _NOT_GAUSSIAN = 1e-4
-"""Probability of the fit's chi-square by chance below which the kernel is not called Gaussian."""
+"""Probability of the fit's chi-square by chance below which the kernel does not count as Gaussian."""
 _FAINT = 10.0
-"""Standard deviations of its light from which on there is a spot."""
+"""Least light of a spot, in its standard deviations."""
 _BACKGROUND = 0.05
-"""Light away from the spot over the spot's own that is let pass."""
+"""Largest accepted light away from the spot, as a share of the spot's own."""
 _LEAST_MASS = 0.99
 """Share of the spot's light that must fall on the sensor."""
 
@@ -33,19 +33,19 @@ class Spot:
     """Least-squares fit of the Gaussian kernel, integrated over the pixels, to the mean profile of resting spots."""
 
     positions: tuple[float, ...]
-    """Slope units, one for each recording."""
+    """Positions, slope units, one for each recording."""
     position_sds: tuple[float, ...]
     sigma: float
-    """Slope units."""
+    """Kernel width, slope units."""
     sigma_sd: float
     counts_per_density: float
-    """By the fit's amplitude where the kernel is Gaussian, by the spot's total where it is not."""
+    """Scale from the fit's amplitude where the kernel is Gaussian, from the spot's total light where it is not."""
     counts_per_density_sd: float
     chi_square: float
     freedom: int
     """Degrees of freedom."""
     largest_residual: float
-    """Over the profile's peak."""
+    """Largest residual as a share of the profile's peak."""
     noise: tuple[float, float]
     """Variance of a dark pixel in one frame, counts squared, and counts per electron."""
 
@@ -56,7 +56,7 @@ class Spot:
 
     @property
     def complaint(self) -> str:
-        """What to say of a kernel that is not Gaussian."""
+        """The note about a kernel that is not Gaussian."""
         return (
             f"the spot is not a Gaussian: chi-square {self.chi_square:.0f} for {self.freedom} degrees of freedom,"
             f" largest residual {self.largest_residual:.1%} of the peak; kernel.sigma is that of the nearest Gaussian,"
@@ -85,7 +85,7 @@ def fit_spots(
     Raises
     ------
     CalibrationError
-        There is no spot, or not the whole of it, or light everywhere.
+        There is no spot, only a part of it, or light everywhere.
     """
     means = np.array([mean[good] for _, _, mean in signals])
     dark_variance = noise[0] / dark_frames
@@ -99,7 +99,8 @@ def fit_spots(
     frames = np.array([[n] for _, n, _ in signals])
     expected = np.maximum(means, 0.0)
     for _ in range(3):  # the noise depends on the profile
-        # All recordings share the dark frames' error: as if each had its own, but that many times larger.
+        # All recordings share the dark frames' error: it is treated as one of each recording, but that many times
+        # larger.
         variance = (noise[0] + noise[1] * expected) / frames + dark_variance * len(signals)
         p, covariance, residuals = _weighted_fit(model, means, variance, p, unit)
         expected = model(p)
@@ -110,7 +111,8 @@ def fit_spots(
     sds = np.sqrt(np.diag(covariance))
     amplitude, amplitude_sd = p[0], sds[0]
     if stats.chi2.sf(chi_square, freedom) < _NOT_GAUSSIAN:
-        # The model is wrong rather than the noise large: the total needs no model, the rest is as uncertain as that.
+        # The model is wrong, rather than the noise large: the total light needs no model, and the other values are
+        # uncertain by the misfit.
         sds = sds * math.sqrt(chi_square / freedom)
         total = inside[:, good].sum() / sensor.pixel_width
         amplitude, amplitude_sd = means.sum() / total, math.sqrt(variance.sum()) / total
@@ -130,7 +132,7 @@ def fit_spots(
 
 def _check_inside(sensor: Sensor, sources: Sequence[str], positions: FloatArray, shares: FloatArray) -> None:
     for source, position, share in zip(sources, positions, shares, strict=True):
-        # In the outermost pixel it could as well be the skirt of one that is not on the sensor at all.
+        # In the outermost pixel it could also be the edge of a spot that is not on the sensor at all.
         if share < _LEAST_MASS or min(position - sensor.field[0], sensor.field[1] - position) < sensor.pixel_width:
             raise CalibrationError(
                 f"{source}: the spot is at the edge of the sensor or beyond (at {position:.3g}): move it inward, and"
@@ -159,7 +161,7 @@ def _weighted_fit(
 
     fit = optimize.least_squares(normed, p / unit, jac="3-point")
     jacobian: FloatArray = np.asarray(fit.jac)
-    # What the data say nothing about gets a huge variance, not none.
+    # Parameters that the data do not determine get a huge variance, not zero.
     covariance = np.linalg.inv(jacobian.T @ jacobian + 1e-12 * np.eye(len(p))) * np.outer(unit, unit)
     p = np.asarray(fit.x * unit)
     return p, covariance, target - model(p)
@@ -206,7 +208,7 @@ def check_at_rest(
     spot: Spot,
     number: int,
 ) -> list[str]:
-    """Whether position and light of a spot stay the same from frame to frame; gives notes.
+    """Check that position and light of a spot stay the same from frame to frame; gives notes.
 
     Parameters
     ----------
@@ -215,12 +217,12 @@ def check_at_rest(
     alone:
         Variance of each good pixel by itself, (good pixels,), and the variance of that over its square.
     number:
-        Which of the fit's spots it is.
+        Number of the spot in the fit.
 
     Raises
     ------
     CalibrationError
-        It moves.
+        The spot moves.
     """
     kernel = Kernel(shape="gaussian", sigma=spot.sigma)
     position = np.array([spot.positions[number]])
@@ -233,7 +235,7 @@ def check_at_rest(
     variance, spread = alone
     for pattern, moves in ((slope * sensor.pixel_width, True), (profile, False)):
         power = float((pattern**2 * weight).sum())
-        if power < 1e-6 * float((profile**2 * weight).sum()):  # within one pixel: nobody sees it move
+        if power < 1e-6 * float((profile**2 * weight).sum()):  # within one pixel a motion cannot be seen
             continue
         gains = pattern * weight / power
         shares = gains**2 * variance

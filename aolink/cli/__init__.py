@@ -1,4 +1,4 @@
-"""The command line: parse, call, print; nothing else."""
+"""The command line: it parses, calls other subpackages and prints; nothing else."""
 
 import sys
 from typing import Annotated
@@ -39,7 +39,7 @@ def _options(
 
 
 def main() -> None:
-    """Run the command that the arguments name; what goes wrong is one line and an exit code."""
+    """Run the command that the arguments name; an error gives one line and an exit code."""
     try:
         with ending_the_command():
             app()
@@ -49,7 +49,7 @@ def main() -> None:
     except MemoryError:
         stderr.print("aolink: this needs more memory than there is: take a part of the recording, or fewer axes")
         sys.exit(AolinkError.exit_code)
-    except OSError as error:  # a file or a folder that no message of ours thought of, as the one for temporary files
+    except OSError as error:  # a file or folder without a message of ours, such as that for temporary files
         what = f"{error.filename}: " if error.filename else ""
         stderr.print(f"aolink: {what}{(error.strerror or str(error)).lower()}", markup=False)
         sys.exit(AolinkError.exit_code)

@@ -107,7 +107,7 @@ def calibrate(
         else:
             _write_calibrated(loaded, rig, paths, output, overwrite=overwrite, as_json=as_json)
     except AolinkError as error:
-        # Somebody has covered and lit the camera for them.
+        # A person has covered and lit the camera for these recordings.
         if not keep and (made := sorted(map(str, folder.glob("*.mcap")))):
             keep = folder
             raise type(error)(f"{error}; `aolink calibrate` takes what was recorded: {' '.join(made)}") from None
@@ -127,7 +127,7 @@ def _write_calibrated(
 
     result = calibrate_recordings(loaded, rig_text(rig, loaded), paths)
     with writing(output, overwrite=overwrite, sources=paths) as unfinished:
-        unfinished.write_text(result.text, newline="")  # with the line ends that the rig file had
+        unfinished.write_text(result.text, newline="")  # with the rig file's own line ends
     if as_json:
         print(json.dumps(tables.calibration_as_json(result)))
         return

@@ -1,4 +1,4 @@
-"""What the commands share: the consoles, common options, opening files."""
+"""Code that the commands share: the consoles, common options, opening files."""
 
 import re
 import shutil
@@ -57,7 +57,7 @@ OutputOption = Annotated[Path, typer.Option("--output", "-o", metavar="FILE", he
 
 
 def warn(text: str) -> None:
-    """Say what is doubtful, on standard error."""
+    """Print a warning on standard error."""
     stderr.print(f"aolink: warning: {text}", markup=False)
 
 
@@ -69,7 +69,7 @@ def progress(what: str, total: int | None) -> Iterator[Callable[..., None]]:
 
 
 def load_checked(path_or_name: str) -> "Rig":
-    """Load a rig file that something is about to run on: refuse what cannot work, print what is doubtful."""
+    """Load a rig file before something runs on it: refuse one that cannot work, and print what is doubtful."""
     from aolink.jobs.check_rig import check_rig
     from aolink.rig import load_rig
 
@@ -94,7 +94,7 @@ def with_key(
 
 
 def open_recording(file: "str | Path | Url", *, check: bool = False, side: "Sequence[Path | Url]" = ()) -> "Recording":
-    """Open a recording with its side files, and say so where it is not whole."""
+    """Open a recording with its side files, and print a warning where it is not whole."""
     from aolink.recording.reader import Recording
 
     recording = Recording(file, check=check, side=side)
@@ -131,12 +131,12 @@ def check_measured(file: "Path | Url", scores: "Mapping[str, Score]") -> None:
 
 
 def program() -> str:
-    """What the user types for this program: its name where the shell finds it, else its path."""
+    """The text by which the user calls this program: its name where the shell finds it, otherwise its path."""
     return "aolink" if shutil.which("aolink") else str(Path(sys.executable).with_name("aolink"))
 
 
 def get_ready(rig: "Rig", estimators: Sequence[str]) -> None:
-    """Compile the loops of these estimators before anything waits for them, and say so on a terminal."""
+    """Compile the loops of these estimators before anything waits for them, with a message on a terminal."""
     from aolink.estimation import make_estimator
 
     with stderr.status(

@@ -19,11 +19,15 @@ def export(
     ],
     estimator: Annotated[
         list[str] | None,
-        typer.Option("--estimator", "-e", help="Whose estimates; may be given several times. All by default."),
+        typer.Option(
+            "--estimator",
+            "-e",
+            help="Estimators whose estimates are written; may be given several times; all by default.",
+        ),
     ] = None,
     overwrite: OverwriteOption = False,
 ) -> None:
-    """Write exposures, inputs, estimates and truth of a recording as other programs read them.
+    """Write exposures, inputs, estimates and truth of a recording in formats that other programs read.
 
     NumPy, NetCDF and AOT telemetry hold the frames and the paths; a table has a row for each exposure and axis.
     """

@@ -47,7 +47,9 @@ def plot(
     estimator: EstimatorOption = None,
     exposure: Annotated[
         int | None,
-        typer.Option(min=0, metavar="N", help="Exposure to draw, counted from 0; else the one with the largest blur."),
+        typer.Option(
+            min=0, metavar="N", help="Exposure to draw, counted from 0; by default the one with the largest blur."
+        ),
     ] = None,
     lenslet: LensletOption = None,
     side: Annotated[
@@ -60,7 +62,7 @@ def plot(
 ) -> None:
     """Draw one figure of a recording in a paper's size.
 
-    blur: what the camera saw over the session, and the paths. exposure: one exposure's path over its blur, the path's
+    blur: the camera's blur over the session, and the paths. exposure: one exposure's path over its blur, the path's
     histogram and the intensity profile. nis, errors, losses, latency: along the session. pupil: maps over the
     lenslets. scene: a picture as it came, restored, and at rest.
     """
@@ -90,9 +92,9 @@ def report(
     steps: StepsOption = False,
     overwrite: OverwriteOption = False,
 ) -> None:
-    """Write a page that tells a session: how good the estimates are, the exposures that tell most, what was lost.
+    """Write a page about a session: how good the estimates are, the most telling exposures, what was lost.
 
-    One file of HTML with everything in it. Two or three recordings stand side by side; of more there is a table.
+    One file of HTML with everything in it. Two or three recordings stand side by side; for more there is a table.
     """
     from aolink.plotting.report import write_report
 
@@ -107,7 +109,8 @@ def report(
 
 
 def _with_sides(files: list[str]) -> "list[Recording]":
-    """The recordings, each with its side files among the others. Raises RecordingError for one of no recording here."""
+    """The recordings, each with its side files among the others. Raises RecordingError for a side file of none of these
+    recordings."""
     from aolink.recording.reader import check_stands_alone
 
     opened = [open_recording(each) for each in files]
@@ -123,7 +126,7 @@ def _with_sides(files: list[str]) -> "list[Recording]":
 
 
 def _in_folders(files: list[str]) -> list[str]:
-    """Files and URLs as they are; of a folder, its recordings by name."""
+    """Files and URLs as they are; for a folder, its recordings by name."""
     found: list[str] = []
     for each in files:
         if Path(each).is_dir():

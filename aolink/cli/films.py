@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from aolink.importing.frames import Settings
 
 RateOption = Annotated[
-    float | None, typer.Option("--rate", metavar="HZ", help="Frames a second, where the film does not say it.")
+    float | None, typer.Option("--rate", metavar="HZ", help="Frames a second, where the film does not state them.")
 ]
 SumOption = Annotated[
     int, typer.Option("--sum", metavar="K", min=1, help="Make one exposure of K frames: the mean of their light.")
@@ -43,7 +43,7 @@ TopicOption = Annotated[
 def film_settings(
     rate: float | None, frames: int, track: int, at: list[str] | None, invert: bool, gamma: float, **more: object
 ) -> "Settings":
-    """The options of a command as settings. Raises ImportingError for a place that is none."""
+    """The options of a command as settings. Raises ImportingError for an invalid place."""
     from aolink.importing.frames import Settings
 
     if rate is not None and rate <= 0:
@@ -81,14 +81,14 @@ def import_(
         float | None, typer.Option(metavar="S", min=0.0, help="Exposure time of a frame, s, where the film lacks it.")
     ] = None,
     start: Annotated[
-        str | None, typer.Option(metavar="DATE", help="When it began, such as 2026-11-22T09:30, in UTC.")
+        str | None, typer.Option(metavar="DATE", help="Start of the film, such as 2026-11-22T09:30, in UTC.")
     ] = None,
     frames: SumOption = 1,
     track: TrackOption = 0,
     at: AtOption = None,
     invert: InvertOption = False,
     background: Annotated[
-        bool, typer.Option("--background", help="Take each frame's median off: the ground is no light.")
+        bool, typer.Option("--background", help="Subtract each frame's median, which is background.")
     ] = False,
     gamma: GammaOption = 1.0,
     scale: Annotated[
@@ -96,7 +96,8 @@ def import_(
         typer.Option(
             metavar="COUNTS",
             help="Counts for a pixel value of one. Without it 8 bits, or floats up to 1.0, are the full range of the"
-            " camera and 16 bits are counts; floats above 1.0 need it. Of slopes: slope units for one of the file's.",
+            " camera and 16 bits are counts; floats above 1.0 need it. For slopes: slope units for one of the file's"
+            " units.",
         ),
     ] = None,
     topic: TopicOption = None,

@@ -1,4 +1,4 @@
-"""The command identify: recordings of blurred frames into a rig file with a model of what disturbs."""
+"""The command identify: it makes a rig file with a model of the disturbance from recordings of blurred frames."""
 
 import glob
 import json
@@ -21,11 +21,11 @@ if TYPE_CHECKING:
     from aolink.rig import Rig
 
 _LOOK_S = 0.2
-"""How often a recording that is being written is looked at."""
+"""Time between two readings of a recording that is being written, s."""
 
 
 class PlantKind(StrEnum):
-    """What is known of the plant."""
+    """The kinds of plants that can be fitted."""
 
     KNOWN = "known"
     FIRST_ORDER = "first-order"
@@ -44,8 +44,9 @@ def identify(
         typer.Option(
             "--model",
             metavar="KIND+KIND...",
-            help="What disturbs: random-walk, ornstein-uhlenbeck, second-order, resonance, ar3, ar4, or a sum of them."
-            " Given several times, cross-validation chooses; without it, from nine; with --follow, the rig file's own.",
+            help="Model of the disturbance: random-walk, ornstein-uhlenbeck, second-order, resonance, ar3, ar4, or a"
+            " sum of them. Given several times, cross-validation chooses; without it, from nine; with --follow, the"
+            " rig file's own.",
         ),
     ] = None,
     plant: Annotated[
@@ -72,10 +73,10 @@ def identify(
     overwrite: OverwriteOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Identify what disturbs the spots, and the plant if asked, from recordings of blurred frames.
+    """Identify the disturbance of the spots, and the plant if asked, from recordings of blurred frames.
 
     Each parameter has a set that holds the truth with a probability of 95 %. It may have several pieces: frequencies
-    that the exposures cannot tell from each other.
+    that the exposures cannot distinguish.
     """
     from aolink.identification import CANDIDATES
     from aolink.jobs import identify as job
@@ -125,7 +126,7 @@ def identify(
 def _follow(
     place: "Path | Url", output: Path, rig: "Rig | None", wanted: "Wanted", sources: list[Path], *, as_json: bool
 ) -> None:
-    """Follow a recording up to its end, and write what is offered."""
+    """Follow a recording up to its end, and write the models that are offered."""
     from aolink.control.drift import WINDOW
     from aolink.jobs.follow import Following, Offer, offer_path
     from aolink.recording.growing import GrowingRecording
@@ -161,7 +162,7 @@ def _follow(
 
 
 def _say(each: "News | Offer", *, as_json: bool) -> None:
-    """Print what is new, a line for each thing, at once."""
+    """Print news at once, a line for each."""
     from aolink.cli.tables.identification import offer_lines
     from aolink.jobs.follow import News
 

@@ -48,7 +48,7 @@ def view(
         bool, typer.Option("--web", help="Serve the web viewer on this machine (127.0.0.1) until Ctrl-C.")
     ] = False,
     exposure: Annotated[
-        int | None, typer.Option(min=0, metavar="N", help="Look into one exposure, counted from 0.")
+        int | None, typer.Option(min=0, metavar="N", help="Show one exposure alone, counted from 0.")
     ] = None,
     start: Annotated[
         float | None, typer.Option(metavar="S", help="Begin at this time, s from the first exposure.")
@@ -62,7 +62,7 @@ def view(
 ) -> None:
     """Open a recording in Rerun, or a Rerun file that was saved from one.
 
-    Of five exposures or fewer, paths are shown at every fast step; of more, at 32 places of each exposure.
+    For five exposures or fewer, paths are shown at every fast step; for more, at 32 places of each exposure.
     """
     import tempfile
 
@@ -78,7 +78,7 @@ def view(
     recording = None if file.suffix == ".rrd" else open_recording(file, side=sides)
     choices = (exposure, start, end, lenslet, compare)
     if recording is None and (save is not None or side or any(each is not None for each in choices)):
-        raise typer.BadParameter(f"{file} is a Rerun file already: --save, side files and choices are for a recording")
+        raise typer.BadParameter(f"{file} is a Rerun file already: --save, side files and choices need a recording")
     if not (web or save or screenshot):
         viewing.check_display()
     if recording is None:
@@ -112,11 +112,12 @@ def view(
 
 
 class _WithoutPandas:
-    """Lets nobody load pandas: pyarrow would, for 0.3 s, to ask whether the first array that it makes is of pandas."""
+    """Prevents pandas from being loaded: pyarrow would load it, in 0.3 s, to check whether the first array that it
+    makes is one of pandas."""
 
     def find_spec(self, name: str, *_: object) -> None:
         if name == "pandas":
-            raise ModuleNotFoundError("looking at a recording needs no pandas", name=name)
+            raise ModuleNotFoundError("viewing a recording needs no pandas", name=name)
 
 
 def _address(address: str) -> None:
@@ -124,7 +125,7 @@ def _address(address: str) -> None:
 
 
 def _numbers(recording: "Recording", exposure: int | None, start: float | None, end: float | None) -> range | None:
-    """Which exposures are asked for; None for all. Raises ViewerError where there are none."""
+    """The numbers of the exposures that are asked for; None for all. Raises ViewerError where there are none."""
     count = recording.n_frames
     if exposure is not None:
         if start is not None or end is not None:
@@ -146,7 +147,7 @@ def _numbers(recording: "Recording", exposure: int | None, start: float | None, 
 
 
 def _first_steps(recording: "Recording") -> list[int]:
-    """The fast steps at which the exposures begin, by the messages that tell of them."""
+    """The fast steps at which the exposures begin, from the messages that have them."""
     from aolink.recording import topics
     from aolink.recording.schemas_pb2 import ExposureInfo
 

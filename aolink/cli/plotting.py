@@ -63,7 +63,7 @@ def _label(row: Mapping[str, Any]) -> str:
 
 
 def _value(row: Mapping[str, Any], key: str) -> float:
-    """A mean NIS or NEES over what a consistent filter has: the middle of its bounds."""
+    """A mean NIS or NEES divided by that of a consistent filter, the middle of its bounds."""
     value = float(row[key])
     if key == "path_rmse":
         return value

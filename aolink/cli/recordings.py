@@ -51,7 +51,7 @@ def info(
     check: Annotated[bool, typer.Option("--check", help="Read every byte, not the index alone.")] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Say what a recording holds. Exit code 1 if a part of it cannot be read."""
+    """Summarise a recording. Exit code 1 if a part of it cannot be read."""
     from aolink.cli.tables import recordings as tables
     from aolink.recording.facts import recording_facts
 
@@ -148,7 +148,7 @@ def estimate(
             check_target(table, overwrite=True, suffix=".parquet")
             load_parquet()
         sources = batch.shard(files, shard) if shard else files
-        if scheduler:  # the workers have other folders
+        if scheduler:  # the workers run in other folders
             sources, output = [batch.absolute(each) for each in sources], output.absolute()
         todo: Sequence[Job | SideJob] = batch.side_jobs(
             sources, models, estimator or ["o3"], output, engine.value, table=table is not None, overwrite=overwrite
@@ -168,7 +168,7 @@ def estimate(
 
 
 def batch_models(rig: str | None, settings: Sequence[str] | None) -> "list[Model]":
-    """What --rig and --set ask for."""
+    """The models that --rig and --set ask for."""
     from aolink.jobs import batch
     from aolink.rig import load_rig
 
@@ -187,7 +187,7 @@ def _estimate_many(
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise AolinkError(f"cannot make the folder {folder}: {(error.strerror or str(error)).lower()}") from None
-    # The table is held from the start, so that the same part that is begun twice is refused.
+    # The table's file is locked from the start, so that the same part, if begun twice, is refused.
     with writing(table, overwrite=True) as partial:
         with StopRequest().installed() as stop, progress("estimate", len(todo)) as tell:
             if scheduler:
@@ -222,7 +222,7 @@ _MOST_ROWS_SHOWN = 40
 
 
 def _told(each_done: "Iterable[Done]") -> "list[Done]":
-    """What jobs came to, with what went wrong printed as it comes."""
+    """The results of jobs; errors and warnings are printed as they come."""
     done = []
     for each in each_done:
         done.append(each)
@@ -326,7 +326,7 @@ def compare(
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Say field by field what differs between two recordings. Exit code 1 if something does.
+    """List field by field how two recordings differ. Exit code 1 if they do.
 
     A side file is compared with the recording's own estimates by the same names.
     """

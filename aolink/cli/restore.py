@@ -15,7 +15,7 @@ from aolink.files import check_target
 
 
 class _NamingMethods(TyperCommand):
-    """Its help names all methods: installed packages are searched for them when the help is shown."""
+    """An option whose help names all methods: installed packages are searched for them when the help is shown."""
 
     def format_help(self, *arguments: Any, **named: Any) -> None:
         from aolink.restoration import METHODS, find_method
@@ -118,7 +118,7 @@ def _deblur_picture(
 
     check_target(out, overwrite=overwrite, sources=[image, psf], error=RestorationError)
     whole = read_picture(image)
-    # Transparency is no light: it stays as it is.
+    # Transparency is not light: it stays as it is.
     picture = whole[..., :3] if whole.ndim == 3 and whole.shape[2] == 4 else whole
     seen = finite_pixels(picture)
     missing = 0 if seen is None else int((~seen).sum())

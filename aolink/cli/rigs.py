@@ -198,7 +198,8 @@ def devices(
     key: KeyOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """List the serial ports and the drivers of this machine with their devices, or identify what is behind ports."""
+    """List the serial ports and the drivers of this machine with their devices, or identify the devices behind
+    ports."""
     from aolink.devices.discovery import Found, find_drivers, identify_port, list_ports
 
     if not ports:

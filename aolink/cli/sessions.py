@@ -88,7 +88,7 @@ def record(
         ),
     ] = None,
     force: Annotated[
-        bool, typer.Option("--force", help="With --control: also a loop that is unstable by the model.")
+        bool, typer.Option("--force", help="With --control: close the loop even if it is unstable by the model.")
     ] = False,
     view: Annotated[
         bool, typer.Option("--view", help="Show the session live in Rerun, which skips exposures if it is too slow.")
@@ -106,7 +106,7 @@ def record(
     reconnect: Annotated[
         float,
         typer.Option(
-            min=0, metavar="S", help="Wait so long for a native device's port that vanishes, and go on with it."
+            min=0, metavar="S", help="Wait this long for a native device's port that has vanished, then go on with it."
         ),
     ] = 0.0,
     split_mib: Annotated[
@@ -216,14 +216,14 @@ def _print_session(report: "Report", output: Path, as_json: bool) -> None:
         stdout.print(tables.session(report))
         written = report.files[0] if report.files else output
         parts = f" in {len(report.files)} files" if len(report.files) > 1 else ""
-        text = f"{written}: {report.exposures} exposures{parts}, {report.ended}; look at it: {program()} view {written}"
+        text = f"{written}: {report.exposures} exposures{parts}, {report.ended}; view it: {program()} view {written}"
         stdout.print(text, markup=False)
 
 
 def _live_view(
     rig: "Rig", estimators: Sequence[str], true_scene: "NDArray[np.uint16] | None" = None, *, shown: bool
 ) -> "AbstractContextManager[LiveView | None]":
-    """What shows exposures in the viewer, or None."""
+    """The function that shows exposures in the viewer, or None."""
     if not shown:
         return nullcontext()
     from aolink import viewing
@@ -239,7 +239,7 @@ def replay(
     file: FileArgument,
     estimator: EstimatorOption = None,
     rate: Annotated[
-        float, typer.Option(min=0, metavar="X", help="X times as fast as it was recorded; 0 for as fast as it goes.")
+        float, typer.Option(min=0, metavar="X", help="Pace relative to the recording's; 0 for as fast as possible.")
     ] = 0.0,
     start: Annotated[float, typer.Option(metavar="S", help="Begin at this time, s from the first exposure.")] = 0.0,
     end: Annotated[float | None, typer.Option(metavar="S", help="End at this time.")] = None,
@@ -247,8 +247,8 @@ def replay(
         str | None,
         typer.Option(
             metavar="NAME",
-            help="Say what this controller would have commanded, served by the first -e; and on a simulated rig what"
-            " would have come of it.",
+            help="Compute what this controller would have commanded, served by the first -e; on a simulated rig, also"
+            " the slopes that it would have left.",
         ),
     ] = None,
     view: Annotated[bool, typer.Option("--view", help="Show it live in Rerun.")] = False,
@@ -331,7 +331,7 @@ def _replay_control(recording: "Recording", controller: str, estimator: str, *, 
 
 
 def _are_driven(rig: "Rig", camera: str | None, mirror: str | None) -> bool:
-    """Whether a port or the rig file says what drives each of the devices."""
+    """Whether a port or the rig file names the driver of each device."""
     return all(port or kind in rig.devices for kind, port in (("camera", camera), ("mirror", mirror)))
 
 
@@ -403,7 +403,7 @@ def demo(
                 control=control or "", stoppable=stop.installed, progress=tell,
             )  # fmt: skip
     except Interrupted as interrupted:
-        raise Interrupted(interrupted.number, f"what was made until then is in {folder}") from None
+        raise Interrupted(interrupted.number, f"the files made until then are in {folder}") from None
     if not stop():
         recording = Recording(result.recording)
         stdout.print(scores.scores(scored(recording, recording.estimators)))

@@ -1,4 +1,4 @@
-"""What a command does with the terminal: questions, progress bars."""
+"""A command's use of the terminal: questions, progress bars."""
 
 from __future__ import annotations
 
@@ -61,11 +61,11 @@ def ask(console: Console, question: str) -> str:
     try:
         return input()
     except Interrupted:
-        console.print()  # what is said next is not on the question's line
+        console.print()  # the next message is not on the question's line
         raise
 
 
 def input_ended() -> bool:
-    """Whether standard input is at its end; what comes on it otherwise is thrown away."""
+    """Whether standard input is at its end; any input on it is thrown away."""
     readable, _, _ = select.select([0], [], [], 0)
     return bool(readable) and not os.read(0, 4096)

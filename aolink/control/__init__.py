@@ -1,4 +1,5 @@
-"""Controllers: what the mirror is to do, from exposures and estimates. No time, no files, no ports."""
+"""Controllers: they give the mirror's inputs from exposures and estimates. The subpackage knows no time, files or
+ports."""
 
 from aolink.control.controller import Controller, ControllerRow, Seen
 from aolink.control.drift import Fit, FitMonitor

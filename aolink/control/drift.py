@@ -1,4 +1,4 @@
-"""Whether the model still fits: the innovations of the estimator that closes the loop."""
+"""The check whether the model still fits, by the innovations of the estimator that closes the loop."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from aolink.numerics.arrays import FloatArray
 WINDOW = 60
 """Exposures that are judged together."""
 TOLERATED_RATIO = 2.0
-"""No model is exact: a mean NIS within this factor of its expectation is no drift, however significant."""
+"""No model is exact: a mean NIS within this factor of its expectation does not count as drift, however significant."""
 _TOLERATED_CORRELATION = 0.3
 _SIGMAS = 5.0
-"""How many standard deviations of chance a window must be off."""
+"""Least deviation of a window, in standard deviations by chance."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Fit:
-    """How the innovations of the newest exposures look, those of `WINDOW`."""
+    """Statistics of the innovations of the newest `WINDOW` exposures."""
 
     nis_ratio: float
     """Mean NIS over its expectation, the number of measurements: 1 where the model is right."""
@@ -33,9 +33,8 @@ class Fit:
     """Whether both are within what chance and an inexact model explain."""
 
     def text(self) -> str:
-        return (
-            f"NIS {self.nis_ratio:.2f} of what is expected, neighbouring innovations correlate by {self.whiteness:+.2f}"
-        )
+        correlation = f"correlation of neighbouring innovations {self.whiteness:+.2f}"
+        return f"NIS {self.nis_ratio:.2f} times its expectation, {correlation}"
 
 
 class _Sums(NamedTuple):
@@ -68,7 +67,7 @@ class FitMonitor:
         return self.fit()
 
     def fit(self) -> Fit | None:
-        """How the innovations of the newest exposures look; None while they are too few."""
+        """Statistics of the innovations of the newest exposures; None while they are too few."""
         if len(self._window) < WINDOW:
             return None
         nis, count, product, square = (sum(each) for each in zip(*self._window, strict=True))
@@ -81,7 +80,7 @@ class FitMonitor:
 def _whitened(estimate: Estimate) -> FloatArray:
     """Innovations in units of their covariance, (axes, n_measurements)."""
     S = estimate.innovation_covariance
-    if S.ndim == 2:  # of many measurements: the diagonal
+    if S.ndim == 2:  # with many measurements, only the diagonal is given
         return np.asarray(estimate.innovation / np.sqrt(np.where(S > 0, S, 1.0)))
     sound = np.diagonal(S, axis1=1, axis2=2).min(axis=1) > 0
     root = np.linalg.cholesky(np.where(sound[:, None, None], S, np.eye(S.shape[-1])))

@@ -1,20 +1,21 @@
-"""Whether a controller pays: what the integrator, and a mirror that holds still, would have left of a disturbance.
+"""The comparison of a controller with the integrator and a mirror that holds still, by the disturbance that each would
+have left.
 
-What the mirror did is known, and so is what another input would have done in its place: the difference of the two
-inputs, by the plant's model of the mirror, is what the slopes would have differed by. So another controller is followed
-beside the one that acts, on the same exposures, and what it would have left is compared. No model of the disturbance is
-believed for that; the centroids say how far the exposures' means would have been from zero.
+The inputs of the mirror are known, and so is the effect of other inputs in their place: the slopes would have differed
+by the response of the plant's mirror to the difference of the two inputs. So another controller is computed beside the
+one that acts, on the same exposures, and the slopes that it would have left are compared. This needs no model of the
+disturbance; the centroids say how far the exposures' means would have been from zero.
 
-Inside an exposure the frame says how far the spot went, but not when. With s the slopes less their mean in the
-exposure, and e the difference that another input would have made, less its own mean, s = -b e + r, where r has nothing
-to do with e. Then var s = b^2 var e + var r: over many exposures b^2 is the slope of a line through the blur's variance
-against that of e, and the other input would have left var s + (1 - 2 b) var e. A controller that moves with the
-disturbance is explained by b = 0 where it acts; one that moves for nothing, by b = 1.
+Inside an exposure the frame shows how far the spot moved, but not when. With s the slopes less their mean in the
+exposure, and e the difference that another input would have made, less its own mean, s = -b e + r, where r is
+independent of e. Then var s = b^2 var e + var r: over many exposures b^2 is the slope of a straight-line fit of the
+blur's variance to that of e, and the other input would have left var s + (1 - 2 b) var e. Where the acting controller
+moves with the disturbance, b is 0; where it moves needlessly, b is 1.
 
-This does not find whether a controller that does not act would pay, because what moves for nothing still moves most
-where there is most to cancel. Where its model predicts the measurements as well as it says, it is believed (b = 1), and
-the controller is tried. It then acts again until it does not pay, and each trial that fails doubles the time to the
-next one.
+This cannot show whether a controller that does not act would be better, because one that moves needlessly still moves
+most where there is most to cancel. Where its model predicts the measurements as well as its covariance says, b = 1 is
+assumed, and the controller is tried. It then acts until it is worse again, and each trial that fails doubles the time
+to the next one.
 """
 
 from __future__ import annotations
@@ -37,27 +38,28 @@ from aolink.numerics.arrays import FloatArray
 from aolink.rig import Rig
 
 WINDOW = 120
-"""Exposures that are judged together, at most, ..."""
+"""The most exposures that are judged together."""
 _FEWEST = 40
-"""... and at least."""
+"""The fewest exposures that are judged together."""
 _WAIT = WINDOW
-"""Exposures from leaving the controller that was asked for to its first trial."""
+"""Exposures from the fall-back to the first trial of the controller that was asked for."""
 _SETTLING = 5
-"""Exposures that are left out after each change of who acts."""
+"""Exposures that are left out after each change of the acting controller."""
 _LEAST_GAIN = 0.04
-"""Share of the slopes' mean square that must be gained: 2 % of their root mean square."""
+"""Least gain, as a share of the slopes' mean square: it is 2 % of their root mean square."""
 _SIGMAS = 2.0
-"""How many standard errors the gain must be above that, and the slope b^2 is taken as less than it was found, ..."""
+"""Standard errors by which the gain must exceed that, and by which the estimate of b^2 is reduced."""
 _SIGMAS_WHERE_IT_FITS = 3.5
-"""... where the model is not known to be wrong: the blur of some exposures may follow the mirror by chance."""
+"""The number for b^2 where the model is not known to be wrong: the blur of some exposures may follow the mirror by
+chance."""
 _LAGS = 8
-"""Exposures over which what is compared is correlated, as the disturbance is."""
+"""Exposures over which the compared quantity is correlated, as the disturbance is."""
 _FEW = 1.5
 _BLUR = Needs(what="moments", orders=(1, 2))
 
 
 class Still:
-    """The mirror holds its safe input."""
+    """A controller with which the mirror holds its safe input."""
 
     def __init__(self, rig: Rig) -> None:
         self._u = rig.mirror.park
@@ -77,24 +79,25 @@ STILL = ControllerRow(name="still", summary="holds the safe input", build=Still,
 
 @dataclass(frozen=True, kw_only=True)
 class Change:
-    """Another controller is to act."""
+    """The change to another controller."""
 
     acting: str
     gained: float
-    """How much less it would have left, as a share of the slopes' root mean square."""
+    """The slopes that it would have left less, as a share of their root mean square."""
 
 
 class _Judged(NamedTuple):
-    """An exposure, as one of those that do not act would have left it, against the one that acts. Sums over slopes."""
+    """One exposure with a rival's inputs compared with those of the acting controller; all values are sums over
+    slopes."""
 
     means: float
     """Difference of the squared means."""
     within: float
-    """Variance, inside the exposure, of the difference."""
+    """Variance of the slopes' difference inside the exposure."""
 
 
 class Rival:
-    """A controller that does not act, followed beside the one that does.
+    """A controller that does not act, computed beside the one that does.
 
     Parameters
     ----------
@@ -109,18 +112,19 @@ class Rival:
         self._A, self._B = plant.A[np.ix_(self._moved, self._moved)].T.copy(), plant.B[self._moved].T.copy()
         self._C = plant.C[:, self._moved].T.copy()
         self._offset = np.zeros((plant.axes, len(self._moved)))
-        """Offset of the mirror's states from those that it really has."""
+        """The mirror's states with the rival's inputs less its real states."""
         self._low, self._high = mirror.input_min, mirror.input_max
         self._most_change = mirror.slew_max_per_s * rig.timing.fast_step_s or math.inf
         self._u, self._sent, self._sees = held, held, False
         self._wanted: FloatArray | None = None
         """The input that was wanted last, once the mirror holds it."""
         self._ahead: list[FloatArray] = []
-        """Its inputs from the end of the newest exposure on."""
+        """The rival's inputs from the end of the newest exposure on."""
 
     def see(self, held: FloatArray, slopes: FloatArray, state: FloatArray | None) -> FloatArray:
         """Take the next exposure: inputs that the mirror held since the end of the one before, (k, n_inputs),
-        centroids, and the estimated state at its end. Gives what the slopes would have differed by, (k, n_outputs)."""
+        centroids, and the estimated state at its end. Gives the difference that the rival's inputs would have made to
+        the slopes, (k, n_outputs)."""
         rows = self._ahead
         while len(rows) < len(held):
             rows.append(self._next())
@@ -140,7 +144,7 @@ class Rival:
         return moved
 
     def _next(self) -> FloatArray:
-        """Its input in the next fast step, as the mirror's converter would put it out."""
+        """The rival's input in the next fast step, rounded by the mirror's converter."""
         if not self._sees or (given := self._controller.step(self._u)) is self._wanted:
             return self._u
         wanted = near = np.minimum(np.maximum(given, self._low), self._high)
@@ -152,10 +156,10 @@ class Rival:
 
 
 class FallBack:
-    """Says which controller is to act: the one that was asked for, or another while that one does not pay.
+    """Chooses the controller that acts: the one that was asked for, or another while that one is worse.
 
     The others are the integrator and a mirror that holds still. Another one acts once it would have left significantly
-    less over the last exposures; the one that was asked for is tried again where its model promises as much.
+    less over the last exposures; the one that was asked for is tried again where its model predicts as large a gain.
     """
 
     def __init__(self, rig: Rig, row: ControllerRow, delay_steps: int) -> None:
@@ -164,22 +168,23 @@ class FallBack:
         self._rows = {each.name: each for each in (row, INTEGRATOR, STILL)}
         self._rivals: dict[str, Rival] = {}
         self._wait, self._since, self._tries = _WAIT, 0, 0
-        """Exposures until the asked-for controller is tried again, those since it was left or tried, and trials."""
+        """Exposures until the asked-for controller is tried again, exposures since it was left or tried, and number of
+        trials."""
         self._end = 0
         """The step after the newest exposure."""
         self._begin()
 
     def controller(self) -> Controller:
-        """A controller of the kind that is to act."""
+        """A controller of the kind that acts."""
         return self._rows[self.acting].build(self._rig)
 
     def interrupt(self) -> None:
-        """The loop is open, or exposures are missing: who does not act is followed anew from what the mirror holds."""
+        """Begin the rivals anew from the input that the mirror holds, because the loop is open or exposures are
+        missing."""
         self._rivals = {}
 
     def see(self, exposure: Exposure, slopes: FloatArray, estimate: Estimate | None, fit: Fit | None) -> Change | None:
-        """Take the next exposure with its centroids, (n_outputs,); says where another controller is to act.
-
+        """Take the next exposure with its centroids, (n_outputs,); gives a `Change` where another controller is to act.
         ``fit`` says how well the asked-for controller's model fits, as far as that is known.
         """
         held = np.concatenate([exposure.lead_inputs, exposure.inputs])
@@ -212,7 +217,7 @@ class FallBack:
         return self._verdict(fit)
 
     def _begin(self) -> None:
-        """Judge from now on."""
+        """Forget earlier exposures, and judge from now on."""
         self.interrupt()
         self._settling = 0
         self._blur: deque[float] = deque(maxlen=WINDOW)
@@ -220,7 +225,7 @@ class FallBack:
         self._judged: dict[str, deque[_Judged]] = {name: deque(maxlen=WINDOW) for name in self._rows}
 
     def _verdict(self, fit: Fit | None) -> Change | None:
-        """Who is to act, where that changes; the asked-for controller once it is time to try it."""
+        """The controller that is to act, where that changes; the asked-for one once it is time to try it."""
         if len(self._power) < _FEWEST:
             return None
         power, blur = float(np.mean(self._power)), np.array(self._blur)
@@ -265,8 +270,8 @@ def _blur(rig: Rig, exposure: Exposure) -> float:
 
 
 def _share(judged: FloatArray, blur: FloatArray, sigmas: float) -> float:
-    """b of the module's text, from the variances inside the exposures; so many standard errors of b^2 on the safe side:
-    the benefit of the doubt is with the controller that acts."""
+    """b of the module's text, from the variances inside the exposures; b^2 is reduced by the given number of standard
+    errors: the benefit of the doubt is with the controller that acts."""
     known = np.isfinite(blur)
     within = judged[known, 1]
     if len(within) < _FEWEST or (spread := float(within.var())) == 0:
@@ -278,9 +283,8 @@ def _share(judged: FloatArray, blur: FloatArray, sigmas: float) -> float:
 
 
 def _difference(judged: FloatArray, share: float) -> tuple[float, float]:
-    """What a rival would have left less what was left, mean square, and the standard error of that, for b = ``share``.
-
-    ``judged`` are the rows of `_Judged`.
+    """Mean square of the slopes that a rival would have left less that of the real ones, and its standard error, for b
+    = ``share``. ``judged`` are the rows of `_Judged`.
     """
     means, within = judged.T
     return _mean_and_error(means + (1 - 2 * share) * within)
@@ -293,5 +297,6 @@ def _mean_and_error(series: FloatArray) -> tuple[float, float]:
     total = float(off @ off)
     for lag in range(1, min(_LAGS, n - 1) + 1):
         total += 2 * (1 - lag / (_LAGS + 1)) * float(off[lag:] @ off[:-lag])
-    # An error that is found from few exposures is too small: the quantile at this bandwidth (Kiefer and Vogelsang).
+    # A standard error from few exposures is too small, so the quantile at this bandwidth is used (Kiefer and
+    # Vogelsang).
     return mean, math.sqrt(max(total, 0.0)) / n * (1 + _FEW * _LAGS / n)

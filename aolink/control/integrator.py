@@ -1,4 +1,4 @@
-"""The integrator on centroids: what most loops run on."""
+"""The integrator on centroids, the controller of most loops."""
 
 from __future__ import annotations
 
@@ -11,10 +11,9 @@ from aolink.rig import Rig
 
 
 class Integrator:
-    """u = u_0 + (1 - leak) (u_held - u_0) - gain R y, once an exposure.
-
-    y are the centroids, R the pseudo-inverse of the plant's response at rest (modal: weak modes are left alone), u_0
-    the safe input. It starts from the input that the mirror really holds, so that it does not wind up at the limits.
+    """The controller u = u_0 + (1 - leak) (u_held - u_0) - gain R y, once an exposure. y are the centroids, R the
+    pseudo-inverse of the plant's response at rest (modal: weak mirror modes are left out), u_0 the safe input. It
+    starts from the input that the mirror really holds, so that it does not wind up at the limits.
     """
 
     def __init__(self, rig: Rig) -> None:

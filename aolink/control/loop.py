@@ -1,4 +1,5 @@
-"""The closed loop, without time, files or ports: exposures and estimates in, the mirror's inputs out, by fast step."""
+"""The closed loop, without time, files or ports: it takes exposures and estimates, and gives the mirror's input for
+each fast step."""
 
 from __future__ import annotations
 
@@ -22,14 +23,14 @@ from aolink.numerics.arrays import FloatArray
 from aolink.rig import Rig
 
 BLIND_EXPOSURES = 5
-"""Exposures in a row without a measurement over which the prediction is believed."""
+"""Exposures in a row without a measurement over which the prediction is trusted."""
 TRUSTED_EXPOSURES = 3
 """Exposures in a row with a measurement after which a loop that was lost is closed again."""
 _CENTROIDS = Needs(what="moments", orders=(1,))
 
 
 class State(enum.IntEnum):
-    """What the loop does. The numbers are those of the recording's schema."""
+    """The state of the loop. The numbers are those of the recording's schema."""
 
     CLOSED = 0
     HELD = 1
@@ -40,31 +41,31 @@ class State(enum.IntEnum):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Act:
-    """What the loop made of one exposure."""
+    """The result of the loop for one exposure."""
 
     frame_id: int
     first_step: int
     """The first fast step whose input it changed."""
     delay_steps: int
-    """From the exposure's end to that step."""
+    """Fast steps from the exposure's end to that step."""
     late: bool
     """Whether that is later than ``control.delay_s`` asks for."""
     state: State
     reason: str
-    """Why the loop is open; empty while it is closed."""
+    """The reason why the loop is open; empty while it is closed."""
     slope_rms: float
     """Root mean square of the centroids, slope units; NaN where none was measured."""
     path_rms: float
     """Root mean square of the estimated path inside the exposure, slope units; NaN without an estimate."""
     clipped_steps: int
-    """Fast steps from the exposure before to this one whose wanted input limits or slew have changed."""
+    """Fast steps from the exposure before to this one whose wanted input the limits or the slew limit have changed."""
     fit: Fit | None
-    """How well the model fits; None while that is not known."""
+    """The model's fit; None while it is not known."""
     acting: str
-    """The controller that acts: another one while the loop's own does not pay (`FallBack`)."""
+    """The controller that acts: another one while the loop's own is worse (`FallBack`)."""
     gained: float
-    """Where that has changed with this exposure: how much less the slopes would have been with it, as a share of their
-    root mean square; NaN otherwise."""
+    """Where the acting controller has changed with this exposure, the reduction of the slopes with it, as a share of
+    their root mean square; NaN otherwise."""
 
 
 def centroids(rig: Rig, exposure: Exposure) -> FloatArray:
@@ -79,7 +80,7 @@ def centroids(rig: Rig, exposure: Exposure) -> FloatArray:
 
 
 class ControlLoop:
-    """A controller on a rig: it knows what the mirror is to hold in each fast step, and keeps it within limits.
+    """A controller on a rig: it gives the input for the mirror in each fast step, and keeps it within limits.
 
     Parameters
     ----------
@@ -108,17 +109,17 @@ class ControlLoop:
         self._low, self._high, self._park = mirror.input_min, mirror.input_max, mirror.park
         self._most_change = mirror.slew_max_per_s * rig.timing.fast_step_s or math.inf
         self._oldest = first_step
-        """Fast step of the first of the rows, of which the older ones are dropped."""
+        """Fast step of the first row in the lists below; older rows are dropped."""
         self._sent: list[FloatArray] = []
-        """Inputs as they are commanded, step by step, ..."""
+        """The commanded inputs, step by step."""
         self._held: list[FloatArray] = []
-        """... and as the mirror holds them."""
+        """The inputs that the mirror holds, step by step."""
         self._limited: list[bool] = []
-        """Whether that is what limits or slew have made of what was wanted."""
+        """Whether limits or the slew limit have changed the wanted input."""
         self._before = (self._park, self._park)
-        """Both for the step before the oldest."""
+        """The commanded and the held input of the step before the oldest row."""
         self._last_end = first_step
-        """End of the newest exposure with a measurement; of the session's beginning before."""
+        """End of the newest exposure with a measurement; before there is one, the session's beginning."""
         self._seen_any = False
         self._blind = self._trusted = 0
         self._clipped = 0
@@ -128,16 +129,16 @@ class ControlLoop:
 
     @property
     def next_step(self) -> int:
-        """The first fast step that no input is fixed for."""
+        """The first fast step whose input is not fixed."""
         return self._oldest + len(self._sent)
 
     def begin(self, first_step: int) -> None:
-        """Name the first fast step, before anything else."""
+        """Set the first fast step, before any other call."""
         self._oldest = self._last_end = first_step
 
     def inputs(self, first_step: int, n_steps: int) -> FloatArray:
-        """Inputs to command for ``n_steps`` fast steps from ``first_step``, (n_steps, n_inputs); the same when asked
-        again, until an exposure changes them. Raises ControlError as the controller's own code fails."""
+        """Inputs to command for ``n_steps`` fast steps from ``first_step``, (n_steps, n_inputs); the same when called
+        again, until an exposure changes them. Raises ControlError if the controller's own code fails."""
         while self.next_step < first_step + n_steps:
             self._go_on()
         start = first_step - self._oldest
@@ -146,8 +147,8 @@ class ControlLoop:
         return np.array(self._sent[start : start + n_steps]).reshape(n_steps, len(self._park))
 
     def commanded(self, first_step: int, u: FloatArray) -> None:
-        """What the mirror was sent from ``first_step`` on, (k, n_inputs), where that may differ from `inputs`: it goes
-        on from there. Raises ControlError as `inputs` does."""
+        """Take the inputs that the mirror was sent from ``first_step`` on, (k, n_inputs), where they may differ from
+        `inputs`: the loop goes on from them. Raises ControlError as `inputs` does."""
         for step, row in enumerate(u, first_step):
             if step < self._oldest:
                 continue
@@ -157,7 +158,7 @@ class ControlLoop:
                 self._sent[step - self._oldest], self._held[step - self._oldest] = row, self._rig.mirror.quantise(row)
 
     def applied(self, first_step: int, u: FloatArray) -> None:
-        """What the mirror reports that it held from ``first_step`` on, (k, n_inputs)."""
+        """Take the inputs that the mirror reports from ``first_step`` on, (k, n_inputs)."""
         for step, row in enumerate(u, first_step):
             if 0 <= step - self._oldest < len(self._held):
                 self._held[step - self._oldest] = row
@@ -169,7 +170,7 @@ class ControlLoop:
         ----------
         earliest_step:
             The first fast step whose input can still be changed. Steps before it stay as they are; those from the
-            returned ``first_step`` on are to be sent anew, also where they were sent before.
+            returned ``first_step`` on must be sent anew, also where they were sent before.
         """
         end = exposure.first_step + exposure.n_steps
         first = max(end + self.delay_steps, earliest_step)
@@ -219,7 +220,7 @@ class ControlLoop:
         self.reason = reason
 
     def _compare(self, exposure: Exposure, slopes: FloatArray, estimate: Estimate | None) -> Change | None:
-        """Let another controller act where this one does not pay, or this one again."""
+        """Let another controller act where this one is worse, or this one again where it is better."""
         if self._fall_back is None:
             return None
         if self.state is not State.CLOSED or not self._seen_any:
@@ -232,11 +233,11 @@ class ControlLoop:
         return change
 
     def _judge(self, slopes: FloatArray, estimate: Estimate | None, end: int) -> None:
-        """Decide whether the loop is closed, from what this exposure is worth."""
+        """Decide whether the loop is closed, from the quality of this exposure's measurement."""
         status = Status.OK if estimate is None else estimate.status
         if status in (Status.DIVERGED, Status.REINITIALISED):
             self._trusted = 0
-            self.lose(f"the estimator says {status.name.lower()} of frame {estimate.frame_id}" if estimate else "")
+            self.lose(f"the estimator is {status.name.lower()} at frame {estimate.frame_id}" if estimate else "")
             return
         if not np.isfinite(slopes).any() or status is Status.GATED:
             self._blind, self._trusted = self._blind + 1, 0
@@ -280,11 +281,11 @@ class ControlLoop:
             return call()
         except AolinkError:
             raise
-        except Exception as error:  # whatever another package does wrong
+        except Exception as error:  # any error of another package
             raise ControlError(f"the controller {self.name} failed: {error!r}; the mirror is parked") from error
 
     def _forget_from(self, step: int) -> None:
-        """The inputs of the steps from this one on are open again."""
+        """Forget the inputs of the steps from this one on."""
         for rows in (self._sent, self._held, self._limited):
             del rows[step - self._oldest :]
 
@@ -299,7 +300,8 @@ class ControlLoop:
 
 
 def delay_steps(rig: Rig) -> int:
-    """``control.delay_s`` in whole fast steps, one at least: the step after an exposure's last has begun by its end."""
+    """``control.delay_s`` in whole fast steps, at least one: the step after an exposure's last has begun at the
+    exposure's end."""
     return max(1, math.ceil(rig.control.delay_s / rig.timing.fast_step_s - 1e-9))
 
 
@@ -308,7 +310,7 @@ def _made(row: ControllerRow, rig: Rig) -> Controller:
         return row.build(rig)
     except AolinkError:
         raise
-    except Exception as error:  # whatever another package does wrong
+    except Exception as error:  # any error of another package
         raise ControlError(f"the controller {row.name} cannot work on the rig {rig.name}: {error!r}") from error
 
 

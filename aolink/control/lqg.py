@@ -1,4 +1,4 @@
-"""Linear-quadratic control at the fast rate, of the state that an estimator finds in the blurred frames."""
+"""Linear-quadratic control at the fast rate, from the state that an estimator finds in the blurred frames."""
 
 from __future__ import annotations
 
@@ -17,11 +17,12 @@ _SETTLES = 1e-9
 
 
 class LQG:
-    """u(k) = -K x(k): x is the estimate at the end of the exposure, predicted over the delay and on, step by step.
+    """The controller u(k) = -K x(k): x is the estimate at the end of the exposure, predicted over the delay and on,
+    step by step.
 
-    The state has mirror and disturbance (`[[disturbance.model]]`, drifts), so K x is the input that cancels what is
-    predicted of both. Between exposures the prediction runs on with the inputs that the mirror really holds, hence
-    nothing winds up at the limits; an estimate that comes late finds the loop on its prediction.
+    The state has mirror and disturbance (`[[disturbance.model]]`, drifts), so -K x is the input that cancels the
+    prediction of both. Between exposures the prediction runs on with the inputs that the mirror really holds, so it
+    does not wind up at the limits; until a late estimate comes, the loop runs on its prediction.
     """
 
     def __init__(self, rig: Rig) -> None:
@@ -48,8 +49,8 @@ def lqr_gain(plant: Plant, effort: float, n_steps: int) -> FloatArray:
     """K of u = -K x for one copy of a plant, (n_inputs, n_states).
 
     It minimises the mean over fast steps of |C x|^2 + rho |u|^2, with rho = ``effort`` times the mean square gain of
-    the mirror's modes (`Modes`). With x_1 the states that the inputs reach and x_2 the others, A = [A_1 A_12; 0 A_2]
-    and C = [C_1 C_2]: P solves the Riccati equation of (A_1, B_1, C_1' C_1, rho), and S, which weighs x_1 against x_2,
+    the mirror modes (`Modes`). With x_1 the states that the inputs reach and x_2 the others, A = [A_1 A_12; 0 A_2] and
+    C = [C_1 C_2]: P solves the Riccati equation of (A_1, B_1, C_1' C_1, rho), and S, which weighs x_1 against x_2,
 
         S = C_1' C_2 + (A_1 - B_1 K_1)' (P A_12 + S A_2),
 

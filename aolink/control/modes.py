@@ -1,4 +1,4 @@
-"""The modes of a mirror: how strongly its inputs move the slopes together, by the plant's response at rest."""
+"""The mirror modes: patterns of inputs and the slopes that they make, by the plant's response at rest."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from aolink.numerics.arrays import FloatArray, Indices
 from aolink.rig import Plant
 
 _SINGULAR = 1e12
-"""With a condition beyond this, I - A has no inverse worth the name: the plant does not come to rest."""
+"""With a condition number beyond this, I - A counts as singular: the plant does not come to rest."""
 
 
 def reached(plant: Plant) -> tuple[Indices, Indices]:
-    """States that the inputs reach, and those that they do not, as the zeros of A and B have it."""
+    """States that the inputs reach, and those that they do not, by the zeros of A and B."""
     linked = plant.A != 0
     found = (plant.B != 0).any(axis=1)
     while not np.array_equal(more := found | linked[:, found].any(axis=1), found):
@@ -52,12 +52,13 @@ class Modes:
 
     @classmethod
     def of(cls, response: FloatArray) -> Modes:
-        """Modes of a response (n_outputs, n_inputs): of a plant, or measured by `aolink calibrate --interaction`."""
+        """Mirror modes of a response (n_outputs, n_inputs), that of a plant or one measured by `aolink calibrate
+        --interaction`."""
         U, gains, V = np.linalg.svd(response, full_matrices=False)
         return cls(slopes=U, gains=gains, inputs=V.T)
 
     def reconstructor(self, least: float) -> FloatArray:
-        """Inputs that make given slopes, by the modes whose gain is at least this share of the strongest one's,
-        (n_inputs, n_outputs)."""
+        """Matrix that gives the inputs for given slopes, by the mirror modes whose gain is at least this share of the
+        strongest one's, (n_inputs, n_outputs)."""
         kept = self.gains >= least * self.gains[0]
         return np.asarray(self.inputs[:, kept] / self.gains[kept] @ self.slopes[:, kept].T)

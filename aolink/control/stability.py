@@ -1,4 +1,4 @@
-"""Whether a loop is stable by its model, and with what margin: before anything is commanded."""
+"""The check whether a loop is stable by its model, and with what margin, before anything is commanded."""
 
 from __future__ import annotations
 
@@ -24,19 +24,20 @@ from aolink.numerics.arrays import FloatArray
 from aolink.rig import Rig
 
 _EXPOSURES = 40
-"""How long a disturbed loop is followed; its growth is that of the second half."""
+"""Exposures over which a disturbed loop is computed; its growth is that of the second half."""
 _MOST_GAIN = 16.0
-"""Margins beyond this factor are not looked for."""
+"""Margins beyond this factor are not searched for."""
 _HALVINGS = 5
 _SWING = 5
 _SETTLED = 1e-9
 _BURST = 1e6
-"""What has fallen to the one share of the beginning has settled, and what has grown to the other never will."""
+"""A loop that has fallen to the first share of its beginning has settled, and one that has grown to the second never
+will."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Stability:
-    """What the model says of a closed loop."""
+    """The stability of a closed loop by its model."""
 
     radius: float
     """Factor by which a disturbed loop grows from one exposure to the next; below 1 it is stable."""
@@ -57,10 +58,10 @@ class Stability:
 
 
 def stability(rig: Rig, name: str) -> Stability:
-    """Follow the loop of a controller by the plant's model, without noise and limits.
+    """Compute the loop of a controller by the plant's model, without noise and limits.
 
-    The true mirror has its states disturbed and its gain changed, while the controller and the estimator that serves
-    it believe in the plant as it is in the rig file. That estimator is the filter on centroids with its steady gain.
+    The true mirror has its states disturbed and its gain changed, while the controller and the estimator that serves it
+    use the plant of the rig file. That estimator is the filter on centroids with its steady gain.
 
     Raises
     ------
@@ -81,7 +82,7 @@ def stability(rig: Rig, name: str) -> Stability:
 
 
 def check_stable(rig: Rig, name: str) -> Stability:
-    """`stability`; raises ControlError for a loop that would be unstable, with its margin."""
+    """The result of `stability`; raises ControlError for a loop that would be unstable, with its margin."""
     found = stability(rig, name)
     if not found.stable:
         raise ControlError(
@@ -92,13 +93,11 @@ def check_stable(rig: Rig, name: str) -> Stability:
 
 
 def _observer_gain(rig: Rig) -> FloatArray:
-    """Correction of the state at an exposure's end by its centroids, (n_states, n_outputs)."""
+    """Gain of the correction of the state at an exposure's end by its centroids, (n_states, n_outputs)."""
     model = exposure_model(rig.plant, rig.timing.exposure_steps, rig.timing.exposure_offset)
     gain = steady_gain(model, added_noise(model, "lifted"), centroid_covariance(rig)[0])
     if gain is None:
-        raise ControlError(
-            f"the loop on {rig.name} cannot be checked: its centroids lose a state that does not die out"
-        )
+        raise ControlError(f"the loop on {rig.name} cannot be checked: its centroids lose a state that does not decay")
     return np.asarray(model.transition @ gain)
 
 
@@ -108,7 +107,7 @@ def _growth(rig: Rig, build: Callable[[Rig], Controller], gain: FloatArray, of_m
     start = np.zeros((rig.plant.axes, rig.plant.n_states))
     start[:, moved] = np.random.default_rng(0).standard_normal((len(start), len(moved)))
     disturbed = _followed(rig, build(rig), gain, of_mirror, start)
-    # An undisturbed loop may move by itself, where its safe input is not zero: that is taken off.
+    # An undisturbed loop may move by itself where its safe input is not zero: this motion is subtracted.
     alone: Iterator[FloatArray] = repeat(np.zeros(1))
     if rig.mirror.park.any():
         alone = _followed(rig, build(rig), gain, of_mirror, np.zeros_like(start))

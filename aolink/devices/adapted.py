@@ -1,4 +1,4 @@
-"""What the adapters share that make a session's devices of simple drivers, for a camera and for a mirror."""
+"""The part that the adapters for cameras and for mirrors share: they make a session's devices of simple drivers."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Adapted:
         raise NotImplementedError
 
     def _clock_doubt_ns(self) -> int:
-        """By how much the driver may correct the clock that it reads, ns."""
+        """The largest correction that the driver may make to the clock that it reads, ns."""
         return 0
 
     def query_clock(self, now_ns: int) -> None:

@@ -22,18 +22,21 @@ from aolink.rig.device_tables import Delay
 from aolink.wire.truth import truth_message
 
 _OFFSETS = 16
-"""An exposure's start is rounded to this part of a fast step: estimators keep a model for each that occurs."""
+"""An exposure's start is rounded to one part in this many of a fast step: estimators keep a model for each fraction
+that occurs."""
 _START_SIGMA = 3.0
 """A camera is started this many standard deviations of the clocks' comparison after the fast step begins."""
 _FUTURE_NS = 1_000_000_000
-"""How far a frame's end may be ahead of the host's clock: more than any error of the clocks' comparison."""
+"""The most by which a frame's end may be ahead of the host's clock, ns: more than any error of the clocks'
+comparison."""
 
 
 class AdaptedCamera(Adapted):
     """A camera with a simple driver, beside a mirror that counts the fast steps.
 
-    Where its frames carry no number, those between two frames that are several periods apart are lost. Where they carry
-    no time, their arrival stands for it, less ``delay``, the time from the end of an exposure to its frame's arrival.
+    Where its frames carry no number, the frames missing between two that are several periods apart are lost. Where they
+    carry no time, the time of their arrival is used, less ``delay``, the time from the end of an exposure to its
+    frame's arrival.
 
     Parameters
     ----------
@@ -86,9 +89,10 @@ class AdaptedCamera(Adapted):
         if ahead_ns < 0:
             return False
         start_ns, sigma_ns = self.clock.device_ns(now_ns + ahead_ns)
-        # An exposure that seems to begin before its session is none of it: rather a little later than too early.
+        # An exposure that seems to begin before its session does not count, so the camera starts rather a little late
+        # than too early.
         margin_ns = _START_SIGMA * math.hypot(sigma_ns, self._mirror.clock.device_ns(now_ns)[1])
-        with calling(self.name, "when it was told to start"):
+        with calling(self.name, "when it was asked to start"):
             self._driver.start(start_ns + round(min(margin_ns, self._step_ns)), exposures)
         self._first_step, self._end_step, self._running = first_step, 0, True
         return True
@@ -98,7 +102,7 @@ class AdaptedCamera(Adapted):
             self._events = self.poll()  # with those that were waiting
         finally:
             self._running = False
-            with calling(self.name, "when it was told to stop"):
+            with calling(self.name, "when it was asked to stop"):
                 self._driver.stop()
 
     def flush(self) -> list[Frame]:
@@ -116,7 +120,7 @@ class AdaptedCamera(Adapted):
             self._driver.close()
 
     def poll(self) -> list[Event]:
-        """What has happened since the last call. What the driver raises comes after the frames before it."""
+        """The events since the last call. An error that the driver raises comes after the frames before it."""
         if self._failed is not None:
             raise self._failed
         events = self._take_events()
@@ -135,7 +139,7 @@ class AdaptedCamera(Adapted):
         return events
 
     def _sampled(self, answers: Iterable[ClockAnswer]) -> list[Event]:
-        """The answers on the host's clock, which is compared with `time.monotonic_ns` now."""
+        """The clock's answers, converted to the host's clock, which is compared with `time.monotonic_ns` now."""
         before_ns, now_ns, after_ns = self._monotonic_ns(), self._now_ns(), self._monotonic_ns()
         exchanges = (
             ClockExchange(
@@ -161,7 +165,7 @@ class AdaptedCamera(Adapted):
         sigma_ns = math.hypot(sigma_ns, jitter_ns, self._mirror.step_sigma_ns(host_start_ns))
         start, n_steps = self._place(self._mirror.since_zero_ns(host_start_ns), sigma_ns)
         first_step, part = divmod(start, _OFFSETS)
-        if first_step < self._first_step:  # what the camera had still kept from before
+        if first_step < self._first_step:  # the camera had kept it from before the session
             self._last = None
             return []
         self._end_step = first_step + n_steps
@@ -180,7 +184,7 @@ class AdaptedCamera(Adapted):
             alignment_sigma_ns=sigma_ns,
             exposure_offset_ns=part * self._step_ns // _OFFSETS,
         )
-        if raw.truth is None or n_steps < self._rig.timing.exposure_steps:  # the truth is of all steps
+        if raw.truth is None or n_steps < self._rig.timing.exposure_steps:  # the truth covers all steps
             return [frame]
         return [frame, truth_message(frame_id, raw.truth)]
 
@@ -189,8 +193,8 @@ class AdaptedCamera(Adapted):
 
         The start is rounded, so that a camera in step with the mirror is not now before a step, now after it. Exposures
         do not overlap: one that seems to, by the clocks' uncertainty and half a step at most, begins with the end of
-        the one before. Those of a camera without a pause that is faster than the mirror overlap by more in the end:
-        then one has a step less, about the same middle.
+        the one before. Where a camera exposes without a pause and is faster than the mirror, exposures overlap by more
+        in the end: then one exposure has a step less, about the same middle.
         """
         start, n_steps = round(since_zero_ns * _OFFSETS / self._step_ns), self._rig.timing.exposure_steps
         overlap = self._end_step * _OFFSETS - start
@@ -201,7 +205,7 @@ class AdaptedCamera(Adapted):
         return start, n_steps
 
     def _check(self, raw: SimpleFrame, pixels: NDArray[np.uint16]) -> None:
-        """Refuse a frame that is not one of the rig file's camera. Raises DeviceError."""
+        """Refuse a frame that the rig file's camera cannot have taken. Raises DeviceError."""
         sensor = self._rig.sensor
         if pixels.shape != sensor.shape or int(pixels.max()) >> sensor.bit_depth or int(pixels.min()) < 0:
             raise DeviceError(
@@ -235,13 +239,14 @@ class AdaptedCamera(Adapted):
         return frame_id
 
     def _start_of(self, raw: SimpleFrame, frame_id: int) -> tuple[int, float]:
-        """Start of a frame's exposure on the camera's clock, and its standard deviation without the clock's, ns."""
+        """Start of a frame's exposure on the camera's clock, and its standard deviation without the clock's own part,
+        ns."""
         if raw.start_ns is not None:
             return raw.start_ns, 0.0
         if self._tells_time:
             raise DeviceError(
-                f"the driver of {self.description} gives a frame without start_ns although its time_ns() tells the"
-                " camera's time: it must say when the exposure started, or tell no time (None)"
+                f"the driver of {self.description} gives a frame without start_ns although its time_ns() gives the"
+                " camera's time: it must say when the exposure started, or give no time (None)"
             )
         # Ids begin anew with each frame from before the session: the camera's own count goes on.
         count = frame_id if raw.number is None else raw.number

@@ -1,6 +1,6 @@
 """The adapter that makes a session's mirror of a simple driver.
 
-It gives each command its answer and its report, and parks a mirror that the session has left alone for too long.
+It gives each command its answer and its report, and parks a mirror that the session has not polled for too long.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ class AdaptedMirror(Adapted):
     """A mirror with a simple driver; each command is answered when it is sent.
 
     Its watchdog is a thread of the host: where the session has not polled the mirror for ``mirror.watchdog_s``, it
-    parks the mirror, which takes no command until `rearm`. ``delay`` is the time from a fast step of the driver's clock
-    to the mirror's following its input.
+    parks the mirror, which takes no command until `rearm`. ``delay`` is the time from the beginning of a fast step, by
+    the driver's clock, until the mirror follows its input.
     """
 
     commanded = True
@@ -49,7 +49,7 @@ class AdaptedMirror(Adapted):
         self._watchdog_ns = round(rig.mirror.watchdog_s * 1e9)
         self._polled_ns = time.monotonic_ns()
         self._left_ns: int | None = None
-        """When it was polled last before the watchdog parked it; None while it is not latched."""
+        """The time of the last poll before the watchdog parked the mirror; None while it is not latched."""
         self._safe: tuple[float, float] = (math.inf, math.inf)
         """First fast step of the safe state that the watchdog asked for, and the step at which it was re-armed."""
         self._closed, self._guarding = threading.Event(), False
@@ -81,7 +81,8 @@ class AdaptedMirror(Adapted):
         self.last_sent_ns = now_ns
 
     def _clock_doubt_ns(self) -> int:
-        # A driver that infers its device's clock corrects it by as much. Without a queue the clock is the host's.
+        # A driver that infers its device's clock corrects it by up to this much. Without a queue the clock is the
+        # host's.
         return 0 if Lacks.QUEUE in self.lacks else round(self._driver_sigma_ns())
 
     def since_zero_ns(self, host_ns: int) -> int:
@@ -91,12 +92,12 @@ class AdaptedMirror(Adapted):
         clock_ns, driver_ns = self.clock.device_ns(host_ns)[1], self._driver_sigma_ns()
         if Lacks.QUEUE in self.lacks:
             return math.hypot(clock_ns, self._delay_sd_ns, driver_ns)
-        return math.hypot(max(clock_ns, driver_ns), self._delay_sd_ns)  # the clock's has part of the driver's
+        return math.hypot(max(clock_ns, driver_ns), self._delay_sd_ns)  # the first has part of the second
 
     def _driver_sigma_ns(self) -> float:
-        """What the driver knows of its own inexactness.
+        """The driver's own standard deviation of the inputs' times, ns.
 
-        For a mirror without a queue, that is how late its inputs are, which the rig file may say instead.
+        For a mirror without a queue, that is how late its inputs are; the rig file may give it instead.
         """
         if self._delay_ns and Lacks.QUEUE in self.lacks:
             return 0.0
@@ -137,7 +138,7 @@ class AdaptedMirror(Adapted):
         return self._limits.go_on_from(first_step, step)
 
     def poll(self) -> list[Event]:
-        """What has happened since the last call."""
+        """The events since the last call."""
         events = self._take_events()
         with self._call("when it was asked what it applied"):
             self._polled_ns = time.monotonic_ns()
@@ -148,7 +149,7 @@ class AdaptedMirror(Adapted):
         return events
 
     def _take(self, held: Held) -> list[Event]:
-        """Each step from the first command to the parking once, in order."""
+        """Report each step from the first command to the parking once, in order."""
         first_step, u, late = held
         assert late is not None
         if u.ndim != 2 or u.shape[1] != self._rig.n_inputs or not np.isfinite(u).all():
@@ -192,7 +193,7 @@ class AdaptedMirror(Adapted):
         return block_id, pb.Applied.COMMAND if as_told else pb.Applied.CLIPPED
 
     def _give_up(self, end: int) -> list[Event]:
-        """``NOT_REPORTED`` for the steps before ``end`` that were not reported."""
+        """Report the steps before ``end`` that were not reported as ``NOT_REPORTED``."""
         if self._next is None or end <= self._next:
             return []
         unknown = pb.Applied(first_step=self._next, n_steps=end - self._next, source=pb.Applied.NOT_REPORTED)
@@ -213,7 +214,7 @@ class AdaptedMirror(Adapted):
 
     def park(self) -> int:
         self._guarding = False
-        with self._call("when it was told to park"):
+        with self._call("when it was asked to park"):
             step = int(self._driver.park())
         self._parked_from = step
         return step
@@ -230,7 +231,7 @@ class AdaptedMirror(Adapted):
         self._guarding = False
         self._closed.set()
         if self._next is not None and self._parked_from == math.inf:  # parking it failed, or was interrupted
-            with suppress(AolinkError), self._call("when it was told to park"):
+            with suppress(AolinkError), self._call("when it was asked to park"):
                 self._driver.park()
         with self._call("when it was closed"):
             self._driver.close()
@@ -242,7 +243,7 @@ class AdaptedMirror(Adapted):
             yield
 
     def _guard(self) -> None:
-        """Have the watchdog watch from the first command on, until the mirror is parked."""
+        """Run the watchdog from the first command on, until the mirror is parked."""
         if not self._guarding:
             self._guarding = True
             threading.Thread(target=self._watch, name="aolink-watchdog", daemon=True).start()
@@ -252,7 +253,7 @@ class AdaptedMirror(Adapted):
             if time.monotonic_ns() - self._polled_ns <= self._watchdog_ns or self.latched:
                 continue
             with suppress(AolinkError), self._call("when its watchdog parked it"):
-                # The session may have had the driver until now: have polled, parked or closed it.
+                # The session may have held the driver's lock until now, to poll, park or close it.
                 left_ns = self._polled_ns
                 if self._guarding and time.monotonic_ns() - left_ns > self._watchdog_ns:
                     step = int(self._driver.park())

@@ -1,4 +1,4 @@
-"""The device's clock seen from the host: a regression over clock queries, the frequency a random walk."""
+"""The device's clock seen from the host: a regression over clock queries, in which the frequency is a random walk."""
 
 from __future__ import annotations
 
@@ -13,24 +13,26 @@ QUERY_PERIOD_S = 0.9839
 SUSPICION_PERIOD_S = 0.0419
 """Time between two queries while a clock is suspected of having been set: `_STEP_AFTER` of them settle it."""
 WARM_UP_QUERIES = 8
-"""Queries in a row at the start: one alone says nothing about how long its round trip is by chance."""
+"""Queries in a row at the start: one alone does not show how much of its round trip is chance."""
 _WINDOW = 64
 _FREQUENCY_PRIOR = 200e-6
 """Standard deviation of a crystal's frequency error before anything is known."""
 _MOST_FREQUENCY = 1e-3
-"""No crystal is off by more; replies that would need more are refused."""
+"""No crystal's frequency is off by more; replies that would need more are refused."""
 _FREQUENCY_WALK = 1e-6 / math.sqrt(60.0)
 """Random walk of the frequency, 1/sqrt(s): temperature moves a crystal by some 1e-6 in a minute."""
 _RESOLUTION_NS = 1000.0
 """Least standard deviation of a sample: interrupts and schedulers on both sides."""
 _SLOW_FACTOR = 4.0
-"""A round trip longer than this many times the shortest says too little to be used."""
+"""A sample whose round trip is longer than this many times the shortest is too inaccurate to be used."""
 _GATE_SIGMA = 6.0
 _STEP_AFTER = 4
-"""This many refused samples that agree are right: the device's clock was set, or the line is slower for good."""
+"""When this many refused samples agree, they are right: the device's clock was set, or the serial line has become
+slower."""
 _REFUSED_KEPT = 16
 _STAMP_NS = 50_000.0
-"""How far a device's time stamp may be from the end of a fast step without raising suspicion: interrupt latency."""
+"""The most by which a device's time stamp may differ from the end of a fast step without raising suspicion, ns:
+interrupt latency."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,7 +46,7 @@ class ClockExchange:
 
     @property
     def round_trip_ns(self) -> int:
-        """Time from query to reply on the host, without the time that the device took, ns."""
+        """Time from query to reply on the host, less the time that the device took, ns."""
         return (self.host_receive_ns - self.host_send_ns) - (self.device_send_ns - self.device_receive_ns)
 
     @property
@@ -71,22 +73,23 @@ class ClockStep:
 class ClockRegression:
     """Offset and frequency of a device's clock, with their uncertainty.
 
-    device = host + offset + frequency * (host - reference). A sample has the more weight the closer its round trip is
-    to the shortest, and the younger it is: the frequency is a random walk, so that the offset's variance grows with the
-    cube of the time since the newest sample. No query can tell how the shortest round trip divides into the two ways:
-    sigma includes that, as a uniform error of half the round trip to either side. This error is common to all times
-    between two steps of the clock; it does not average out.
+    device = host + offset + frequency * (host - reference). A sample has more weight if its round trip is close to the
+    shortest, and if it is new: the frequency is a random walk, so that the offset's variance grows with the cube of the
+    time since the newest sample. No query can show how the shortest round trip divides into the two directions: sigma
+    includes that, as a uniform error of half the round trip to either side. This error is common to all times between
+    two steps of the clock; it does not average out.
 
     A reply that contradicts the regression makes the clock suspect, and so does a call of `suspect`. Until newer
-    queries have settled it, both hypotheses count: times are those of the clock before, and sigma reaches to those of
-    the clock after.
+    queries have settled it, both hypotheses count: times follow the clock before the step, and sigma is wide enough to
+    cover the clock after it.
     """
 
     def __init__(self) -> None:
         self._samples: deque[ClockExchange] = deque(maxlen=_WINDOW)
         self._refused: deque[ClockExchange] = deque(maxlen=_REFUSED_KEPT)
         self._trips: deque[int] = deque(maxlen=_WINDOW)
-        """Round trips of samples, ns: they outlast a step of the clock, for the line stays as it was."""
+        """Round trips of samples, ns: they are kept after a step of the clock, because the serial line has not
+        changed."""
         self._reference: ClockExchange | None = None
         self._solution = np.zeros(2)
         self._covariance = np.full((2, 2), np.nan)
@@ -155,7 +158,7 @@ class ClockRegression:
             dtype=np.float64,
         )
         trips = np.array([s.round_trip_ns for s in self._samples], dtype=np.float64)
-        # All samples may have taken longer than the line does at best; their spread and number say by how much.
+        # All samples may have taken longer than the line's shortest time; their spread and number show by how much.
         shortest = min(self._trips)
         longer = (sum(self._trips) / len(self._trips) - shortest) / math.sqrt(len(self._trips))
         sd = np.maximum((trips - shortest) / 2, max(_RESOLUTION_NS, longer / 2))
@@ -179,7 +182,8 @@ class ClockRegression:
         self._reference = reference
 
     def _by_line(self, host_ns: int) -> tuple[int, float]:
-        """Device time at a host time, and its standard deviation if the clock has not been set, ns."""
+        """Device time at a host time by the regression, and its standard deviation if the clock has not been set,
+        ns."""
         assert self._reference is not None, "ask `ready` first"
         elapsed = host_ns - self._reference.host_ns
         row = np.array([1.0, float(elapsed)])
@@ -193,7 +197,8 @@ class ClockRegression:
         return device_ns, math.hypot(sigma, self._doubt_at(host_ns))
 
     def _doubt_at(self, host_ns: int) -> float:
-        """What a step adds to sigma, ns: a suspected one, or one that was found only after this time."""
+        """The addition to sigma from a step of the clock, ns: a suspected step, or one that was found only after this
+        time."""
         if self._doubt_ns or self.step is None or host_ns >= self.step.before_ns:
             return self._doubt_ns
         return float(abs(self.step.size_ns))
@@ -209,7 +214,7 @@ class ClockRegression:
 
     @property
     def frequency_ppm(self) -> float:
-        """By how much the device's clock runs fast, parts per million."""
+        """Relative frequency error of the device's clock, parts per million; positive where it runs fast."""
         return float(self._solution[1]) * 1e6
 
     def offset_ns(self, host_ns: int) -> float:
@@ -218,7 +223,7 @@ class ClockRegression:
 
 
 def _agree(one: ClockExchange, other: ClockExchange) -> bool:
-    """Whether two exchanges can be of one clock."""
+    """Whether two exchanges can belong to one unchanged clock."""
     apart = (one.device_ns - one.host_ns) - (other.device_ns - other.host_ns)
     drifted = _MOST_FREQUENCY * abs(one.host_ns - other.host_ns)
     return abs(apart) <= (one.round_trip_ns + other.round_trip_ns) / 2 + _RESOLUTION_NS + drifted

@@ -21,7 +21,7 @@ from aolink.wire.signing import read_key
 
 @dataclass(frozen=True)
 class Found:
-    """A device that said who it is."""
+    """A device that has reported its identity."""
 
     port: str
     kind: str
@@ -33,7 +33,7 @@ class Found:
     virtual_time: bool
 
     def text(self) -> str:
-        """In one line."""
+        """The device in one line of text."""
         time = "virtual time" if self.virtual_time else "real time"
         return (
             f"{self.kind} {self.model}, serial number {self.serial_number}, firmware {self.firmware},"
@@ -51,7 +51,7 @@ class DriverFound:
     devices: list[tuple[str, str]] = field(default_factory=list)
     """Address and description of each device found: the address is a key of the rig file's ``[devices]``."""
     search: str = ""
-    """What there is to know of how its devices are found; empty where some were."""
+    """How its devices can be found; empty where some were found."""
     problem: str = ""
     """Why it cannot be used, or cannot look for devices; empty where it can."""
 
@@ -59,15 +59,15 @@ class DriverFound:
 def find_drivers() -> list[DriverFound]:
     """The installed drivers of cameras and mirrors, each with the devices that it finds on this machine.
 
-    A driver looks for its devices if its module has a function ``discover()``, and says with a text ``NOT_LISTED``
-    which of them that cannot find. None is opened.
+    A driver looks for its devices if its module has a function ``discover()``; a text ``NOT_LISTED`` in the module says
+    which devices that function cannot find. No device is opened.
     """
     return [_find(kind, name) for kind in KINDS for name in driver_names(kind)]
 
 
 def _find(kind: Kind, name: str) -> DriverFound:
     if name == NATIVE:
-        return DriverFound(kind=kind, name=name, search="`aolink devices PORT...` asks who answers at a port")
+        return DriverFound(kind=kind, name=name, search="`aolink devices PORT...` identifies the device at a port")
     try:
         driver = load_driver(kind, name)
         with calling(kind, "when it was asked what its devices lack"):
@@ -91,7 +91,8 @@ def list_ports() -> list[tuple[str, str]]:
 
 
 def identify_port(port: str, key: str | Path | None = None) -> Found:
-    """Ask the device behind a port who it is, with packets signed by a key file. Raises PortError and DeviceError."""
+    """Ask the device behind a port for its identity, with packets signed by a key file. Raises PortError and
+    DeviceError."""
     hub, secret = Hub(), read_key(key) if key else None
     try:
         identity = identify(hub, hub.connect(f"given ({port})", SerialPort(port), secret), new_nonce())

@@ -52,7 +52,7 @@ def check_driver(kind: Kind, table: DeviceTable, rig: Rig) -> Callable[..., Any]
 
 @contextmanager
 def calling(kind: str, when: str) -> Iterator[None]:
-    """Whatever a driver raises becomes a DeviceError that says so."""
+    """Turn any exception of a driver into a DeviceError."""
     try:
         yield
     except AolinkError:

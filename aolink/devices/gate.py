@@ -1,8 +1,9 @@
-"""The gate: every message of a device is checked here, against the rig file, the host's clock and what was sent.
+"""The gate: every message of a device is checked here, against the rig file, the host's clock and the commands that
+were sent.
 
-Nothing that a device says changes any state before it has passed. The packet's checksum lets damage through once in
-2^32 times, so an impossible message was sent like that: by faulty firmware, or by a device that is not what the rig
-file describes. Numbers of such a device are worth nothing, so the session ends with a `DeviceError` that names the
+No message of a device changes any state before it has passed. The packet's checksum lets damage through once in
+2^32 times, so an impossible message was sent in that form: by faulty firmware, or by a device that is not what the rig
+file describes. Such a device's numbers cannot be trusted, so the session ends with a `DeviceError` that names the
 field. A sound device may also send repeated, late or unasked answers, clock replies that the regression refuses, and
 reports from before the session: these are no error, but dropped or counted.
 """
@@ -29,14 +30,15 @@ MOST_STEP = 1 << 53
 MOST_TIME_NS = 3_600_000_000_000_000_000
 """No clock reads a time further from its zero: 114 years. The difference of two such times fits into int64."""
 MOST_RATE_ERROR = 1e-3
-"""No crystal is off by more."""
+"""No crystal's frequency is off by more."""
 _SLACK_S = 1.0
-"""How far a device may be ahead of what its crystal explains."""
+"""The most by which a device may be ahead of the time that its crystal explains, s."""
 _DELAY_S = 1.0
 """On virtual time, how long a packet may take beyond four times the rig file's latency: a rig may inject stalls."""
 _LONGEST_TEXT = 1000
 _REMEMBERED_BLOCKS = 4096
-"""A closed loop sends some six of them for each exposure; of older ones only the id is checked."""
+"""Number of blocks that are remembered. A closed loop sends some six for each exposure; for older ones only the id is
+checked."""
 _KINDS: dict[str, tuple[type[Message], ...]] = {
     "camera": (pb.FrameChunk, pb.TruthChunk, pb.ClockReply, pb.Event, pb.Ack, pb.Identity),
     "mirror": (pb.Applied, pb.CommandAck, pb.ClockReply, pb.Event, pb.Ack, pb.Identity),
@@ -90,7 +92,7 @@ class Gate:
         self._sent_end = self._first_step
         mirror = rig.mirror
         self.limits = CommandLimits(rig)
-        """Limits of what is sent to the mirror."""
+        """Limits of the inputs that are sent to the mirror."""
         margin = converter_margin(mirror)
         self._input_min, self._input_max = mirror.input_min - margin, mirror.input_max + margin
         planes = [(rig.sensor.shape, rig.sensor.bit_depth)]
@@ -106,7 +108,7 @@ class Gate:
 
     @property
     def exposure_bytes(self) -> int:
-        """The most that the camera sends for one exposure."""
+        """The most bytes that the camera sends for one exposure."""
         return sum(2 * height * width for (height, width), _ in self._planes) + self._most_truth
 
     def sent(self, block: pb.CommandBlock) -> None:
@@ -118,10 +120,10 @@ class Gate:
             del self._sent[next(iter(self._sent))]
 
     def passes(self, link: Link, message: Message, receive_ns: int) -> bool:
-        """Whether to act on a message; False for one that is to be dropped. Raises DeviceError naming the field."""
+        """Whether to use a message; False for one that is to be dropped. Raises DeviceError naming the field."""
         device = link.name
         if not isinstance(message, _KINDS[device]):
-            raise lie(device, "a message", type(message).__name__, f"what a {device} has to say")
+            raise lie(device, "a message", type(message).__name__, f"a message that a {device} may send")
         if isinstance(message, pb.FrameChunk):
             self._check_chunk(device, message, receive_ns)
         elif isinstance(message, pb.Applied):
@@ -156,7 +158,7 @@ class Gate:
             )
 
     def check_truth(self, device: str, truth: pb.Truth, frame_id: int) -> None:
-        """Refuse a truth that is not one of this rig. Raises DeviceError."""
+        """Refuse a truth that this rig cannot have sent. Raises DeviceError."""
         rig, path = self._rig, truth.path or truth.path_single
         outputs, axes = rig.n_outputs, rig.plant.axes
         pairs = [
@@ -194,7 +196,7 @@ class Gate:
             raise lie(link.name, "VirtualTime.host_ns", handed.host_ns, f"{first_ns} to {last_ns}")
 
     def _end(self, now_ns: int) -> int:
-        """First fast step that cannot have ended."""
+        """The first fast step that cannot have ended yet."""
         if self._hub.virtual:
             return self._sent_end
         elapsed_s = max(now_ns - self._asked_ns, 0) / 1e9
@@ -238,7 +240,8 @@ class Gate:
             self._frame_id, self._frame_step, self._frame_head = chunk.frame_id, first, head
 
     def _check_order(self, device: str, frame_id: int, first_step: int) -> None:
-        """Whether a frame can follow the one before: a newer one begins later, and its id is as much higher at most."""
+        """Whether a frame can follow the one before: a newer frame begins later, and its id is higher by no more than
+        the number of frame periods between them."""
         timing, before, since = self._rig.timing, self._frame_id, first_step - self._frame_step
         if frame_id == before and since:
             what = f"{self._frame_step}, as the rest of frame {frame_id} has"
@@ -264,7 +267,7 @@ class Gate:
         if not applied.n_steps or numbers != known * applied.n_steps * n_inputs:
             what = f"as many as it has inputs for, {numbers / n_inputs:g}, at least 1" if known else "no inputs with it"
             raise lie(device, "Applied.n_steps", applied.n_steps, what)
-        if end <= self._first_step:  # of a session before
+        if end <= self._first_step:  # from an earlier session
             return False
         latest = self._end(receive_ns)
         if end > latest:

@@ -16,7 +16,7 @@ _LONGEST_NAME = 200
 
 
 def new_nonce() -> int:
-    """A number that tells the answer to one `identify` from those to others.
+    """A number that distinguishes the answer to one `identify` from the answers to others.
 
     It always has 48 bits: a shorter one makes shorter packets, and two sessions on virtual time would differ.
     """
@@ -24,7 +24,7 @@ def new_nonce() -> int:
 
 
 def identify(hub: Hub, link: Link, nonce: int) -> pb.Identity:
-    """Ask the device on a line who it is.
+    """Ask the device on a serial line for its identity.
 
     Raises
     ------
@@ -35,7 +35,7 @@ def identify(hub: Hub, link: Link, nonce: int) -> pb.Identity:
     try:
         identity = hub.request(link, pb.Identify(nonce=nonce), pb.Identity, lambda answer, _: answer.nonce == nonce)
     except PortError:
-        if not link.refusal:  # who is refused is hung up on
+        if not link.refusal:  # the device closes the connection to a host that it refuses
             raise
     if identity is None and link.refusal and link.signing:
         raise DeviceError(

@@ -1,6 +1,6 @@
 """The interfaces of camera, mirror and time that a session uses, whatever the devices' protocol.
 
-Devices never wait: a session takes, as events, what has come since it last asked, and decides when it asks again.
+Devices never wait: a session takes the events that have come since its last poll, and decides when it polls again.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ class ClockSampled:
 
     @classmethod
     def add(cls, clock: ClockRegression, exchange: ClockExchange, *, usable: bool = True) -> ClockSampled:
-        """Give an exchange to a regression, unless it is not ``usable``."""
+        """Add the exchange to a regression if it is ``usable``."""
         before = clock.step
         accepted = usable and clock.add(exchange)
         return cls(exchange, accepted, clock.step if clock.step is not before else None)
@@ -46,17 +46,18 @@ class CommandAnswered:
 
 @dataclass(frozen=True, slots=True)
 class Vanished:
-    """The port of a device is gone, and may return: until then the device is sent nothing, and nothing comes."""
+    """The port of a device is gone, and may return: until then nothing is sent to the device, and nothing comes from
+    it."""
 
     why: str
 
 
 @dataclass(frozen=True, slots=True)
 class Returned:
-    """The same device is there again. It has stopped or parked, and its clock is to be asked before it goes on."""
+    """The same device is there again. It has stopped or parked, and its clock must be queried before it goes on."""
 
     away_s: float
-    """From when the port was found gone to the device's answer."""
+    """Time from the loss of the port to the device's answer, s."""
 
 
 Event = Frame | pb.Truth | pb.Applied | pb.Event | ClockSampled | CommandAnswered | Vanished | Returned
@@ -66,9 +67,9 @@ Event = Frame | pb.Truth | pb.Applied | pb.Event | ClockSampled | CommandAnswere
 class Lacks(StrEnum):
     """What a device cannot do. A driver lists it as ``lacks``; `aolink devices` shows it, and a recording keeps it."""
 
-    TIME = "tells no time: the arrival of its frames stands for it"
+    TIME = "reports no time: the arrival times of its frames are used"
     COUNT = "does not count its frames: lost ones show by their time only"
-    TRIGGER = "starts when it likes: its exposures begin anywhere in a fast step"
+    TRIGGER = "has no trigger: its exposures begin anywhere in a fast step"
     QUEUE = "queues no inputs: the host sends each when its fast step begins"
     ANSWER = "acknowledges nothing: what was sent counts as taken"
     READ_BACK = "does not say what it holds: what was sent counts as held"
@@ -77,13 +78,13 @@ class Lacks(StrEnum):
 
 
 def lacks_of(driver: Any) -> list[Lacks]:
-    """What a driver, or its class, says that its devices lack; a direct mirror lacks a queue."""
+    """The abilities that a driver, or its class, lists as lacking; a direct mirror lacks a queue."""
     own = [Lacks(each) for each in getattr(driver, "lacks", ())]
     return list(dict.fromkeys([*own, Lacks.QUEUE] if hasattr(driver, "put") else own))
 
 
 class Device(Protocol):
-    """What camera and mirror have in common."""
+    """The common part of camera and mirror."""
 
     name: str
     """``camera`` or ``mirror``."""
@@ -106,7 +107,8 @@ class Device(Protocol):
         """
 
     def statistics(self) -> dict[str, Any]:
-        """Counts since the session began, by the fields of ``LinkStatistics``; empty for a device without a line."""
+        """Counts since the session began, by the fields of ``LinkStatistics``; empty for a device without a serial
+        line."""
 
 
 class Camera(Device, Protocol):
@@ -126,22 +128,23 @@ class Camera(Device, Protocol):
 
     @property
     def chunks_refused(self) -> int:
-        """Pieces of frames that made no sense."""
+        """Number of invalid chunks of frames."""
 
     def flush(self) -> list[Frame]:
-        """The frames that are still incomplete, as they are."""
+        """Give the frames that are still incomplete, as they are."""
 
 
 class Mirror(Device, Protocol):
     """Applies inputs at fast steps, which it counts.
 
-    Its `Applied` events say what the mirror held in each fast step, exactly once from the first command on: a report,
-    or ``NOT_REPORTED`` where none can be had. ``AWAITED`` comes before either where a report is asked for again.
+    Its `Applied` events give the input that the mirror held in each fast step, exactly once from the first command on:
+    a report, or ``NOT_REPORTED`` where there is none. ``AWAITED`` comes before either where a report is requested
+    again.
     """
 
     @property
     def in_flight(self) -> int:
-        """Blocks sent and not yet answered."""
+        """Number of blocks that were sent and are not yet answered."""
 
     commanded: bool
     """Whether there is a mirror: where there is none, nothing is commanded, and the rig's safe input counts as held."""
@@ -152,11 +155,12 @@ class Mirror(Device, Protocol):
 
     @property
     def outage_s(self) -> float:
-        """How long a mirror that is latched had taken no command when the session found out, s; 0 at its start."""
+        """How long a latched mirror had received no command when the session noticed the latch, s; 0 at the session's
+        start."""
 
     @property
     def last_sent_ns(self) -> int:
-        """Host time at which something was last sent to it: its watchdog runs from then."""
+        """Host time at which the mirror was last sent a packet: its watchdog runs from then."""
 
     def since_zero_ns(self, host_ns: int) -> int:
         """Time from the beginning of its fast step 0 to a host time, on the mirror's own clock, ns."""
@@ -165,34 +169,36 @@ class Mirror(Device, Protocol):
         """Standard deviation of `since_zero_ns`, as far as the inputs' times depend on it, ns."""
 
     def start_step(self, now_ns: int) -> int:
-        """The fast step that it is in, or, on virtual time, waits at. Raises DeviceError for an impossible one."""
+        """The fast step that the mirror is in, or, on virtual time, waits at. Raises DeviceError for an impossible
+        one."""
 
     def send_block(self, first_step: int, u: NDArray[np.float64], cause_frame_id: int, now_ns: int) -> pb.CommandBlock:
         """Send inputs (n_steps, n_inputs) for the fast steps from ``first_step``; gives the block as sent.
 
         Raises DeviceError for an input beyond the limits: it is refused, never clamped. The exception: with a slew
-        limit, a mirror that was parked, or whose steps were left out, goes from what it holds to ``u`` as fast as that
-        allows, and the block says how.
+        limit, a mirror that was parked, or whose steps were left out, goes from the input that it holds to ``u`` as
+        fast as that allows, and the block that is returned has these inputs.
         """
 
     def go_on_from(self, first_step: int, step: int) -> NDArray[np.float64]:
         """Leave out the fast steps from ``first_step`` to the one before ``step``, which have gone by.
 
-        Gives what the mirror holds in them by what it was sent, (step - first_step, n_inputs).
+        Gives the inputs that the mirror holds in these steps, by the commands that it was sent, (step - first_step,
+        n_inputs).
         """
 
     def withdraw(self, step: int) -> int:
-        """Send no block again that has steps from ``step`` on: they are about to be replaced.
-
-        Gives the first step from which inputs must be sent anew, because a block that begins there may not have come;
-        ``step`` where all have.
+        """Stop sending blocks again that have steps from ``step`` on: they are about to be replaced. Gives the first
+        step from which inputs must be sent anew, because a block that begins there may not have come; ``step`` where
+        all have.
         """
 
     def next_due_ns(self) -> int | None:
-        """Host time at which it is to be served next; None while nothing is waited for."""
+        """Host time at which the mirror is to be served next; None while it waits for nothing."""
 
     def serve(self, now_ns: int) -> list[Event]:
-        """Do what is due: send again what has timed out, ask for missing reports, and give up those that never came.
+        """Do what is due: send blocks again that have timed out, request missing reports, and give up reports that
+        never came.
 
         Raises DeviceError when a command has not been answered for twice the mirror's watchdog.
         """
@@ -203,28 +209,29 @@ class Mirror(Device, Protocol):
     def park(self) -> int:
         """Put the mirror into its safe state and empty its queue; gives the first fast step that this holds for.
 
-        Blocks that are not answered are given up. Raises DeviceError if the mirror does not answer.
+        Blocks without an answer are given up. Raises DeviceError if the mirror does not answer.
         """
 
     def rearm(self) -> int:
-        """End the latch of the watchdog; gives the first fast step that had not passed. Otherwise as `park`."""
+        """Release the watchdog's latch; gives the first fast step that had not passed. Otherwise this works as
+        `park`."""
 
 
 class Happened(NamedTuple):
-    """Events of a device that came at one time."""
+    """The events of a device that came at one time."""
 
     device: Device
     events: Sequence[Event]
     receive_ns: int
-    """Host clock."""
+    """The time at which they came, on the host's clock."""
 
 
 class Time(Protocol):
-    """The time of a session: the host's clock, or, on virtual time, the clock that a simulated rig hands down."""
+    """The time of a session: the host's clock, or, on virtual time, the clock that a simulated rig sends."""
 
     virtual: bool
     beside: Sequence[Served]
-    """What `events` also serves while it waits in real time, such as estimators' processes."""
+    """Objects that `events` also serves while it waits in real time, such as estimators' processes."""
 
     def now_ns(self) -> int:
         """Host time, ns since 1970."""
@@ -236,7 +243,7 @@ class Time(Protocol):
         """
 
     def elapse_until(self, host_ns: int) -> None:
-        """On virtual time, let a time-out pass in which nothing can come."""
+        """On virtual time, advance the clock by a time-out in which nothing can come."""
 
     def hurry(self) -> None:
         """Wait from now on as if a stop had been asked for: the session ends with an error."""

@@ -1,4 +1,4 @@
-"""The limits of what a mirror is sent."""
+"""The limits of the inputs that a mirror is sent."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from aolink.rig import Rig
 
 _ROUNDING = 1e-9
 _REMEMBERED_INPUTS = 64
-"""Blocks among which the one is found that a later block, sent anew, goes on from."""
+"""Number of blocks that are remembered, so that a later block, sent anew, can continue from one of them."""
 
 
 class CommandLimits:
-    """The limits of a mirror's inputs and of their change from step to step; what is beyond them is not sent.
+    """The limits of a mirror's inputs and of their change from step to step; inputs beyond them are not sent.
 
-    The change counts from what the mirror holds in the step before, as far as that is known here: what it was sent for
-    that step, and its safe input where it was sent nothing, or was parked since.
+    The change is measured from the input that the mirror holds in the step before, as far as that is known here: the
+    input that it was sent for that step, or its safe input where it was sent none or was parked since.
     """
 
     def __init__(self, rig: Rig) -> None:
@@ -30,12 +30,13 @@ class CommandLimits:
         """First fast steps and inputs of the newest blocks that were sent."""
         self._park = rig.mirror.park
         self._joined = -math.inf
-        """The first fast step in which the mirror holds what was wanted again, after it was left out or parked."""
+        """The first fast step in which the mirror holds the wanted input again, after steps were left out or it was
+        parked."""
 
     def check(self, first_step: int, u: NDArray[np.float64]) -> None:
         """Check inputs (n_steps, n_inputs) for the fast steps from ``first_step``, then take them as sent.
 
-        Raises DeviceError for what is beyond the limits.
+        Raises DeviceError for inputs beyond the limits.
         """
         if u.ndim != 2 or u.shape[1] != len(self._min):
             raise DeviceError(
@@ -60,10 +61,8 @@ class CommandLimits:
         self._sent.append((first_step, u))
 
     def take(self, first_step: int, u: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Check inputs and take them as sent, as `check` does; gives what to send.
-
-        What to send is ``u``; or, after `parked` and `go_on_from`, what comes as near to it as the limit of the change
-        allows.
+        """Check inputs and take them as sent, as `check` does; gives the inputs to send. These are ``u``; or, after
+        `parked` and `go_on_from`, inputs as near to ``u`` as the limit of the change allows.
         """
         wanted = u
         if self._slew and first_step <= self._joined:
@@ -75,21 +74,21 @@ class CommandLimits:
         return u
 
     def parked(self) -> None:
-        """What was sent is forgotten: the mirror holds its safe input, and goes from there to what it is sent next."""
+        """Forget the inputs that were sent: the mirror holds its safe input, and goes from there to the next input."""
         self._sent.clear()
         self._joined = math.inf
 
     def go_on_from(self, first_step: int, step: int) -> NDArray[np.float64]:
         """Steps from ``first_step`` to the one before ``step`` are left out: nothing more is sent for them.
 
-        The mirror goes from what it holds by then to what it is sent next. Gives what it holds in the steps that are
-        left out, (step - first_step, n_inputs).
+        The mirror goes from the input that it holds by then to the next input. Gives the inputs that it holds in the
+        steps that are left out, (step - first_step, n_inputs).
         """
         self._joined = max(self._joined, step)
         return np.array([self.held(each) for each in range(first_step, step)]).reshape(-1, len(self._park))
 
     def held(self, step: int) -> NDArray[np.float64]:
-        """What the mirror holds in a fast step by what it was sent, (n_inputs,)."""
+        """The input that the mirror holds in a fast step by the commands that it was sent, (n_inputs,)."""
         for first, u in reversed(self._sent):
             if first <= step < first + len(u):
                 return np.asarray(u[step - first])

@@ -28,7 +28,8 @@ _MIN_TIMEOUT_S = 0.01
 """Least time between two tries of a block: a Python host is held up for some ms now and then."""
 _MAX_TIMEOUT_S = 0.5
 _LATE_TIMEOUTS = 4
-"""A late block is sent again at every fourth time-out only: just its answer is still wanted, for the account."""
+"""A late block is sent again at every fourth time-out only: just its answer is still needed, to account for its
+steps."""
 _PATIENCE_WATCHDOGS = 2.0
 """A mirror that answers nothing for this many times its watchdog has parked itself, and the session ends."""
 _LEAST_TRIES = 5
@@ -41,7 +42,7 @@ _MOST_WITHDRAWN = 64
 
 
 class _NativeDevice:
-    """What the native camera and mirror share: identity, clock, simple requests."""
+    """The common part of the native camera and mirror: identity, clock, simple requests."""
 
     def __init__(self, hub: Hub, link: Link, identity: pb.Identity, gate: Gate) -> None:
         self.link, self.identity = link, identity
@@ -69,22 +70,23 @@ class _NativeDevice:
     def query_clock(self, now_ns: int) -> None:
         query_id = next(self._query_ids)
         self._queries[query_id] = now_ns
-        while len(self._queries) > _MAX_QUERIES:  # answers that never came
+        while len(self._queries) > _MAX_QUERIES:  # queries whose answers never came
             del self._queries[next(iter(self._queries))]
         self.link.send(pb.ClockQuery(query_id=query_id, host_send_ns=now_ns))
 
     def watch_port(self, now_ns: int) -> list[Event]:
-        """Open the port again where it has vanished, and ask who is there. Raises PortError once that took too long."""
+        """Open the port again where it has vanished, and ask the device for its identity. Raises PortError once that
+        took too long."""
         events = self.port.poll(now_ns)
         return [*self._broken_off(), *events] if events else []
 
     def _broken_off(self) -> list[Frame]:
-        """What of a frame had come when the port vanished."""
+        """The parts of a frame that had come when the port vanished."""
         return []
 
     def _come_back(self, message: Message, now_ns: int) -> list[Event]:
         """Go on with the device that answers on a port that was gone. Raises DeviceError for another one."""
-        if not isinstance(message, pb.Identity):  # of the session before the port vanished
+        if not isinstance(message, pb.Identity):  # from before the port vanished
             return []
         now_step = self.since_zero_ns(now_ns) // self.identity.fast_step_ns if self.clock.ready else 0
         returned = self.port.take(message, now_step, now_ns)
@@ -93,12 +95,12 @@ class _NativeDevice:
         self.identity = message
         self._queries.clear()
         self.steps = StepClock(self.clock, message.step_zero_ns, message.fast_step_ns)
-        self.clock.suspect(MOST_RATE_ERROR * (ANSWER_S + returned.away_s) * 1e9, now_ns)  # until it has been asked
+        self.clock.suspect(MOST_RATE_ERROR * (ANSWER_S + returned.away_s) * 1e9, now_ns)  # until a query
         self._begin_anew(now_ns)
         return [returned]
 
     def _begin_anew(self, now_ns: int) -> None:
-        """The device has forgotten what it was sent."""
+        """Begin anew, because the device has forgotten the packets that it was sent."""
 
     def _sample_clock(self, reply: pb.ClockReply, receive_ns: int, *, usable: bool = True) -> list[Event]:
         sent_ns = self._queries.pop(reply.query_id, None)
@@ -120,7 +122,8 @@ class _NativeDevice:
         tries: int = TRIES,
         codes: Sequence[int] = (pb.OK,),
     ) -> pb.Ack:
-        """Send a request until it is answered; gives the answer. Raises DeviceError if its code is not of ``codes``."""
+        """Send a request until it is answered; gives the answer. Raises DeviceError if its code is not among
+        ``codes``."""
         ack = self._hub.request(
             self.link, message, pb.Ack, lambda ack, sequence: ack.sequence == sequence, answer_s, tries
         )
@@ -198,17 +201,18 @@ class _Flight:
     over_ns: float
     """End of the block's last step, after which no try can help."""
     heard_ns: int
-    """When the mirror last answered for the block; before that, when it was first sent."""
+    """The time of the mirror's last answer for the block; before any answer, the time at which it was first sent."""
     first_ns: int
-    """When it was first sent."""
+    """The time at which it was first sent."""
     last_ns: int = 0
     """Time of the last try."""
     timeouts: int = 0
     tries: dict[int, int] = field(default_factory=dict)
-    """When each try was sent, by the sequence number of its packet."""
+    """The time at which each try was sent, by the sequence number of its packet."""
 
     def due_ns(self, timeout_ns: int) -> int:
-        """When to try again: at every time-out; one more try just before its first step; seldom once it is over."""
+        """The time of the next try: at every time-out; once more just before the first step; seldom once the block is
+        over."""
         if self.last_ns >= self.over_ns:
             return self.last_ns + _LATE_TIMEOUTS * timeout_ns
         due_ns = self.last_ns + timeout_ns
@@ -218,8 +222,8 @@ class _Flight:
 class NativeMirror(_NativeDevice):
     """A mirror driver on the packet protocol.
 
-    Blocks are acknowledged, and sent again on time-out as often as their lead leaves room for. Reports that do not come
-    are asked for again.
+    Blocks are acknowledged, and sent again on time-out as often as the time before their first step allows. Reports
+    that do not come are requested again.
     """
 
     commanded = True
@@ -234,13 +238,13 @@ class NativeMirror(_NativeDevice):
         self._full_s = (
             identity.mirror.queue_steps * identity.fast_step_ns / 1e9 + _PATIENCE_WATCHDOGS * self._watchdog_s
         )
-        """A block that finds the queue full for longer will find it full forever."""
+        """A queue that stays full for longer will stay full forever."""
         self._block_ids = count(1)
         self._flights: dict[int, _Flight] = {}
         self._withdrawn: dict[int, _Flight] = {}
-        """Blocks that are not sent again, but may be answered yet."""
+        """Blocks that are not sent again, but may still be answered."""
         self._answered_ns: int | None = None
-        """When the newest of the blocks that the mirror has taken was sent."""
+        """The time at which the newest of the blocks that the mirror has accepted was sent."""
         self._reports = AppliedReports(identity.fast_step_ns, round(self._watchdog_s * 1e9))
         # Smoothed round trip and its mean deviation, as TCP has them (RFC 6298).
         self.round_trip_s = math.nan
@@ -337,7 +341,7 @@ class NativeMirror(_NativeDevice):
                 self.link.lose(PortError(gone))
                 return []
             flight.timeouts += 1
-            if self.link.transport.unsent():  # on a slow line the try before has not even left
+            if self.link.transport.unsent():  # on a slow line the previous try has not even left
                 flight.last_ns = now_ns
                 continue
             self.retransmits += 1
@@ -355,14 +359,15 @@ class NativeMirror(_NativeDevice):
         return self._request(pb.Park(), "park", self._answer_s()).step
 
     def rearm(self) -> int:
-        self._flights.clear()  # whoever re-arms sends anew what is still to come
+        self._flights.clear()  # after re-arming, the session sends the steps that are still to come anew
         step = self._request(pb.Rearm(), "end the latch of its watchdog", self._answer_s()).step
         self._gate.limits.parked()
         self.latched = False
         return step
 
     def _answer_s(self) -> float:
-        """How long to wait for an answer, s: the tries together take the watchdog's time. Then it parks by itself."""
+        """How long to wait for an answer, s: all tries together take the watchdog's time, after which the mirror parks
+        by itself."""
         return min(ANSWER_S, max(self._watchdog_s / TRIES, self._timeout_ns() / 1e9))
 
     def _begin_anew(self, now_ns: int) -> None:
@@ -382,7 +387,7 @@ class NativeMirror(_NativeDevice):
         if isinstance(message, pb.Applied):
             return list(self._reports.take(message, received.receive_ns))
         if isinstance(message, pb.ClockReply):
-            # While something is sent again the line is busy in one direction: such a sample is worth nothing.
+            # While a block is sent again the line is busy in one direction, so such a sample is useless.
             clean = all(len(flight.tries) == 1 for flight in self._flights.values())
             return self._sample_clock(message, received.receive_ns, usable=clean)
         return self._say(message) if isinstance(message, pb.Event) else []
@@ -394,7 +399,7 @@ class NativeMirror(_NativeDevice):
         sent_ns = flight.tries.get(ack.sequence)
         if sent_ns is not None:
             self._measure(max(0, receive_ns - sent_ns) / 1e9)
-        if ack.code == pb.QUEUE_FULL:  # not an answer to keep: it is sent again when its time-out comes
+        if ack.code == pb.QUEUE_FULL:  # this answer is not final: the block is sent again when its time-out comes
             flight.heard_ns = receive_ns
             if (full_s := (receive_ns - flight.first_ns) / 1e9) > self._full_s:
                 expected = f"room in a queue of {self.identity.mirror.queue_steps} steps by then"
@@ -426,6 +431,6 @@ class NativeMirror(_NativeDevice):
 
 
 def _reason(ack: pb.Ack | pb.CommandAck) -> str:
-    """Why a device refused something."""
+    """The reason for which a device refused a message, in words."""
     known = pb.Code.Name(ack.code) if ack.code in pb.Code.values() else f"code {ack.code}"
     return printable(ack.text) or known

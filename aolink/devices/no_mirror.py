@@ -20,13 +20,13 @@ _MOST_STEPS = 1000
 
 
 class NoMirror:
-    """Counts fast steps by the host's clock, and says of each that the rig's safe input was held.
+    """Counts fast steps by the host's clock, and reports for each that the rig's safe input was held.
 
     Parameters
     ----------
     since_zero_ns:
-        Time from the beginning of fast step 0 to a host time, ns: of a native camera, which counts the steps itself.
-        By default the steps begin now.
+        Function that gives the time from the beginning of fast step 0 to a host time, ns, for a native camera, which
+        counts the steps itself. By default the steps begin now.
     """
 
     name = "mirror"
@@ -50,7 +50,7 @@ class NoMirror:
         return self._now_ns()
 
     def query_clock(self, now_ns: int) -> None:
-        """Nobody has a clock here."""
+        """Do nothing: there is no device whose clock could be queried."""
 
     def host_ns(self, device_ns: int, since_zero_ns: int, now_ns: int) -> tuple[int, float]:
         return device_ns, 0.0
@@ -98,7 +98,7 @@ class NoMirror:
         return self._passed(math.ceil(self._rig.timing.frame_period_steps / 10))
 
     def _passed(self, at_least: int) -> list[Event]:
-        """The fast steps that have passed since the last call and are ``at_least`` so many."""
+        """The fast steps that have passed since the last call, if they are ``at_least`` this many."""
         if self._told is None:  # nor is the camera's clock known
             return []
         step_ns, park = self._rig.timing.fast_step_ns, self._rig.mirror.park

@@ -37,7 +37,7 @@ def open_devices(
     stop: Callable[[], bool] = lambda: False,
     reconnect_s: float = 0.0,
 ) -> Iterator[Opened]:
-    """Open both devices, ask who they are, and check that against the rig file.
+    """Open both devices, ask for their identities, and check these against the rig file.
 
     Parameters
     ----------
@@ -45,7 +45,7 @@ def open_devices(
         Ports of devices that speak aolink's packets; where None, the rig file's table ``[devices]`` names the driver.
         Where that names no mirror, the camera is opened alone.
     stop:
-        Once it gives True, no device is waited for longer than for one answer.
+        Once it gives True, the wait for a device is no longer than for one answer.
     reconnect_s:
         How long to wait for the port of a native device that has vanished, s; with 0 that is an error at once.
 
@@ -125,7 +125,8 @@ def _open_camera(rig: Rig, table: DeviceTable, mirror: Mirror, host: Host, stack
     with _closing_what_fails("camera", lambda: driver.close()):
         _check_whole("camera", table, driver, SimpleCamera)
         tells_time, period_s = driver.time_ns() is not None, rig.timing.frame_period_steps * rig.timing.fast_step_s
-        # Where nothing is known of when a frame arrives, it is some time within the frame period after its exposure.
+        # Where the delay of frames is not known, a frame may arrive at any time within the frame period after its
+        # exposure.
         delay = table.delay or (Delay() if tells_time else Delay(mean_s=period_s / 2, sd_s=period_s / math.sqrt(12)))
         camera = AdaptedCamera(rig, driver, mirror, delay, host.now_ns)
         _close_with(stack, camera.close)
@@ -133,7 +134,7 @@ def _open_camera(rig: Rig, table: DeviceTable, mirror: Mirror, host: Host, stack
 
 
 def _close_with(stack: ExitStack, close: Callable[[], None]) -> None:
-    """Close a device with ``stack``. Where a session has failed, what closing raises does not hide why."""
+    """Close a device with ``stack``. Where a session has failed, an error from closing does not hide the reason."""
 
     def leave(failed: type[BaseException] | None, *_: object) -> None:
         with suppress(*([AolinkError] if failed else [])):
@@ -144,12 +145,12 @@ def _close_with(stack: ExitStack, close: Callable[[], None]) -> None:
 
 @contextmanager
 def _closing_what_fails(kind: Kind, close: Callable[[], None]) -> Iterator[None]:
-    """Close a driver that turns out to be of no use. Raises DeviceError for whatever it raises."""
+    """Close a driver that turns out to be unusable. Raises DeviceError for any exception of the driver."""
     try:
         with calling(kind, "when it was opened"):
             yield
     except BaseException:
-        with suppress(Exception):  # it may lack that as well
+        with suppress(Exception):  # it may lack ``close`` as well
             close()
         raise
 
@@ -177,7 +178,7 @@ def _port_and_key(kind: Kind, table: DeviceTable, rig: Rig) -> tuple[str, bytes 
             f"devices.{kind}: the driver {NATIVE} takes port, a text, and key, a file's name; found {table.options}"
             f"{' and a delay' if table.delay else ''}"
         )
-    if isinstance(key, str):  # of the rig file; not one that the user has given beside it
+    if isinstance(key, str):  # from the rig file; not one that the user has given beside it
         key = rig.path_of(key, f"devices.{kind}.key") if key else None
     return port, read_key(key) if key else None
 
@@ -219,7 +220,8 @@ def _open_native(
 
 
 def _allow_return(host: Host, stop: Callable[[], bool], within_s: float) -> None:
-    """Wait for native devices whose port vanishes. Raises DeviceError where there is none that can return."""
+    """Let the session wait for native devices whose port vanishes. Raises DeviceError where there is none that can
+    return."""
     if host.virtual or not host.native:
         why = "this rig runs on virtual time" if host.virtual else "the devices here have drivers of their own"
         raise DeviceError(
@@ -232,7 +234,7 @@ def _allow_return(host: Host, stop: Callable[[], bool], within_s: float) -> None
 
 
 def _check_whole(kind: Kind, table: DeviceTable, driver: Any, protocol: type) -> None:
-    """Refuse a driver that has not all of ``protocol``. Raises DeviceError."""
+    """Refuse a driver that lacks a member of ``protocol``. Raises DeviceError."""
     asked = [name for name in (*protocol.__annotations__, *vars(protocol)) if not name.startswith("_")]
     if lacking := [name for name in asked if not hasattr(driver, name)]:
         raise DeviceError(

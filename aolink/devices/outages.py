@@ -7,9 +7,8 @@ import time
 
 
 class Outages:
-    """A thread that should run every ``period_ns`` sees by its own lateness when nothing here ran.
-
-    It is some time late without an outage, too: what is shorter than a period is not counted.
+    """A thread that should run every ``period_ns`` measures by its own lateness how long this process did not run. It
+    is slightly late without an outage, too: a lateness below one period is not counted.
     """
 
     def __init__(self, period_ns: int) -> None:
@@ -21,7 +20,7 @@ class Outages:
         self._thread.start()
 
     def total_ns(self) -> int:
-        """Time of all outages so far, that of one included which has just ended and which the thread has yet to see."""
+        """Time of all outages so far, including one that has just ended and that the thread has not noticed yet."""
         with self._changed:
             return self._ended_ns + self._overdue_ns()
 

@@ -17,15 +17,15 @@ from aolink.rig import Rig
 
 _REMEMBERED = 1000
 _LATE = 0.5
-"""A step whose input was taken only after this part of it held the one before for longer: it was late."""
+"""A step whose input was taken only after this part of the step is late: it held the previous input for longer."""
 _LEAST_PERIOD_NS = 1_000_000
-"""Least period of looking whether the host is held up: to look more often would cost more than it tells."""
+"""Least period of checking whether the host is held up, ns: more frequent checks would cost more than they show."""
 
 
 class PacedMirror:
     """A `SimpleMirror` made of a `DirectMirror`: the host queues the inputs, and sends each when its step begins.
 
-    The scheduler and the line decide how exactly that goes. A step for which the device took its input later than
+    The scheduler and the serial line limit how exact this is. A step for which the device took its input later than
     half-way counts as late, and is reported to have held the input before. Where steps begin while the device is still
     busy with an earlier one, the newest is sent, and those between are late. Time for which this host was held up while
     it waited for an answer is not the device's, and does not make it late.
@@ -42,15 +42,16 @@ class PacedMirror:
         self._now = self._park
         """What the device holds."""
         self._held: list[tuple[NDArray[np.float64], bool]] = []
-        """Inputs of the steps that were not told yet, and whether they were late."""
+        """Inputs of the steps that were not reported yet, and whether they were late."""
         self._told = 0
-        """The first step of ``_held``. While the device takes an input, its step is played, and not yet in there."""
+        """The first step of ``_held``. While the device takes an input, its step has been played, but is not in
+        ``_held`` yet."""
         self._changed = threading.Condition()
-        """For all of the above."""
+        """Guards all of the above."""
         self._device = threading.Lock()
-        """Held while the driver is called; never asked for by who holds ``_changed``."""
+        """Held while the driver is called; a thread that holds ``_changed`` never acquires it."""
         self._lateness_ns: deque[int] = deque(maxlen=_REMEMBERED)
-        """How long after the beginning of their steps the device's answers to its newest inputs were heard."""
+        """Times from the beginning of a step until the device's answer to its input was read, for the newest inputs."""
         self._outages = Outages(max(rig.timing.fast_step_ns // 8, _LEAST_PERIOD_NS))
         self._parked = self._closed = False
         self._failed: Exception | None = None
@@ -62,7 +63,8 @@ class PacedMirror:
 
     @property
     def timing_sigma_ns(self) -> float:
-        """Rms of how late the device's answers to its newest inputs were heard, ns; it had taken them before."""
+        """Rms of the time from a step's beginning to the device's answer, over its newest inputs, ns; it took each
+        input before it answered."""
         with self._changed:
             return float(np.sqrt(np.mean(np.square(self._lateness_ns)))) if self._lateness_ns else 0.0
 
@@ -91,7 +93,7 @@ class PacedMirror:
             self._driver.park()
             with self._changed:
                 first = max(self._next, self.time_ns() // self._step_ns + 1)
-                # Until now it went on holding its input, also in the step whose input the thread waits to put out.
+                # Until now the device held its input, also in the step whose input the thread waits to put out.
                 self._held += [(self._now, True)] * (first - self._told - len(self._held))
                 self._next, self._now = first, self._park
                 return first
@@ -117,15 +119,15 @@ class PacedMirror:
                     continue
             try:
                 self._put(step, u)
-            except Exception as error:  # the session is told when it asks next
+            except Exception as error:  # the session gets the error when it asks next
                 with self._changed:
                     self._failed = error
                 return
 
     def _wait_for_step(self) -> int | None:
-        """The step that is on, once the one before was played; None when the mirror is closed.
-
-        Steps that have passed meanwhile held what the device held; they are late where something was queued for them.
+        """Wait for the step that follows the last one played, and give the present step; None when the mirror is
+        closed. Steps that have passed meanwhile held the device's input; they are late where an input was queued for
+        them.
         """
         while not self._closed:
             step = self.time_ns() // self._step_ns

@@ -1,4 +1,5 @@
-"""The port of a native device, which may vanish and return: it is opened again, and asked who is there."""
+"""The port of a native device, which may vanish and return: it is opened again, and the device is asked for its
+identity."""
 
 from __future__ import annotations
 
@@ -14,13 +15,14 @@ from aolink.wire.link import Link
 from aolink.wire.port import Reopening, Transport
 
 _SILENT_S = 2.0
-"""A device that was asked for its time and has said nothing for so long has no line."""
+"""A device that has not answered a clock query for this long counts as disconnected, s."""
 _STEPS_OFF_S = 0.25
-"""How far a device's count of fast steps may be from what its clock foretells, s; a restart makes it begin anew."""
+"""The most by which a device's count of fast steps may differ from the prediction by its clock, s; a restart makes the
+count begin anew."""
 
 
 class PortWatch:
-    """Notices that a port has vanished, opens it again, and asks who is there, without ever waiting.
+    """Notices that a port has vanished, opens it again, and asks the device for its identity, without ever waiting.
 
     Without `allow` a port that vanishes is an error, as `aolink.wire.link.Link.lose` raises it.
     """
@@ -36,14 +38,15 @@ class PortWatch:
         self._nonce = 0
         self._asked_ns: int | None = None
         self._unanswered_ns: int | None = None
-        """Host time since which the device has been asked and has said nothing."""
+        """Host time of the first query that the device has left unanswered."""
 
     def allow(self, reopen: Callable[[], Transport], within_s: float) -> None:
-        """From now on, wait for a port that vanishes for up to ``within_s`` seconds."""
+        """Wait from now on for a port that vanishes, for up to ``within_s`` seconds."""
         self._link.reopen, self._within_s = reopen, within_s
 
     def poll(self, now_ns: int) -> list[Vanished]:
-        """Do what is due; says once that the port has vanished. Raises PortError where it has not returned in time."""
+        """Do what is due; reports once that the port has vanished. Raises PortError where it has not returned in
+        time."""
         link = self._link
         if link.reopen is None:
             return []
@@ -77,7 +80,7 @@ class PortWatch:
             link.send(pb.Identify(nonce=self._nonce))
 
     def take(self, identity: pb.Identity, now_step: int, now_ns: int) -> Returned | None:
-        """Compare who answers with who was there; None for an answer to nothing that was asked.
+        """Compare the device that answers with the one that was there; None for an answer that was not asked for.
 
         ``now_step`` is the fast step that the device must be in by its clock. Raises DeviceError for another device,
         and for one that was restarted: its fast steps are not those of the session any more.
@@ -103,13 +106,13 @@ class PortWatch:
         return Returned(away_s)
 
     def give_up(self) -> None:
-        """Look for the port no more."""
+        """Stop trying to open the port."""
         if self._reopening is not None:
             self._reopening.give_up()
 
 
 def _lasting(identity: pb.Identity) -> pb.Identity:
-    """What stays as it is for as long as a device runs."""
+    """The fields of an identity that stay the same for as long as a device runs."""
     lasting = pb.Identity()
     lasting.CopyFrom(identity)
     for name in ("nonce", "next_step", "step_zero_ns"):

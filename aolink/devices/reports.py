@@ -1,4 +1,4 @@
-"""The reports of a mirror, fast step by fast step; missing ones are asked for again."""
+"""The reports of a mirror, fast step by fast step; missing reports are requested again."""
 
 from __future__ import annotations
 
@@ -16,26 +16,27 @@ class _Gap:
 
     first: int
     end: int
-    """The first step after them."""
+    """The first step after the gap."""
     since_ns: int
-    """Host time since which nothing of them has come."""
+    """Host time since which the steps have been missing."""
     asked_ns: int | None = None
     """Host time of the last query; None before the first."""
     tries: int = 0
 
 
 class AppliedReports:
-    """Hands on what the mirror held in each fast step exactly once, and knows which steps to ask for again.
+    """Passes on the input that the mirror held in each fast step exactly once, and keeps the steps to be requested
+    again.
 
     A device sends its reports in order, so a report that begins later than the one before it ended shows a gap.
-    Reports may come twice (both the original and an answer): only what is new of them is handed on.
+    Reports may come twice (both the original and an answer): only their new steps are passed on.
 
     Parameters
     ----------
     fast_step_ns:
         Length of a fast step.
     patience_ns:
-        How long a step is asked for before it is given up as not reported.
+        How long a step is requested before it counts as not reported.
     """
 
     def __init__(self, fast_step_ns: int, patience_ns: int) -> None:
@@ -48,12 +49,12 @@ class AppliedReports:
         """Number of queries so far."""
 
     def begin(self, first_step: int) -> None:
-        """From ``first_step`` on every step has to be reported. Only the first call counts."""
+        """Expect a report of every step from ``first_step`` on. Only the first call counts."""
         if self._start is None:
             self._start = self._next = first_step
 
     def take(self, applied: pb.Applied, now_ns: int) -> list[pb.Applied]:
-        """Take a report; gives what is new of it, after an ``AWAITED`` for each gap that it shows."""
+        """Take a report; gives its new steps, after an ``AWAITED`` for each gap that it shows."""
         first, end = applied.first_step, applied.first_step + applied.n_steps
         if self._start is None or end <= self._start:  # before the session: nothing depends on it
             return [applied]
@@ -78,7 +79,7 @@ class AppliedReports:
         return awaited + [self._part(applied, low, high) for low, high in new]
 
     def expect_until(self, end: int, now_ns: int) -> list[pb.Applied]:
-        """Ask for every step before ``end`` that has not been reported, also without a later report."""
+        """Request every step before ``end`` that has not been reported, also without a later report."""
         if self._start is None or end <= self._next:
             return []
         gap = _Gap(self._next, end, now_ns)
@@ -87,7 +88,7 @@ class AppliedReports:
         return [pb.Applied(first_step=gap.first, n_steps=end - gap.first, source=pb.Applied.AWAITED)]
 
     def ask_anew(self, now_ns: int) -> None:
-        """Ask for all that is missing as if it were missing since now: the device could not be asked before."""
+        """Request all missing steps as if they were missing since now: the device could not be asked before."""
         self._gaps = [_Gap(gap.first, gap.end, now_ns) for gap in self._gaps]
 
     def next_due_ns(self, interval_ns: int) -> int | None:
@@ -95,7 +96,7 @@ class AppliedReports:
         return min((_due_ns(gap, interval_ns) for gap in self._gaps), default=None)
 
     def ask(self, now_ns: int, interval_ns: int) -> tuple[list[pb.AppliedQuery], list[pb.Applied]]:
-        """The queries that are due, and ``NOT_REPORTED`` for steps that were asked for long enough."""
+        """The queries that are due, and ``NOT_REPORTED`` for steps that were requested for long enough."""
         queries, given_up, gaps = [], [], []
         for gap in self._gaps:
             if _due_ns(gap, interval_ns) <= now_ns:

@@ -2,7 +2,7 @@
 
 A simple driver knows its device and nothing of a session. It never waits: the session's thread polls it every few
 milliseconds. `aolink.devices.adapted_camera` and `adapted_mirror` make a session's devices of such drivers, and
-`aolink.devices.paced` a mirror that takes a queue of one that does not.
+`aolink.devices.paced` makes a mirror with a queue of one without.
 """
 
 from __future__ import annotations
@@ -27,9 +27,10 @@ class SimpleFrame:
     exposure_ns: int
     """Length of the exposure, ns."""
     start_ns: int | None = None
-    """Start of the exposure on the camera's own clock; None where it tells no time."""
+    """Start of the exposure on the camera's own clock; None where it reports no time."""
     arrived_ns: int | None = None
-    """`time.monotonic_ns` when the frame arrived, for a camera that tells no time; None for when it is taken."""
+    """`time.monotonic_ns` when the frame arrived, for a camera that reports no time; None for the time at which the
+    frame is taken."""
     number: int | None = None
     """The camera's own count of its frames, without wrapping; a gap is a lost frame. None where it does not count."""
     mask: NDArray[np.bool_] | None = None
@@ -37,11 +38,11 @@ class SimpleFrame:
     chunks_lost: int = 0
     """Packets of the frame that never arrived."""
     truth: Truth | None = None
-    """What really happened, where the driver simulates a camera."""
+    """The true states and path, where the driver simulates a camera."""
 
 
 class ClockAnswer(NamedTuple):
-    """What a camera's clock said between two times of `time.monotonic_ns`, all in ns."""
+    """A reading of a camera's clock between two times of `time.monotonic_ns`, all in ns."""
 
     asked_ns: int
     camera_ns: int
@@ -55,21 +56,21 @@ class SimpleCamera(Protocol):
     attribute ``lacks`` may list what the device cannot do, some of `Lacks`. A method ``statistics`` may give the counts
     of its line by the fields of the recording's ``LinkStatistics``; they are recorded once a second.
 
-    A camera whose clock takes long to ask has a method ``ask_time``, which has it asked without waiting (False where
-    there is no clock to ask), and a method ``time_answers``, which gives the `ClockAnswer`s since its last call. During
-    a session ``time_ns`` is not called then.
+    A camera whose clock takes long to ask has a method ``ask_time``, which queries it without waiting (False where
+    there is no clock), and a method ``time_answers``, which gives the `ClockAnswer`s since its last call. During a
+    session ``time_ns`` is not called then.
     """
 
     description: str
     """Model, serial number, firmware: for the recording."""
 
     def time_ns(self) -> int | None:
-        """The camera's clock now, ns since any time; it must not jump. None where it tells no time."""
+        """The camera's clock now, ns since any time; it must not jump. None where it reports no time."""
 
     def start(self, start_ns: int, exposures: int) -> None:
         """Take ``exposures`` frames (0: until stopped), the first as soon as the camera can from ``start_ns`` on.
 
-        ``start_ns`` is on the camera's clock, on `time.monotonic_ns` for a camera that tells no time.
+        ``start_ns`` is on the camera's clock, on `time.monotonic_ns` for a camera that reports no time.
         """
 
     def frames(self) -> Iterable[SimpleFrame]:
@@ -83,7 +84,7 @@ class SimpleCamera(Protocol):
 
 
 class Held(NamedTuple):
-    """What a mirror held in a run of fast steps."""
+    """The inputs that a mirror held in a run of fast steps."""
 
     first_step: int
     u: NDArray[np.float64]
@@ -111,12 +112,12 @@ class SimpleMirror(Protocol):
         """
 
     def applied(self) -> Iterable[Held | tuple[int, NDArray[np.float64]]]:
-        """What the mirror held since the last call: first fast steps and inputs (n_steps, n_inputs), in order."""
+        """The inputs that the mirror held since the last call: first fast steps and inputs (n_steps, n_inputs), in
+        order."""
 
     def park(self) -> int:
-        """Hold the safe input from now on and empty the queue; gives the first fast step of that.
-
-        It may be called by another thread than the session's, but never at the same time as another method.
+        """Hold the safe input from now on and empty the queue; gives the first fast step with the safe input. It may be
+        called by another thread than the session's, but never at the same time as another method.
         """
 
     def close(self) -> None:
@@ -124,7 +125,7 @@ class SimpleMirror(Protocol):
 
 
 class DirectMirror(Protocol):
-    """A mirror without a queue, which holds the input that it was given last. For the entry point see `SimpleCamera`.
+    """A mirror without a queue, which holds the input that it received last. For the entry point see `SimpleCamera`.
 
     `aolink.devices.paced.PacedMirror` drives it at the fast rate, on a thread of its own: its methods may wait for the
     device, and are never called at the same time.
@@ -133,9 +134,8 @@ class DirectMirror(Protocol):
     description: str
 
     def put(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Hold ``u`` (n_inputs,) from now on; gives what the device took, as its resolution has it.
-
-        Raises DeviceError where the device refuses it or does not answer.
+        """Hold ``u`` (n_inputs,) from now on; gives the input that the device took, rounded to its resolution. Raises
+        DeviceError where the device refuses it or does not answer.
         """
 
     def park(self) -> None:

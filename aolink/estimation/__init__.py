@@ -1,4 +1,4 @@
-"""Estimation: the motion inside each exposure, from its blur. Pure: no time, no files, no ports."""
+"""Estimation of the motion inside each exposure, from its blur. The subpackage is pure: no time, no files, no ports."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
     ESTIMATOR_NAMES: tuple[str, ...]
     """The names that `make_estimator` knows, by rank."""
-else:  # the type checker would believe in any name
+else:  # the type checker would accept any name
     from aolink.names import at_first_use
 
     _load = at_first_use(
@@ -52,7 +52,7 @@ else:  # the type checker would believe in any name
     )
 
     def __getattr__(name: str) -> Any:
-        """Search other packages for estimators, too, but only when somebody asks for all names."""
+        """Search other packages for estimators, too, but only when all names are asked for."""
         if name == "ESTIMATOR_NAMES":
             from aolink.estimation.registry import estimator_rows
 

@@ -1,17 +1,17 @@
 """The error of an exposure's alignment with the mirror's fast steps, as a consider parameter of any filter.
 
-Where camera and mirror have clocks of their own, nobody knows exactly which inputs belong to an exposure. The error of
-the clocks' comparison is nearly the same in neighbouring exposures: it does not average out, so white noise is no model
-of it. Nor can frames tell it from the plant's own motion, so it is not estimated. It is considered (S. F. Schmidt,
-Advances in Control Systems 3 (1966); P. S. Maybeck, Stochastic Models, Estimation, and Control 2 (1982), section 13):
-two copies of the filter are given the same frames with the inputs of some steps earlier and later, and half the
-difference of their estimates is what such an error does to the estimate, with all that earlier exposures contributed.
-Where it is many steps, the estimate does not follow it along a straight line: the second order, from the sum of the
-two, widens the covariances.
+Where camera and mirror have clocks of their own, it is not known exactly which inputs belong to an exposure. The error
+of the clocks' comparison is nearly the same in neighbouring exposures: it does not average out, so white noise is not a
+model of it. Frames cannot distinguish it from the plant's own motion, so it is not estimated. It is considered (S. F.
+Schmidt, Advances in Control Systems 3 (1966); P. S. Maybeck, Stochastic Models, Estimation, and Control 2 (1982),
+section 13): two copies of the filter are given the same frames with the inputs of some steps earlier and later, and
+half the difference of their estimates is the effect of such an error on the estimate, including the effect through
+earlier exposures. Where the error is many steps, the estimate is not linear in it: the second order, from the sum of
+the two, widens the covariances.
 
 The clocks are known better the longer they are compared, and worse after a pause. The error is taken to be the same
-number of standard deviations in all exposures, so each is shifted by its own: what an exposure of badly known alignment
-has done to the estimates stays in them until frames have corrected it, however well the later ones are aligned.
+number of standard deviations in all exposures, so each is shifted by its own: the effect of an exposure with badly
+known alignment stays in the estimates until frames have corrected it, however well the later ones are aligned.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ from aolink.exposure import Exposure
 from aolink.numerics.arrays import FloatArray
 
 _NEGLIGIBLE = 0.02
-"""An alignment that is known to this part of a fast step changes no estimate that the model has right."""
+"""An alignment error below this part of a fast step is negligible."""
 
 _ROUNDED = 0.5
 """A shift of more than this part of a fast step is rounded to whole steps."""
 
 
 def matters(exposure: Exposure, fast_step_ns: int) -> bool:
-    """Whether an exposure's alignment is so uncertain that it is to be considered."""
+    """Whether an exposure's alignment is so uncertain that its error has to be considered."""
     return exposure.alignment_sigma_ns > _NEGLIGIBLE * fast_step_ns
 
 
@@ -113,7 +113,7 @@ def considered(
 def _bent(
     share: float, estimate: Estimate, late: Estimate, early: Estimate, name: Literal["coefficients", "end_state"]
 ) -> FloatArray:
-    """What a badly known alignment does beyond the straight line: the error's second order, (axes, n, n).
+    """The second-order effect of the alignment's error on the estimate, (axes, n, n).
 
     With shifts of root 3 standard deviations both are the points of Gauss and Hermite's quadrature, and the first
     order, c c', and this one are together the mean square of the estimate's change.
@@ -124,7 +124,7 @@ def _bent(
 
 
 def _nis(estimate: Estimate, change: FloatArray) -> FloatArray:
-    """nu' (S + c c')^-1 nu from nu' S^-1 nu, for a change c of the innovation (Sherman and Morrison)."""
+    """The NIS nu' (S + c c')^-1 nu from nu' S^-1 nu, for a change c of the innovation (Sherman and Morrison)."""
     nis = estimate.nis.copy()
     for axis in np.flatnonzero(nis > 0):
         weighted = np.linalg.lstsq(estimate.innovation_covariance[axis], change[axis], rcond=None)[0]

@@ -1,6 +1,6 @@
-"""What estimators of the blur assume of a rig: the ranges of the family of scenes that they are judged on.
+"""The assumptions of the estimators about a rig: the ranges of the family of scenes that they are judged on.
 
-`tools/family` draws its scenes from these ranges. A rig outside may work as well; nobody has measured how well.
+`tools/family` draws its scenes from these ranges. A rig outside may work as well, but how well has not been measured.
 """
 
 from __future__ import annotations
@@ -16,19 +16,19 @@ from aolink.rig import Rig
 
 MOST_MODES = 3
 MOST_SWINGS = 8.0
-"""Swings of a mode in one exposure, at most."""
+"""Most swings of an eigenmode in one exposure."""
 STEPS_IN_SWING = 8
-"""Fast steps in one swing of a mode, at least."""
+"""Fewest fast steps in one swing of an eigenmode."""
 MOST_PATH_WIDTHS = 8.0
-"""Standard deviation of the spot's motion, in standard deviations of the kernel."""
+"""Largest standard deviation of the spot's motion, in standard deviations of the kernel."""
 LEAST_KERNEL_PIXELS = 0.8
-"""The kernel's sigma."""
+"""Least sigma of the kernel, pixels."""
 LEAST_PEAK_SNR = 1.0
-"""Signal to noise in the brightest pixel of a resting spot."""
+"""Least signal to noise in the brightest pixel of a resting spot."""
 
-# A mode that makes less than this share of the motion's variance does not count.
+# An eigenmode that makes less than this share of the motion's variance does not count.
 _LEAST_SHARE = 0.01
-# Plants whose eigenvectors are closer to each other than this have no modes of their own.
+# Plants whose eigenvectors are closer to each other than this have no separate eigenmodes.
 _MOST_CONDITION = 1e8
 _MOST_OUTPUTS = 2
 _ROUNDING = 1e-9
@@ -44,7 +44,7 @@ def peak_snr(rig: Rig) -> float:
 def broken_assumptions(rig: Rig) -> Iterator[tuple[str, str]]:
     """The rig file's key and a sentence for each assumption that a rig does not meet.
 
-    What moves the spot is judged for plants that move one spot each, along one axis or both.
+    The spot's motion is judged for plants that move one spot each, along one axis or both.
     """
     sensor, plant, timing = rig.sensor, rig.plant, rig.timing
     kernel = math.sqrt(2 * float(np.linalg.eigvalsh(sensor.kernel.covariance)[0])) / sensor.pixel_width
@@ -58,7 +58,7 @@ def broken_assumptions(rig: Rig) -> Iterator[tuple[str, str]]:
         yield (
             "sensor.noise_density",
             f"signal to noise is {snr:.2g} in the brightest pixel of a resting spot, estimators were judged from"
-            f" {LEAST_PEAK_SNR:g} on: below, frames tell little more than the plant's model does",
+            f" {LEAST_PEAK_SNR:g} on: below, frames add little to the plant's model",
         )
     if plant.n_outputs > _MOST_OUTPUTS:
         return
@@ -68,27 +68,28 @@ def broken_assumptions(rig: Rig) -> Iterator[tuple[str, str]]:
         yield (
             "plant.process_noise",
             f"the plant moves the spot by {widths:.3g} sds of the kernel (sd), estimators were judged up to"
-            f" {MOST_PATH_WIDTHS:g}: beyond, a blur is thin and long, and has more readings than they follow",
+            f" {MOST_PATH_WIDTHS:g}: beyond, a blur is thin and long, and more paths explain it than they follow",
         )
     count, swings = _modes(rig)
     fastest = float(swings.max(initial=0.0))
     if count > MOST_MODES:
         yield (
             "plant.A",
-            f"{count} modes of the plant move the spot along one axis, estimators were judged with up to {MOST_MODES}:"
-            " with more, intervals of profile and mixture may be too narrow; compare them with those of moments",
+            f"{count} eigenmodes of the plant move the spot along one axis, estimators were judged with up to"
+            f" {MOST_MODES}: with more, intervals of profile and mixture may be too narrow; compare them with those of"
+            " moments",
         )
     if fastest > MOST_SWINGS + _ROUNDING:
         yield (
             "timing.exposure_steps",
-            f"the plant's fastest mode swings {fastest:.3g} times in an exposure, estimators were judged up to"
+            f"the plant's fastest eigenmode swings {fastest:.3g} times in an exposure, estimators were judged up to"
             f" {MOST_SWINGS:g}: beyond, the blur shows its amplitude and not its phase; shorten the exposure",
         )
     if fastest * STEPS_IN_SWING > timing.exposure_steps * (1 + _ROUNDING):
         yield (
             "timing.fast_step_s",
-            f"the plant's fastest mode has {timing.exposure_steps / fastest:.2g} fast steps in one swing, estimators"
-            f" were judged from {STEPS_IN_SWING} on: the model has no motion inside a step; make it shorter",
+            f"the plant's fastest eigenmode has {timing.exposure_steps / fastest:.2g} fast steps in one swing,"
+            f" estimators were judged from {STEPS_IN_SWING} on: the model has no motion inside a step; make it shorter",
         )
 
     if plant.wandering is not None and plant.wandering.parameter == "frequency":
@@ -97,13 +98,15 @@ def broken_assumptions(rig: Rig) -> Iterator[tuple[str, str]]:
         for each in between[np.abs(between - np.round(2 * between) / 2) < reach]:
             yield (
                 "plant.wandering",
-                f"a mode of the plant swings {each:.3g} times from frame to frame, nearly a whole or half number: a"
-                " faster plant looks like a slower one there, and the frequency may be lost; leave the table out",
+                f"an eigenmode of the plant swings {each:.3g} times from frame to frame, nearly a whole or half"
+                " number: a faster plant looks like a slower one there, and the frequency may be lost; leave the table"
+                " out",
             )
 
 
 def _modes(rig: Rig) -> tuple[int, FloatArray]:
-    """How many modes move the spot along one axis, an oscillation being one; and the swings of each in an exposure."""
+    """The number of eigenmodes that move the spot along one axis, an oscillation counting as one; and the swings of
+    each in an exposure."""
     plant = rig.plant
     values, vectors = np.linalg.eig(plant.A)
     share = np.ones((plant.n_outputs, len(values)))

@@ -1,4 +1,4 @@
-"""Batches of exposures: what does not depend on earlier exposures is computed for a whole batch at once."""
+"""Batches of exposures: quantities that do not depend on earlier exposures are computed for a whole batch at once."""
 
 from __future__ import annotations
 

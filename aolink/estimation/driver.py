@@ -18,14 +18,14 @@ from aolink.numerics.arrays import FloatArray
 from aolink.rig import Rig
 
 _MOST_SKIPPED_STEPS = 100_000
-"""Longest gap, in fast steps, that is predicted input by input; of a longer one the oldest inputs are dropped."""
+"""Longest gap, in fast steps, that is predicted input by input; in a longer gap the oldest inputs are dropped."""
 
 
 class SkippedInputs:
     """The inputs of exposures that one estimator has skipped.
 
     The next exposure that it gets carries them as its lead, so that the estimator predicts over the steps of the
-    skipped ones with what the mirror did, as it does over dead time and lost frames.
+    skipped ones with the mirror's inputs, as it does over dead time and lost frames.
     """
 
     def __init__(self) -> None:
@@ -41,7 +41,7 @@ class SkippedInputs:
             self._steps -= len(self._rows.popleft())
 
     def leading(self, exposure: Exposure) -> Exposure:
-        """An exposure that the estimator gets, with what it has skipped since the one before."""
+        """The given exposure, with the inputs of the exposures skipped since the one before it."""
         if not self._rows:
             return exposure
         lead = np.concatenate([*self._rows, exposure.lead_inputs])[-_MOST_SKIPPED_STEPS:]
@@ -56,7 +56,7 @@ class Driver:
     Parameters
     ----------
     names:
-        The estimators, some of `ESTIMATOR_NAMES`.
+        Names of the estimators, among `ESTIMATOR_NAMES`.
     engine:
         As in `Options`.
     skipped:

@@ -1,4 +1,4 @@
-"""`Estimate`: what an estimator says about one exposure, as plain data; and sums of its outputs."""
+"""The class `Estimate`: the result of an estimator for one exposure; and sums of its outputs."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from aolink.plain import plain_data
 
 
 class Status(enum.IntEnum):
-    """What became of the measurement in an estimate. The numbers are those of the recording's schema."""
+    """The use of the measurement in an estimate. The numbers are those of the recording's schema."""
 
     OK = 0
     """The measurement was used."""
@@ -36,9 +36,8 @@ class Status(enum.IntEnum):
 
 @dataclass(frozen=True, eq=False)
 class AlignmentError:
-    """What one standard deviation of an exposure's alignment with the mirror's steps does to an estimate.
-
-    The error is one of the clocks' comparison: neighbouring exposures, and all axes, have it in common.
+    """The change of an estimate by one standard deviation of the exposure's alignment with the mirror's steps. The
+    error comes from the clocks' comparison: neighbouring exposures, and all axes, have it in common.
     """
 
     steps: float
@@ -56,7 +55,7 @@ class AlignmentError:
 
 @dataclass(frozen=True, eq=False)
 class WanderingValue:
-    """A quantity that drifts, in what the rig file says of it."""
+    """A quantity that drifts, relative to the rig file's value."""
 
     mean: FloatArray
     """(axes,)"""
@@ -68,12 +67,12 @@ class WanderingValue:
 class Components:
     """The posterior of an exposure as a Gaussian mixture for each axis, of few coefficients t: z = expand t + a rest.
 
-    It has what one mean and one covariance do not tell: that a path may have run one way or the other.
+    It holds what one mean and one covariance cannot: for example, that a path may have run in either direction.
     """
 
     parts: Sequence[tuple[Indices, FloatArray, FloatArray, FloatArray]]
     """Some of the axes, their log-weights (axes, components), means (axes, components, n) and covariances (axes,
-    components, n, n). Of an axis that is in several parts the last one counts."""
+    components, n, n). For an axis that is in several parts the last one counts."""
     expand: FloatArray
     """(n_coefficients, n)"""
     left_out: FloatArray
@@ -97,7 +96,7 @@ class Estimate:
 
     The three are jointly Gaussian. The path is kept as coefficients of the exposure basis
     (`aolink.estimation.ExposureModel.basis`): path = basis @ coefficients + response to the inputs. It is computed
-    when it is first read: for 1800 axes that takes longer than the estimation. The arrays are not to be written to.
+    when it is first read: for 1800 axes that takes longer than the estimation. The arrays must not be changed.
     """
 
     estimator: str
@@ -106,20 +105,20 @@ class Estimate:
     n_steps: int
     status: Status
     reason: str
-    """Why the status is not OK, or what the estimate had to do without; otherwise empty."""
+    """The reason why the status is not OK, or the data that the estimate lacked; otherwise empty."""
     start_state: FloatArray
     """State at the exposure's first fast step, (axes, n_states)."""
     start_covariance: FloatArray
     """(axes, n_states, n_states)"""
     end_state: FloatArray
-    """State one fast step after the exposure's last: where control goes on, (axes, n_states)."""
+    """State one fast step after the exposure's last, from which control goes on, (axes, n_states)."""
     end_covariance: FloatArray
     """(axes, n_states, n_states)"""
     coefficients: FloatArray
     """Coefficients of the exposure basis; the first n_states are the start state, (axes, n_coefficients)."""
     coefficient_covariance: FloatArray
-    """(axes, n_coefficients, n_coefficients); without the error of the exposure's alignment, which is in the other two
-    and in the path's, but for its second order."""
+    """(axes, n_coefficients, n_coefficients); without the error of the exposure's alignment except for its second
+    order; the other two covariances and the path's contain it."""
     inputs: FloatArray
     """Inputs during the exposure; their response is part of the path, (n_steps, n_inputs)."""
     model: ExposureModel = field(compare=False, repr=False)
@@ -134,11 +133,13 @@ class Estimate:
     Chi-square with n_measurements degrees of freedom where model and covariances are right.
     """
     alignment: AlignmentError | None = field(default=None, compare=False)
-    """Where camera and mirror count by different clocks."""
+    """The effect of the alignment's error, where camera and mirror count by different clocks."""
     components: Components | None = field(default=None, compare=False, repr=False)
-    """Where the estimator carries a mixture; recordings do not have them. `smooth` uses them."""
+    """The mixture's components, where the estimator carries a mixture; recordings do not have them. `smooth` uses
+    them."""
     wandering: WanderingValue | None = field(default=None, compare=False)
-    """Where the rig has ``plant.wandering`` and the estimator follows it; recordings do not have it."""
+    """The drifting quantity, where the rig has ``plant.wandering`` and the estimator follows it; recordings do not have
+    it."""
 
     @property
     def path(self) -> FloatArray:
@@ -162,7 +163,7 @@ class Estimate:
         Returns
         -------
         (k n_steps, k n_steps) for k outputs, all steps of the first one first: what `aolink.restoration.motion_psf`
-        takes. Its diagonal is ``path_sd`` squared. What the exposure's basis leaves out of the path stands on the
+        takes. Its diagonal is ``path_sd`` squared. The part of the path that the exposure's basis leaves out is on the
         diagonal alone.
         """
         chosen = range(len(self.path)) if outputs is None else outputs
@@ -174,8 +175,8 @@ class Estimate:
     def alignment_path(self) -> FloatArray:
         """Change of the path by one standard deviation of the alignment's error, (n_outputs, n_steps).
 
-        A later exposure sees what later inputs do: the path changes by its coefficients and by the response to the
-        inputs' own change.
+        A later exposure sees the effect of later inputs: the path changes by its coefficients and by the response to
+        the change of the inputs.
         """
         if self.alignment is None:
             return np.zeros_like(self.path)

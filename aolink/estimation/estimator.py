@@ -33,8 +33,8 @@ class Estimator:
     def __init__(self, rig: Rig, name: str, filter: Filter) -> None:
         self.rig, self.name, self.filter = rig, name, filter
         self.several: NDArray[np.bool_] | None = None
-        """Axes whose last posterior has several modes (the blur has more than one reading), (axes,); None if the filter
-        does not look for modes."""
+        """Axes whose last posterior has several modes (more than one path explains the blur), (axes,); None if the
+        filter does not search for modes."""
         self.posterior: Posterior | None = None
         """The filter's last posterior, of an exposure that it took by itself."""
         self._next_step: int | None = None
@@ -43,7 +43,7 @@ class Estimator:
 
     @property
     def shared(self) -> list[object]:
-        """What copies of it have in common."""
+        """The data that copies of the estimator share."""
         return [self.rig, self.rig.plant, self.rig.sensor]
 
     def step(self, exposure: Exposure) -> Estimate:
@@ -80,7 +80,7 @@ class Estimator:
             k += count
 
     def _run(self, batch: Batch, measured: Measurements, first: int) -> Run | None:
-        """Have the filter take at once the exposures from ``first`` to the next gap or flaw; None where it cannot."""
+        """Run the filter at once over the exposures from ``first`` to the next gap or flaw; None where it cannot."""
         row, moments = measured.rows[first], measured.moments
         if batch.model is None or moments is None or row < 0:
             return None
@@ -223,7 +223,7 @@ def _status_reasons(posterior: Posterior) -> list[str]:
             reasons.append(f"{nis}, {text}" if axes == 1 else f"{counts[status]} of {axes} axes: {nis}, {text}")
     if posterior.several is not None and posterior.several.any():
         of = "" if axes == 1 else f"{int(posterior.several.sum())} of {axes} axes: "
-        reasons.append(f"{of}the blur has more than one reading")
+        reasons.append(f"{of}more than one path explains the blur")
     if posterior.remark:
         reasons.append(posterior.remark)
     return reasons

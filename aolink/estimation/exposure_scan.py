@@ -1,4 +1,4 @@
-"""Which exposure time is best: the expected error of o1, from covariances alone, without a single frame.
+"""The choice of the exposure time: the expected error of o1, from covariances alone, without a single frame.
 
 Everything is linear: o1 multiplies a centroid's innovation by a constant gain, and the process noise moves the
 centroid, the path and the end state together. So the true covariance of o1's error follows from a recursion of its
@@ -87,12 +87,12 @@ def exposure_scan(rig: Rig, steps: Iterable[int] | None = None) -> list[Expected
 
 
 def best(errors: Iterable[ExpectedError]) -> ExpectedError:
-    """The one with the smallest path error."""
+    """The exposure time with the smallest path error."""
     return min(errors, key=lambda e: e.path_rms)
 
 
 def _expected(rig: Rig) -> ExpectedError:
-    """Over all copies of the plant; those whose spots have the same light are computed once."""
+    """The expected errors over all copies of the plant; copies whose spots have the same light are computed once."""
     noises, counts = np.unique(centroid_covariance(rig), axis=0, return_counts=True)
     each = [_expected_of(rig, linalg.block_diag(*noise)) for noise in noises]
     squares = np.array([[e.path_rms**2, e.end_rms**2, e.noise_rms**2] for e in each])
@@ -107,10 +107,10 @@ def _expected_of(rig: Rig, R: FloatArray) -> ExpectedError:
     K = steady_gain(model, added_noise(model, "lifted"), R)
     if K is None:
         raise EstimatorError(
-            f"exposures of {n} fast steps lose a mode that does not die out: o1 has no steady state;"
-            " `aolink rig --check` says which mode"
+            f"exposures of {n} fast steps do not observe an eigenmode that does not decay: o1 has no steady state;"
+            " `aolink rig --check` says which eigenmode"
         )
-    # What a unit of noise in one step does to the outputs k steps later, to the centroid and to the end state.
+    # Effect of a unit of noise in one step on the outputs k steps later, on the centroid and on the end state.
     root = plant.B_w @ psd_root(plant.process_noise)
     impulse = np.concatenate([np.zeros((plant.n_outputs, 1, root.shape[1])), model.state_rows[:, :-1] @ root], axis=1)
     on_centroid = np.cumsum(impulse, axis=1)[:, ::-1] / n  # (n_outputs, step of the noise, noises)

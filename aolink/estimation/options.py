@@ -30,10 +30,11 @@ class Options:
     gate: bool = True
     """Whether a measurement too far from its prediction is left out."""
     engine: Engine = "aolink"
-    """What o1 to o3 run on: "aolink", or "filterpy", for one axis."""
+    """The engine of o1 to o3: "aolink", or "filterpy", for one axis."""
     second_order: bool = False
-    """Whether o2 and o3 allow for what their linearisation leaves out (`SecondOrderMoments`): their covariance is then
-    right where the prior is as wide as the spot's way, at the price of a weaker correction."""
+    """Whether o2 and o3 include the second-order terms that their linearisation leaves out (`SecondOrderMoments`):
+    their covariance is then right where the prior is as wide as the spot's motion, at the price of a weaker
+    correction."""
     orders: tuple[int, ...] = (0, 1, 2, 3)
     """Orders of the moments that `moments` takes, in its basis; 0 is the light in the window."""
     basis: Basis = "monomial"
@@ -51,7 +52,7 @@ _NAMES = tuple(Options.__dataclass_fields__)
 
 
 def with_options(text: str) -> tuple[str, dict[str, Any]]:
-    """An estimator's name and options out of a text such as ``o3:second_order`` or ``sampled:particles=500,seed=2``.
+    """An estimator's name and options from a text such as ``o3:second_order`` or ``sampled:particles=500,seed=2``.
 
     ``orders`` are digits, ``orders=012``; an option without a value is switched on. Raises EstimatorError.
     """

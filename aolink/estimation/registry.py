@@ -31,24 +31,25 @@ GROUP = "aolink.estimators"
 """The entry points by which other packages add estimators."""
 DEFAULT_ESTIMATOR = "o3"
 BASELINE_ESTIMATOR = "o1"
-"""What the others are compared with: it takes the centroid of a blurred spot alone."""
+"""The estimator that others are compared with: it takes the centroid of a blurred spot alone."""
 # Spots of one copy of the plant, by `moments`.
 _MOST_SPOTS = 128
 
 
 @dataclass(frozen=True, kw_only=True)
 class EstimatorRow:
-    """All that aolink knows of an estimator."""
+    """All that aolink needs to know about an estimator."""
 
     name: str
     rank: int
-    """Place in tables and plots, from the plainest to the one that a user wants to see first; ours are tens."""
+    """Rank in tables and plots, from the simplest estimator to the one that is shown first; aolink's own ranks are
+    multiples of ten."""
     colour: tuple[int, int, int]
     """Red, green and blue, 0 to 255."""
     build: Callable[[Rig, Options], Filter]
-    """Makes the filter for a rig, which says what it needs of a frame and updates with that."""
+    """A function that makes the filter for a rig; the filter states its needs of a frame and updates with them."""
     refusal: Callable[[Rig], str | None] = lambda rig: None
-    """Why it cannot work on a rig, and what to use instead; None where it can."""
+    """A function that gives the reason why it cannot work on a rig, and what to use instead; None where it can."""
     engines: tuple[Engine, ...] = ("aolink",)
     """Engines that it can run on."""
     wanders: bool = False
@@ -58,8 +59,8 @@ class EstimatorRow:
 
 
 def estimator_row(name: str) -> EstimatorRow:
-    """The row of an estimator, whose name may have its options. Raises EstimatorError: there is none, or the package
-    that has it is broken."""
+    """The row of an estimator, whose name may have its options. Raises EstimatorError if there is none, or if the
+    package that has it is broken."""
     return row_named(name.partition(":")[0], _OURS, GROUP, "estimator", EstimatorError)
 
 
@@ -106,7 +107,7 @@ def make_estimator(rig: Rig, name: str, **options: Any) -> Estimator:
         )
 
     def made(rig: Rig) -> Estimator:
-        # What the first exposure would load or compile is ready before the session.
+        # Code that the first exposure would load or compile is ready before the session.
         steps = rig.timing.exposure_steps
         exposure_model(rig.plant, steps, rig.timing.exposure_offset).response(np.ones((steps, rig.n_inputs)))
         return Estimator(rig, name, row.build(rig, chosen))
@@ -128,13 +129,13 @@ def _moments_refusal(rig: Rig) -> str | None:
 
 
 def _pixels_refusal(name: str) -> Callable[[Rig], str | None]:
-    """Why a filter that uses every pixel cannot work on a rig; profile has another form for many alike systems."""
+    """Why a filter that uses every pixel cannot work on a rig; profile has another form for many equal systems."""
 
     def refusal(rig: Rig) -> str | None:
         if name == "profile" and alike_systems(rig.plant) is not None:
             return None
         if rig.plant.n_states > MANY_STATES:
-            alike = " that is not of alike systems side by side" if name == "profile" else ""
+            alike = " that does not consist of equal systems side by side" if name == "profile" else ""
             return (
                 f"{name} follows the posterior's modes for at most {MANY_STATES} states of one plant, {rig.name} has"
                 f" {rig.plant.n_states}{alike}: use {'o3' if alike else 'profile or moments'}"

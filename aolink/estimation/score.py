@@ -1,4 +1,4 @@
-"""Estimates against the truth: RMSE, NIS, NEES; and why measurements were not used."""
+"""Scores of estimates against the truth: RMSE, NIS, NEES; and the reasons why measurements were not used."""
 
 from __future__ import annotations
 
@@ -40,12 +40,12 @@ class Unused:
     status: str
     """Name of the `Status` that their estimates have."""
     reason: str
-    """What the first of these estimates says; the others may have other numbers in it."""
+    """The reason of the first of these estimates; those of the others may have other numbers in them."""
     first_frame: int
     """Frame of the first."""
 
     def text(self, estimated: int) -> str:
-        """The same in words, for a series of ``estimated`` exposures."""
+        """The count and its reason in words, for a series of ``estimated`` exposures."""
         what = self.status.lower().replace("_", " ")
         first = "" if self.exposures == 1 else ", the first"
         return f"{self.exposures} of {estimated} exposures {what}: {self.reason} (frame {self.first_frame}{first})"
@@ -58,7 +58,7 @@ class UnusedCounter:
         self._found: dict[tuple[str, str], Unused] = {}
 
     def add(self, status: Status, reason: str, frame_id: int) -> None:
-        """Count an estimate; one that used its exposure, or that never looks at the camera, counts nothing."""
+        """Count an estimate; one that used its exposure, or whose estimator takes no measurements, is not counted."""
         if status in (Status.OK, Status.PREDICTED):
             return
         # Reasons hold numbers, such as a NIS, that differ from frame to frame.
@@ -72,7 +72,7 @@ class UnusedCounter:
         )
 
     def result(self) -> tuple[Unused, ...]:
-        """What was counted so far, the most frequent first."""
+        """The counts so far, the most frequent first."""
         return tuple(sorted(self._found.values(), key=lambda each: -each.exposures))
 
 
@@ -92,14 +92,14 @@ class Score:
     looks: bool
     """Whether the estimator takes measurements at all; `open-loop` does not."""
     unused: tuple[Unused, ...]
-    """Why measurements were not used, the most frequent reason first."""
+    """The reasons why measurements were not used, the most frequent first."""
     gated: int
     """Estimates whose measurement was too far from its prediction in some axis and was not used there (status GATED or
     DIVERGED); exposures without truth are counted, too."""
     start_rmse: float
     """Root mean square over exposures and axes of the norm of the error of the start state (Mishra & Wen, figure 5)."""
     end_rmse: float
-    """The same for the end state."""
+    """The same error for the end state."""
     path_rmse: float
     """Root mean square error of the path, slope units."""
     nis: Consistency
@@ -108,7 +108,8 @@ class Score:
 
     @property
     def nothing_measured(self) -> str:
-        """Why none of the exposures gave a measurement, in words; empty where one did or the estimator never looks."""
+        """The reason why none of the exposures gave a measurement, in words; empty where one did or the estimator takes
+        none."""
         if not self.looks or self.measured:
             return ""
         why = self.unused[0].reason if self.unused else "no reason is known"
@@ -180,7 +181,7 @@ def score(exposures: Sequence[Exposure], estimates: Sequence[Estimate], skip: in
 
 
 class RunningMean:
-    """A running mean; it carries along what rounding takes from a long sum (Kahan, as Neumaier has it)."""
+    """A running mean that compensates for the rounding of long sums (Kahan, in Neumaier's form)."""
 
     def __init__(self) -> None:
         self.count = 0

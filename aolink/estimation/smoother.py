@@ -8,10 +8,10 @@ and all that is known of it N(x+, P+),
     G = P E' A_g' P-^-1,    z <- z + G (x+ - x-),    P <- P + G (P+ - P-) G'.
 
 Rauch, Tung, Striebel, Maximum likelihood estimates of linear dynamic systems, AIAA J. 3 (1965), (3.30) to (3.32).
-The posteriors are taken as the estimator gave them: where it approximated, this does as well.
+The posteriors are those of the estimator: its approximations remain in the result.
 
-Estimators that carry a Gaussian mixture give its components with an estimate. Where all estimates have them, which of
-them later exposures speak for is found by backward simulation (`aolink.estimation.pixels.backward`).
+Estimators that carry a Gaussian mixture give its components with an estimate. Where all estimates have them, backward
+simulation reweights them by the later exposures (`aolink.estimation.pixels.backward`).
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ def smooth(
     Returns
     -------
     The same with other states, coefficients, paths and covariances; status, innovation and NIS stay the filter's.
-    Where a filter started again, what came later says nothing of what was before.
+    Where a filter started again, later exposures do not correct earlier ones.
 
     Raises
     ------
@@ -85,7 +85,7 @@ def _backward(plant: Plant, exposures: Sequence[Exposure], estimates: Sequence[E
 def _through_mixtures(
     plant: Plant, exposures: Sequence[Exposure], estimates: Sequence[Estimate]
 ) -> list[Estimate]:  # fmt: skip
-    """The same by backward simulation, for estimates with components."""
+    """Each estimate corrected by backward simulation, for estimates with components."""
     from aolink.estimation.pixels.backward import Next, Smoothed, smoothed  # its imports take long
 
     done: list[Estimate] = []
@@ -117,7 +117,7 @@ def _corrected(
     model = estimate.model
     z, P = estimate.coefficients, estimate.coefficient_covariance
     end, P_end, alignment = estimate.end_state, estimate.end_covariance, estimate.alignment
-    if alignment is not None:  # it is no noise, and later frames have it too: it stands aside
+    if alignment is not None:  # it is not noise, and later frames have it too: it is kept apart
         P_end = P_end - alignment.added_to(np.zeros_like(P_end), "end_state")
     E = model.transition if z.shape[1] == plant.n_states else model.end_rows
     transition, noise, kick = _gap(plant, exposure, next_exposure)

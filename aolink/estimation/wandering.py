@@ -1,11 +1,11 @@
-"""A quantity that wanders: copies of an estimator at several values of it, weighed by what they predict.
+"""A quantity that wanders: copies of an estimator at several values of it, weighted by the likelihood of the frames.
 
 Each copy has one relative value s of a frequency, a gain, a width or a noise. At a frequency s all motion of the plant
 runs s times as fast with the same spread: A -> A^s, and a process noise that leaves the stationary covariance as it
-is. The value is a Markov chain over the copies, a random walk in log s. Each frame's likelihood under a copy weighs it
-(multiple models: Magill, IEEE Trans. Autom. Control 10 (1965); with a chain over them: Blom, Bar-Shalom, ibid. 33
-(1988)). States are not mixed between copies, as the latter do: a plant that forgets its state brings each copy's
-estimate near to what its own value allows, and a mixture of Gaussians as well as a Gaussian can stay with its copy.
+is. The value is a Markov chain over the copies, a random walk in log s. Each copy is weighted by the likelihood of each
+frame under it (multiple models: Magill, IEEE Trans. Autom. Control 10 (1965); with a chain over them: Blom, Bar-Shalom,
+ibid. 33 (1988)). States are not mixed between copies, as the latter do: since the plant forgets its state, each copy's
+estimate follows from its own value, and each copy can keep a Gaussian mixture as well as a Gaussian.
 
 Each axis has a value of its own. An estimate is the mixture of the copies' estimates, by its mean and covariance.
 Its path is written in the basis of the plant as it is in the rig file, so a recording needs no other: the noise inside
@@ -127,7 +127,7 @@ class WanderingEstimator(Estimator):
 
 
 def at_value(rig: Rig, parameter: Wanders, relative: float) -> Rig:
-    """A rig with another frequency, gain, width or noise, so many times the file's.
+    """A rig whose frequency, gain, width or noise is multiplied by a factor.
 
     Raises EstimatorError: its plant cannot run faster or slower.
     """
@@ -154,7 +154,7 @@ def at_value(rig: Rig, parameter: Wanders, relative: float) -> Rig:
 
 
 def at_frequency(plant: Plant, relative: float) -> Plant:
-    """A plant all of whose motion runs so many times as fast, with the same spread and the same static response.
+    """A plant whose motion is faster by a factor, with the same spread and the same static response.
 
     Raises EstimatorError: its motion has no stationary spread, or its matrix no real logarithm.
     """
@@ -196,7 +196,7 @@ def _grid(plant: Plant, wandering: Wandering) -> FloatArray:
 
 
 def _evidence(posterior: Posterior) -> FloatArray:
-    """Log-likelihood of what was measured, (axes,); not finite where nothing was.
+    """Log-likelihood of the measurement, (axes,); not finite where there is none.
 
     By innovation and covariance it is -(NIS + log |S|) / 2, up to a constant.
     """
@@ -209,9 +209,8 @@ def _evidence(posterior: Posterior) -> FloatArray:
 
 
 def _nearest_known(evidence: FloatArray) -> FloatArray:
-    """Evidence (axes, copies), where it is not finite that of the nearest copy whose is.
-
-    A copy with much noise, or a wide kernel, may see no spot where the others do; that says nothing of its value.
+    """Evidence (axes, copies), replaced where it is not finite by that of the nearest copy with a finite one. A copy
+    with much noise, or a wide kernel, may see no spot where the others do; this is no evidence about its value.
     """
     known = np.isfinite(evidence)
     places = np.arange(evidence.shape[1])
@@ -221,7 +220,7 @@ def _nearest_known(evidence: FloatArray) -> FloatArray:
 
 def _in_basis(nominal: Estimate, other: Estimate, tolerance: float) -> tuple[FloatArray, FloatArray]:
     """Mean and covariance of another copy's path as coefficients of the nominal basis."""
-    if other.model is nominal.model:  # what wanders is the camera's
+    if other.model is nominal.model:  # the quantity that wanders belongs to the camera
         return other.coefficients, other.coefficient_covariance
     model, theirs = nominal.model, other.model
     n = nominal.end_state.shape[1]

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     import xarray as xr
 
 _MOST_BYTES = 8 << 30
-"""More is not put into memory at once, nor more than a quarter of what the machine has."""
+"""The most bytes that are put into memory at once; a quarter of the machine's memory is the other limit."""
 _SLOPE = "slope unit"
 
 
@@ -32,20 +32,20 @@ class Variable:
     """Names of its dimensions."""
     values: NDArray[Any]
     text: str
-    """What it is."""
+    """The meaning of the variable."""
     unit: str = ""
 
 
 @dataclass(frozen=True)
 class _Row:
-    """How one variable is got."""
+    """The source of one variable."""
 
     text: str
     dims: tuple[str, ...] = ()
-    """Besides time, and estimator."""
+    """Dimensions besides time and estimator."""
     unit: str = ""
     get: Callable[[Any], Any] | None = None
-    """By its own name where None."""
+    """Function that gets the value; where None, the attribute of the variable's name."""
     in_words: bool = False
 
     def of(self, name: str, source: Any) -> Any:
@@ -94,25 +94,25 @@ ESTIMATE = {
 def arrays(
     series: Series, estimators: Sequence[str] | None = None, progress: Progress = no_progress
 ) -> dict[str, Variable]:
-    """Everything about exposures and their estimates, by name, in memory.
+    """All data of exposures and their estimates, by name, in memory.
 
     Dimensions: ``time``, an exposure each; ``row`` and ``column`` of a frame; ``step``, a fast step of an exposure;
     ``input``; ``axis``, ``state`` and ``output`` of the plant; ``estimator``. ``lead_inputs`` are those of the steps
     between exposures, end to end along ``lead_step``: ``lead_steps`` says how many belong to each exposure, before it.
-    Frames of a picture sensor are ``scene``. Variables of a truth, or of estimates, are there if these are; where one
-    exposure has none, numbers are NaN and texts empty.
+    Frames of a picture sensor are ``scene``. Variables of a truth, or of estimates, are there if any exposure has one;
+    where one exposure has none, numbers are NaN and texts empty.
 
     Parameters
     ----------
     estimators:
-        Whose estimates; all of them by default.
+        Estimators whose estimates are exported; all by default.
 
     Raises
     ------
     RecordingError
         There are no estimates of such a name.
     ExportError
-        There is no exposure, the exposures have different sizes, or all of it would be too large for the memory.
+        There is no exposure, the exposures have different sizes, or the arrays would be too large for the memory.
     """
     names = series.named(estimators)
     _check_size(series, len(names))
@@ -190,7 +190,7 @@ def _sd(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _scenes(scenes: Sequence[Any]) -> Mapping[str, Variable]:
-    """Frames of the picture sensor; one that never came is zero, with nothing of it in the mask."""
+    """Frames of the picture sensor; one that never came is zero, with a mask that is False throughout."""
     known = next((each for each in scenes if each is not None), None)
     if known is None:
         return {}
@@ -215,7 +215,7 @@ def _check_alike(series: Series, first: Exposure, other: Exposure) -> None:
 
 
 def _check_size(series: Series, n_estimators: int) -> None:
-    """Refuse what would fill the memory."""
+    """Refuse arrays that would fill the memory."""
     rig, steps = series.rig, series.rig.timing.exposure_steps
     numbers = (1 + 2 * n_estimators) * rig.n_outputs * steps + rig.n_inputs * steps
     numbers += 4 * n_estimators * rig.plant.axes * rig.plant.n_states
@@ -230,7 +230,7 @@ def _check_size(series: Series, n_estimators: int) -> None:
 
 
 def to_xarray(series: Series, estimators: Sequence[str] | None = None, progress: Progress = no_progress) -> xr.Dataset:
-    """What `Series.to_xarray` gives. Raises as `arrays`, and ExportError where xarray is missing."""
+    """The result of `Series.to_xarray`. Raises as `arrays`, and ExportError where xarray is missing."""
     xarray = needed("xarray", "tables", "a dataset")
     found = arrays(series, estimators, progress)
     coordinates = ("time", "frame_id", "estimator")

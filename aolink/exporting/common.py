@@ -1,4 +1,4 @@
-"""What all that is exported shares: what must be there, the clock, the facts that go along."""
+"""The common part of all exports: the checks, the clock, the facts about the session."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from aolink.exposure import Exposure
 from aolink.series import Series
 
 Progress = Callable[[int], None]
-"""Is told how many exposures have been read."""
+"""A function that is called with the number of exposures read."""
 
 
 def no_progress(exposures: int) -> None:
-    """Tell nobody."""
+    """Ignore the progress."""
 
 
 def needed(module: str, extra: str, what: str) -> Any:
@@ -33,7 +33,7 @@ def needed(module: str, extra: str, what: str) -> Any:
 def together(
     series: Series, names: Sequence[str], progress: Progress = no_progress
 ) -> Iterator[tuple[Exposure, list[Estimate | None]]]:
-    """What `Series.with_estimates` gives. Raises ExportError where there is no exposure."""
+    """The exposures and estimates of `Series.with_estimates`. Raises ExportError where there is no exposure."""
     number = 0
     for number, both in enumerate(series.with_estimates(names), 1):
         yield both
@@ -43,9 +43,9 @@ def together(
 
 
 def clock_of(first: Exposure) -> str:
-    """Which of an exposure's times a series counts by, as the first one has it; '' where there is none.
-
-    The start on the host's clock where it is known, else when the frame came, else the device's clock.
+    """The field of an exposure's time that a series uses, chosen by the first exposure; '' where there is none. It is
+    the start on the host's clock where that is known, otherwise the arrival of the frame, otherwise the start on the
+    device's clock.
     """
     clocks = ("host_start_ns", "host_receive_ns", "device_start_ns")
     return next((name for name in clocks if getattr(first, name)), "")
@@ -66,7 +66,7 @@ def check_frame(series: Series, exposure: Exposure) -> None:
 
 
 def facts(series: Series) -> dict[str, str]:
-    """Where it all comes from: what every export carries along, if it can."""
+    """Facts about the origin of the data, which every export that can holds."""
     return {
         "recording": series.path.name,
         "rig": series.rig.name,

@@ -30,7 +30,7 @@ def export(
     overwrite: bool = False,
     progress: Progress = no_progress,
 ) -> None:
-    """Write exposures and their estimates into a file of another program's format, which its suffix says.
+    """Write exposures and their estimates into a file of another program's format, which its suffix selects.
 
     ``.npz``, ``.nc`` (NetCDF) and ``.fits`` (AOT telemetry) hold everything of `arrays`; ``.parquet`` and ``.csv`` the
     table of `aolink.exporting.table`, the former with inputs and paths as lists.
@@ -38,11 +38,11 @@ def export(
     Parameters
     ----------
     series:
-        What `aolink.read` gives, or a slice of it.
+        The result of `aolink.read`, or a slice of it.
     estimators:
-        Whose estimates; all of them by default.
+        Estimators whose estimates are exported; all by default.
     progress:
-        Is told how many exposures have been read.
+        Called with the number of exposures read.
 
     Raises
     ------
@@ -72,7 +72,7 @@ def _write_netcdf(series: Series, names: Sequence[str], path: Path, progress: Pr
     for module in ("h5py", "h5netcdf"):
         needed(module, "tables", "NetCDF (.nc)")
     dataset = to_xarray(series, names, progress)
-    with path.open("r+b") as file:  # by its name HDF5 would want a lock on the file, which is ours
+    with path.open("r+b") as file:  # given the name, HDF5 would lock the file, which is locked already
         dataset.to_netcdf(file, engine="h5netcdf")
 
 
@@ -111,4 +111,4 @@ WRITERS: dict[str, Callable[[Series, Sequence[str], Path, Progress], None]] = {
     ".nc": _write_netcdf,
     ".fits": write_fits,
 }
-"""By the suffix of the file."""
+"""Functions that write a format, by the suffix of the file."""

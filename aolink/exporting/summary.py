@@ -1,4 +1,4 @@
-"""One number for each axis out of a path: what fits into a column of a table."""
+"""Numbers for each axis from a path, which fit into a column of a table."""
 
 from __future__ import annotations
 
@@ -14,15 +14,14 @@ def rms_by_axis(values: FloatArray, axes: int) -> FloatArray:
 
 
 def path_rms(path: FloatArray, axes: int) -> FloatArray:
-    """How far the spots of each axis moved: RMS of a path (axes * outputs, n_steps) about its own means, (axes,).
-
-    Slope units.
+    """Motion of the spots of each axis: RMS of a path (axes * outputs, n_steps) about its own means, slope units,
+    (axes,).
     """
     return rms_by_axis(path - path.mean(axis=1, keepdims=True), axes)
 
 
 def estimate_scalars(estimate: Estimate) -> dict[str, FloatArray]:
-    """What a column of a table holds of an estimate's path and consistency, by name, each (axes,).
+    """Values for a table's columns about an estimate's path and consistency, by name, each (axes,).
 
     ``path_rms`` is how far the spot moved in the exposure (`path_rms`), ``path_sd_rms`` the RMS of the path's standard
     deviation, both in slope units; ``nis`` is the estimate's own, NaN for an estimator that measures nothing.

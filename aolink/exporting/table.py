@@ -28,22 +28,23 @@ class Column:
 
     name: str
     kind: Kind
-    """What is in it: a ``time`` is ns since 1970, ``numbers`` a list, None what is not known."""
+    """The type of its values: a ``time`` is ns since 1970, ``numbers`` a list; unknown values are None."""
 
 
 def columns(series: Series, names: Sequence[str], *, lists: bool = False) -> list[Column]:
     """The table's columns for the estimators ``names``; those of an estimator begin with its name.
 
-    A row says where it comes from (``recording``, ``rig``), which exposure it is of (``time``, ``lead_steps`` and the
-    fields of `Exposure`) and which ``axis``. Of that axis it has the mean of each input (``input_1_mean``, ...), the
-    states (``x1``, ...) at both ends with their standard deviations, the mean of each output's path (``path_1_mean``),
-    the RMS of the path about these means (``path_rms``), of its standard deviation (``path_sd_rms``) and, where the
-    truth is known, of its error (``path_error_rms``); ``status``, ``reason`` and ``nis``.
+    A row names its source (``recording``, ``rig``), its exposure (``time``, ``lead_steps`` and the fields of
+    `Exposure`) and its ``axis``. For that axis it has the mean of each input (``input_1_mean``, ...), the states
+    (``x1``, ...) at both ends with their standard deviations, the mean of each output's path (``path_1_mean``), the RMS
+    of the path about these means (``path_rms``), of its standard deviation (``path_sd_rms``) and, where the truth is
+    known, of its error (``path_error_rms``); ``status``, ``reason`` and ``nis``.
 
     Parameters
     ----------
     lists:
-        With the axis's inputs (steps x inputs), paths and their standard deviations (outputs x steps) as lists.
+        Whether to add the axis's inputs (steps x inputs), paths and their standard deviations (outputs x steps) as
+        lists.
     """
     plant = series.rig.plant
     inputs, states = range(1, plant.n_inputs + 1), range(1, plant.n_states + 1)
@@ -73,7 +74,7 @@ def columns(series: Series, names: Sequence[str], *, lists: bool = False) -> lis
 def rows(
     series: Series, names: Sequence[str], *, lists: bool = False, progress: Progress = no_progress
 ) -> Iterator[dict[str, Any]]:
-    """The table's rows by the names of its `columns`, one by one; what is not known is not in it.
+    """The table's rows by the names of its `columns`, one by one; unknown values are left out.
 
     Raises ExportError where there is no exposure.
     """
@@ -111,7 +112,7 @@ _OF_EXPOSURE: dict[str, Kind] = {
 
 
 def _of_truth(truth: Truth, axes: int, lists: bool) -> dict[str, ByAxis]:
-    """What a truth says of each axis, by column."""
+    """The values of a truth for each axis, by column."""
     found: dict[str, ByAxis] = {}
     for end, states in (("start", truth.start_state), ("end", truth.end_state)):
         found |= {f"{end}_x{i}": column.tolist() for i, column in enumerate(states.T, 1)}
@@ -119,7 +120,7 @@ def _of_truth(truth: Truth, axes: int, lists: bool) -> dict[str, ByAxis]:
 
 
 def _of_estimate(estimate: Estimate, exposure: Exposure, lists: bool) -> dict[str, ByAxis]:
-    """What an estimate says of each axis, by column."""
+    """The values of an estimate for each axis, by column."""
     axes = len(estimate.start_state)
     found: dict[str, ByAxis] = {
         "status": [estimate.status.name] * axes,
@@ -148,7 +149,7 @@ def _of_path(path: FloatArray, axes: int, lists: bool) -> dict[str, ByAxis]:
 
 
 def to_pandas(series: Series, estimators: Sequence[str] | None = None) -> pd.DataFrame:
-    """What `Series.to_pandas` gives. Raises RecordingError and ExportError as that."""
+    """The result of `Series.to_pandas`. Raises RecordingError and ExportError as that does."""
     pandas = needed("pandas", "tables", "a data frame")
     names = series.named(estimators)
     known = columns(series, names)

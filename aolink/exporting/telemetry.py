@@ -1,10 +1,10 @@
-"""Exposures as AOT telemetry (Gomes et al., aotpy): what adaptive optics has names for, and tables for the rest.
+"""Exposures as AOT telemetry (Gomes et al., aotpy): the quantities that the format defines, and tables for the rest.
 
 Frames are the pixel intensities of a Shack-Hartmann sensor's detector, with the centres of gravity of its spots as
 measurements; the inputs that the mirror held are a loop's commands, one row for each fast step. A line sensor is one
 spot whose second direction is not measured (NaN). Estimates, truth, the facts about each exposure and the rig file,
-for which the format has no place, are binary tables behind what it knows: aotpy warns that they are not of its format
-and gives them as extra data, and every program that reads FITS reads them.
+for which the format has no place, are binary tables behind these: aotpy warns that they are not of its format and gives
+them as extra data, and every program that reads FITS reads them.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from aolink.optics.sensor import BaseSensor
 from aolink.series import Series
 
 _IN_IMAGES = ("pixels", "inputs")
-"""What of an exposure is not in the table, because an image holds it."""
+"""The parts of an exposure that are not in the table, because an image holds them."""
 
 
 def write_fits(series: Series, names: Sequence[str], path: Path, progress: Progress) -> None:
@@ -35,7 +35,7 @@ def write_fits(series: Series, names: Sequence[str], path: Path, progress: Progr
     aot = needed("aotpy", "aot", "AOT telemetry (.fits)")
     writer = needed("aotpy.io.fits.writer", "aot", "AOT telemetry (.fits)")
     fits = needed("astropy.io.fits", "aot", "AOT telemetry (.fits)")
-    found = arrays(series, names, progress)  # whose frames are all of one size
+    found = arrays(series, names, progress)  # the format needs frames of one size
     check_frame(series, next(series.exposures()))
     hdus = writer.AOTFITSWriter(_system(aot, series, found)).get_hdulist()
     hdus.append(_table(fits, "EXPOSURES", {k: found[k].values for k in EXPOSURE if k not in _IN_IMAGES}))
@@ -53,11 +53,11 @@ def write_fits(series: Series, names: Sequence[str], path: Path, progress: Progr
 
 
 def _system(aot: Any, series: Series, found: Mapping[str, Variable]) -> Any:
-    """What AOT has names for."""
+    """The part of the data that AOT defines."""
     rig, times = series.rig, found["time"].values
     step_s, begun = rig.timing.fast_step_s, times.astype(np.int64) / 1e9
     frames = aot.Time(uid="FRAMES", timestamps=begun.tolist(), frame_numbers=found["frame_id"].values.tolist())
-    telescope = aot.MainTelescope(uid="NONE")  # AOT asks for one, and for a source
+    telescope = aot.MainTelescope(uid="NONE")  # AOT requires a telescope, and a source
     source = aot.NaturalGuideStar(uid="SPOT")
     sensor, pixels = rig.sensor, found["pixels"].values
     if "slopes" in found:
@@ -136,11 +136,11 @@ def _commands(found: Mapping[str, Variable]) -> tuple[NDArray[np.int64], FloatAr
 
 
 def _table(fits: Any, name: str, columns: Mapping[str, NDArray[Any]]) -> Any:
-    """A binary table with a row for each of the first dimension."""
+    """A binary table with a row for each element of the first dimension."""
     made = []
     for key, values in columns.items():
         if values.dtype.kind == "U":
-            values = np.char.encode(values, "ascii", "replace")  # FITS knows no other letters
+            values = np.char.encode(values, "ascii", "replace")  # FITS allows no other characters
         flat = values.reshape(len(values), -1)
         code = {"f": "D", "i": "K", "u": "B", "b": "L", "S": "A"}[values.dtype.kind]
         repeat = max(values.dtype.itemsize, 1) if code == "A" else flat.shape[1]

@@ -1,4 +1,5 @@
-"""Which kinds of processes a disturbance is made of: those that foretell best what they were not fitted to.
+"""The choice of the kinds of processes in a disturbance, by how well they predict exposures that they were not fitted
+to.
 
 Each recording is cut in two; a model is fitted to one half and scored on the other, both ways. A score is the
 log-likelihood of a stretch of exposures. Of the models whose score is not worse than the best one's by more than the
@@ -24,14 +25,14 @@ CANDIDATES = (
     "random-walk", "ornstein-uhlenbeck", "second-order", "resonance", "ar3", "ornstein-uhlenbeck+resonance",
     "random-walk+resonance", "ar4", "resonance+resonance",
 )  # fmt: skip
-"""What is tried where nothing is asked for."""
+"""The sums of kinds that are tried where the user asks for none."""
 _STRETCH = 16
 """Exposures in a stretch."""
 
 
 @dataclass(frozen=True, eq=False)
 class Tried:
-    """A sum of kinds, and how well it foretells."""
+    """A sum of kinds, and how well it predicts."""
 
     name: str
     parameters: int
@@ -50,12 +51,12 @@ def tried(name: str, space: Callable[[Sequence[str]], Space], seen: Sequence[Rea
     Parameters
     ----------
     space:
-        Gives the parameters of the kinds.
+        A function that gives the parameters of the kinds.
     """
     if all(each.slots < 2 * FEWEST for each in seen):
         raise IdentificationError(
             f"{max(each.slots for each in seen)} exposures are too short a recording to choose a model with, which is"
-            f" fitted to one half and scored on the other: {2 * FEWEST} or more are needed, or --model says which"
+            f" fitted to one half and scored on the other: {2 * FEWEST} or more are needed, or one --model"
         )
     of = space(kinds_of(name))
     long = [each for each in seen if each.slots >= 2 * FEWEST]
@@ -77,7 +78,7 @@ def tried(name: str, space: Callable[[Sequence[str]], Space], seen: Sequence[Rea
 
 
 def chosen(of: Sequence[Tried]) -> Tried:
-    """The one with the fewest parameters of those that are as good as the best."""
+    """The model with the fewest parameters among those that are as good as the best."""
     usable = [each for each in of if math.isfinite(each.score)]
     if not usable:
         raise IdentificationError("no model could be fitted to both halves of the recording: it shows too little")

@@ -4,13 +4,13 @@ A path theta = r + b + d has the known response r to the inputs, an unknown cons
 disturbance d, a Gaussian process. With y the means of the path over the exposures and s its mean squares about c, as
 measured, p(y, s) = p(y) p(s | y).
 
-p(y) is Gaussian, exactly, and taken over long runs of exposures. Given y of a block of consecutive exposures the path
+p(y) is Gaussian, exactly, and taken over long runs of exposures. Given y in a block of consecutive exposures the path
 is Gaussian, with mean m and covariance S, and each s_j is a quadratic form of it: its mean is that of (m - c)^2 + diag
 S over the exposure's steps, its variance that of 2 S^2 + 4 (m - c) S (m - c) over pairs of them, and its third cumulant
 is as exact. p(s | y) is taken as the product of gamma distributions of these cumulants, with the pixels' noise: where a
 spot swings several times in an exposure, its mean square is an exponential variable. So it is a composite likelihood:
-each factor is right or nearly so, and that given y the mean squares still depend on each other is left out. What that
-costs is found by simulation (`sets`), and the sets allow for it.
+each factor is right or nearly so, but the dependence of the mean squares on each other, given y, is left out. The
+effect of this is found by simulation (`sets`), and the sets allow for it.
 
 Sums over the steps of an exposure are Gauss's quadrature.
 """
@@ -33,7 +33,7 @@ _FEWEST_NODES = 12
 _NODES_PER_CYCLE = 3.2
 """Nodes in an exposure for each cycle of the fastest process in it, beside half of the fewest."""
 _WALK_START = 4.0
-"""Variance of where a random walk starts in a block, in squares of half the field."""
+"""Variance of a random walk's start in a block, in squares of half the field."""
 _RUN = 128
 """Exposures whose means are taken together."""
 _CELLS = np.linspace(0.0, 1.0, 41) ** 1.5
@@ -41,16 +41,17 @@ _SPAN = 5.0
 """Standard deviations that the cells of a gamma distribution reach to on the lower side; 1.6 times as far above."""
 _LEAST_SKEWNESS, _MOST_SKEWNESS = 0.05, 2.8
 _SMOOTH = 0.05
-"""Smoothing of a gamma distribution, in standard deviations: where it begins it is not so right as it is steep."""
+"""Smoothing of a gamma distribution, in standard deviations: at its lower end it is steep, but only an
+approximation."""
 _RARE, _WIDE = 1e-3, 3.0
-"""Share of a Gaussian so many times as wide that is in every distribution."""
+"""The share of a wide Gaussian that is mixed into every distribution, and how many times as wide it is."""
 _AT_ONCE = 128
-"""Blocks that are computed together: what they need stays in the processor's cache."""
+"""Blocks that are computed together: their data stay in the processor's cache."""
 
 
 @dataclass(frozen=True, eq=False)
 class Blocks:
-    """Readings cut into blocks, (blocks, L); blocks of one pattern of usable exposures."""
+    """Readings divided into blocks, (blocks, L), which all have the same pattern of usable exposures."""
 
     usable: BoolArray
     """(L,)"""
@@ -59,9 +60,9 @@ class Blocks:
     square_noise: FloatArray
     centre: FloatArray
     response: FloatArray
-    """At the nodes, (blocks, L, nodes)."""
+    """Response to the inputs at the nodes, (blocks, L, nodes)."""
     output: np.ndarray[tuple[int], np.dtype[np.int64]]
-    """Which output each block is of."""
+    """The output of each block."""
 
 
 class Likelihood:
@@ -70,7 +71,7 @@ class Likelihood:
     Parameters
     ----------
     seen:
-        The readings; those of all outputs have one model, each output being a draw of its own.
+        The readings; all outputs have one model, of which each output is an independent draw.
     length:
         Exposures in a block.
     """
@@ -81,7 +82,7 @@ class Likelihood:
         self._means: dict[int, list[tuple[BoolArray, Indices, FloatArray]]] = {}
         good = seen.usable
         self.mean_noise = float(seen.mean_noise[good].mean())
-        """Variance of a mean by the pixels' noise, that of all exposures."""
+        """Variance of a mean by the pixels' noise, one value for all exposures."""
         self.exposure_s = seen.n_steps * seen.step_s
 
     def with_response(self, response: FloatArray) -> Likelihood:
@@ -89,14 +90,14 @@ class Likelihood:
         return Likelihood(replace(self.seen, response=response), self.length)
 
     def __call__(self, model: Disturbance, noise: float = 1.0, wider: float = 0.0, nodes: int | None = None) -> float:
-        """Log-likelihood, -inf where the model's covariance is none.
+        """Log-likelihood, -inf where the model gives no valid covariance.
 
         Parameters
         ----------
         noise:
             Factor of the pixels' noise variance.
         wider:
-            By how much the kernel's variance is larger than the rig file's, slope units squared.
+            The kernel's variance less the rig file's, slope units squared.
         nodes:
             Nodes in an exposure; `nodes` of the model where None.
         """
@@ -230,7 +231,7 @@ class Likelihood:
 
 
 def _taken(values: FloatArray, where: Sequence[tuple[int, slice]]) -> FloatArray:
-    """Stretches of equal lengths, each of an output, (stretches, ...)."""
+    """Stretches of equal length, each from one output, (stretches, ...)."""
     return np.array([values[at] for at in where])
 
 
@@ -248,7 +249,7 @@ def _stationary(model: Disturbance, apart: FloatArray, at: FloatArray) -> FloatA
 
 
 def _walk(model: Disturbance) -> float:
-    """Intensity of the random walks of a model together."""
+    """Sum of the intensities of a model's random walks."""
     return sum(process.walk for process in model.processes)
 
 
@@ -277,7 +278,8 @@ class _GivenMeans:
         S = own[self.good] - np.einsum("ija,ijb->jab", self.gain, self.gain, optimize=True)
         root_w = np.sqrt(weights)
         self.S = S * root_w[:, None] * root_w
-        """S of each exposure with the roots of the nodes' weights on both sides, (good, nodes, nodes)."""
+        """S of each exposure, multiplied by the square roots of the nodes' weights on both sides, (good, nodes,
+        nodes)."""
 
     def log_densities(self, data: Blocks, constants: FloatArray, noise: float, wider: float) -> FloatArray:
         """Log-density of each block's mean squares, (blocks,); ``constants`` b of each block."""
@@ -313,14 +315,14 @@ def _shifted_gamma(e: FloatArray, variance: FloatArray, third: FloatArray, read:
     sd = np.sqrt(variance)
     skewness = np.clip(third / (variance * sd), _LEAST_SKEWNESS, _MOST_SKEWNESS)
     k = 4 / skewness**2
-    # In standard deviations: from where the gamma variable begins, in equal cells.
+    # Equal cells in standard deviations, beginning at the lower end of the gamma variable.
     low = -2 / skewness
     begin = np.maximum(low, -_SPAN)
     edges = begin[..., None] + (_SPAN * 1.6 - begin)[..., None] * _CELLS
     below = special.gammainc(k[..., None], np.maximum((edges - low[..., None]) * (2 / skewness)[..., None], 0.0))
     mass = np.diff(below, axis=-1)
     places = (edges[..., 1:] + edges[..., :-1]) / 2
-    # A cell is as good as a Gaussian of its width.
+    # A cell can be replaced by a Gaussian of its width.
     width = np.sqrt((read / variance + _SMOOTH**2)[..., None] + np.diff(edges, axis=-1) ** 2 / 12)
     u = (e / sd)[..., None] - places
     bell = np.exp(-0.5 * (u / width) ** 2)
@@ -329,6 +331,6 @@ def _shifted_gamma(e: FloatArray, variance: FloatArray, third: FloatArray, read:
     whole = 1 + read / variance
     apart, size = -0.5 * (e / sd) ** 2 / (_WIDE**2 * whole), np.sqrt(2 * math.pi * _WIDE**2 * whole)
     both = (1 - _RARE) * density + _RARE * np.exp(apart) / size
-    # What is smaller than any double has a logarithm all the same.
+    # A density that is smaller than any double has a logarithm all the same.
     logarithm = np.where(both > 0, np.log(np.where(both > 0, both, 1.0)), np.log(_RARE / size) + apart)
     return np.asarray(logarithm - np.log(sd))

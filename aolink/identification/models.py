@@ -92,13 +92,13 @@ class Covariance(ABC):
         return np.asarray(np.tensordot(np.exp(np.outer(apart_s, poles)), inside, axes=1).real)
 
     def covariance_of_means(self, apart_s: FloatArray, at_s: FloatArray, weights: FloatArray) -> FloatArray:
-        """The same for means with these ``weights`` over ``at``, (m,)."""
+        """The covariance of means with these ``weights`` over ``at``, (m,)."""
         poles = self._tamed(at_s)
         means = np.exp(np.outer(poles, at_s)) @ weights, np.exp(-np.outer(poles, at_s)) @ weights
         return np.asarray((np.exp(np.outer(apart_s, poles)) @ (self.shares * means[0] * means[1])).real)
 
     def _tamed(self, at_s: FloatArray) -> ComplexArray:
-        """The poles, none of which decays so fast within ``at`` that its inverse is no number."""
+        """The poles, limited so that none decays within ``at`` so fast that its inverse overflows."""
         fastest = _FASTEST / max(float(np.ptp(at_s)), 1e-12)
         return np.asarray(np.maximum(self.poles.real, -fastest) + 1j * self.poles.imag)
 
@@ -184,7 +184,7 @@ class StateSpace:
 
 
 class Disturbance(Protocol):
-    """What a likelihood needs of a model: independent processes, whose sum it is."""
+    """The interface of a model for a likelihood: independent processes, whose sum is the disturbance."""
 
     @property
     def processes(self) -> Sequence[Covariance]: ...
@@ -203,7 +203,7 @@ class ProcessSum:
 
     @property
     def is_stationary(self) -> bool:
-        """Whether all its processes are."""
+        """Whether all its processes are stationary."""
         return all(process.is_stationary for process in self.processes)
 
     def state_space(self, step_s: float, start_variance: float = 0.0) -> StateSpace:
@@ -214,7 +214,7 @@ class ProcessSum:
         step_s:
             Fast step, s.
         start_variance:
-            Variance of where a random walk starts, slope units squared.
+            Variance of a random walk's start, slope units squared.
         """
         parts = [_sampled(process, step_s, start_variance) for process in self.processes]
         A, W, P = (linalg.block_diag(*(part[k] for part in parts)) for k in (0, 1, 2))
@@ -223,7 +223,7 @@ class ProcessSum:
 
 
 def _sampled(process: Process, step_s: float, start_variance: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """A, W and the covariance of the start of one process; its first state is theta."""
+    """A, W and the initial covariance of one process; its first state is theta."""
     if not process.is_stationary:
         return np.eye(1), np.array([[process["intensity"] * step_s]]), np.array([[start_variance]])
     poles = process.poles
@@ -248,8 +248,8 @@ PLANTS: Mapping[str, tuple[str, ...]] = {
 }
 """The parameters of each kind of plant whose input moves one output.
 
-``gain`` is the slope for a resting input of one, slope units; the poles are as of `PARAMETERS`; ``sd`` is the standard
-deviation of the slope by noise at the plant's input, slope units.
+``gain`` is the slope for a resting input of one, slope units; the poles are given as in `PARAMETERS`; ``sd`` is the
+standard deviation of the slope by noise at the plant's input, slope units.
 """
 
 
@@ -259,14 +259,14 @@ class IdentifiedPlant:
 
     kind: str
     values: tuple[float, ...]
-    """In the order of `PLANTS`."""
+    """Values of the parameters, in the order of `PLANTS`."""
 
     def __getitem__(self, name: str) -> float:
         return self.values[PLANTS[self.kind].index(name)]
 
     @property
     def noise(self) -> Process:
-        """What the noise does to the output."""
+        """The disturbance of the output by the plant's noise."""
         if self.kind == "first-order":
             tau = self["correlation_s"]
             return Process("ornstein-uhlenbeck", (tau, 2 * self["sd"] ** 2 / tau))

@@ -1,9 +1,10 @@
-"""What identification takes of each exposure: two weighted sums of the pixels of each slope.
+"""The measurements for identification: two weighted sums of the pixels for each slope in each exposure.
 
 A spot at theta gives a weighted sum g(theta) = sum_i W_i (kernel integrated over pixel i). The weights are those of
-least noise for which g is theta - c, and (theta - c)^2, wherever the spot moves; c is where the spot is expected. So
-the sums are the mean of the path in the exposure and its mean square about c, kernel and pixels taken off, with the
-noise of the pixels that are needed and of no others. They are linear in the pixels, so that their noise is Gaussian.
+least noise for which g is theta - c, and (theta - c)^2, wherever the spot moves; c is the expected position of the
+spot. So the sums are the mean of the path in the exposure and its mean square about c, without the effect of kernel and
+pixels, with the noise of the pixels that are needed and of no others. They are linear in the pixels, so that their
+noise is Gaussian.
 """
 
 from __future__ import annotations
@@ -27,13 +28,13 @@ from aolink.plant.lifting import input_response, output_rows
 from aolink.rig import Rig
 
 FEWEST = 24
-"""Fewest exposures that anything is identified from."""
+"""Fewest exposures from which a model is identified."""
 _REACH = 4.0
-"""The spot moves within so many standard deviations of its path about c: weights are right that far."""
+"""The spot moves within this many standard deviations of its path about c: the weights are right up to there."""
 _WRONG = 2e-3
-"""Rms by which g may differ from what it should be there, in units of the path's standard deviation and its square."""
+"""Largest rms error of g there, in units of the path's standard deviation and its square."""
 _HIDDEN = 0.05
-"""The same, if that is more, in standard deviations of a sum by the pixels' noise."""
+"""The same in standard deviations of a sum by the pixels' noise; the larger of the two limits applies."""
 _POINTS = 61
 _ROUNDS = 4
 _FOLLOWED = 0.6
@@ -46,7 +47,7 @@ _LOST = 0.05
 
 @dataclass(frozen=True, eq=False)
 class Readings:
-    """The readings of a recording's exposures: slots at equal distances, some of them perhaps empty.
+    """The readings of a recording's exposures, in slots at equal distances, some of them perhaps empty.
 
     Arrays are (outputs, slots): an output is a slope of one copy of the plant.
     """
@@ -60,7 +61,7 @@ class Readings:
     mean: FloatArray
     """Mean of the path in the exposure about ``centre``, slope units."""
     square: FloatArray
-    """Mean square of it, slope units squared."""
+    """Mean square of the path about ``centre``, slope units squared."""
     mean_noise: FloatArray
     """Variance of ``mean`` by the pixels' noise."""
     square_noise: FloatArray
@@ -69,7 +70,7 @@ class Readings:
     usable: BoolArray
     """False where there is no exposure, or where it showed no spot."""
     response: FloatArray
-    """What the inputs did to the output at each fast step, by the known plant, (outputs, slots, N + 1)."""
+    """Response of the output to the inputs at each fast step, by the known plant, (outputs, slots, N + 1)."""
     inputs: FloatArray
     """Inputs of the copy of the plant that the output belongs to, at each fast step from the first slot on, (outputs,
     n_inputs, steps)."""
@@ -78,8 +79,8 @@ class Readings:
     motion: float
     """Standard deviation of the path about c, slope units."""
     follows: bool
-    """Whether c follows the spot: it is where the inputs alone would have it, plus what they left over in the exposure
-    before. Otherwise plus a constant."""
+    """Whether c follows the spot: it is the response to the inputs plus the residual of the exposure before, or
+    otherwise plus a constant."""
     reach: float
     """Half of the sensor's field, slope units."""
 
@@ -95,7 +96,7 @@ class Readings:
         return replace(self, inputs=self.inputs[:, :, steps], **{name: getattr(self, name)[:, some] for name in names})
 
     def of_outputs(self, which: Sequence[int]) -> Readings:
-        """Some of the outputs."""
+        """The readings of some of the outputs."""
         names = ("mean", "square", "mean_noise", "square_noise", "centre", "usable", "response", "inputs")
         return replace(self, **{name: getattr(self, name)[list(which)] for name in names})
 
@@ -106,12 +107,12 @@ def readings(rig: Rig, exposures: Sequence[Exposure], *, plant_known: bool = Tru
     Parameters
     ----------
     plant_known:
-        Whether the inputs' response is that of the rig's plant; if not, none is taken off where the spot is expected.
+        Whether the inputs' response is that of the rig's plant; if not, no response is part of the expected position.
 
     Raises
     ------
     IdentificationError
-        The exposures are too few, without pixels, or of several lengths.
+        There are too few exposures, they have no pixels, or their lengths differ.
     """
     if len(exposures) < FEWEST:
         raise IdentificationError(
@@ -192,23 +193,24 @@ def _response(rig: Rig, inputs: FloatArray, slots: int, n_steps: int, period: in
 
 
 def by_slot(path: FloatArray, slots: int, n_steps: int, period: int, offset: float) -> FloatArray:
-    """Outputs at each fast step and one more (outputs, steps + 1), as exposures see them, (outputs, slots, N + 1)."""
+    """Outputs at each fast step and one more (outputs, steps + 1), divided into exposures, (outputs, slots, N + 1)."""
     if offset:
         path = np.concatenate([(1 - offset) * path[:, :-1] + offset * path[:, 1:], path[:, -1:]], axis=1)
     return np.asarray(path[:, np.arange(slots)[:, None] * period + np.arange(n_steps + 1)])
 
 
 def _measured(sensor: Sensor, density: FloatArray, mask: BoolArray, blank: Readings) -> Readings:
-    """Readings from densities (outputs, slots, pixels): where the spot is expected follows it, if that is nearer."""
+    """Readings from densities (outputs, slots, pixels): the expected position follows the spot, if that makes the
+    motion about it smaller."""
     expected = blank.response[:, :, :-1].mean(axis=2)
     middle = (sensor.field[0] + sensor.field[1]) / 2
-    # At first anything may be anywhere; then weights are made for what was found.
+    # First the spot may be anywhere; then weights are made for the motion that was found.
     found = _at(sensor, density, mask, blank, np.full_like(expected, middle), blank.reach / _REACH)
     if not found.usable.any():
         raise IdentificationError("no exposure shows a spot on the rig's sensor")
     best = found
     for _ in range(_ROUNDS):
-        place = best.mean + best.centre - expected  # what the inputs did not do
+        place = best.mean + best.centre - expected  # the motion that the inputs do not explain
         still = expected + _mean(place, best.usable)[:, None]
         follows = expected + before(place, best.usable)
         tried = [
@@ -216,7 +218,7 @@ def _measured(sensor: Sensor, density: FloatArray, mask: BoolArray, blank: Readi
             for centre in (np.clip(each, *sensor.field) for each in (still, follows))
         ]
         last = best.motion
-        # To follow the spot brings its noise along: only where it is worth it.
+        # Following the spot adds the noise of its position, so it is done only where it helps.
         best = replace(tried[1], follows=True) if tried[1].motion < _FOLLOWED * tried[0].motion else tried[0]
         if abs(best.motion - last) < 0.02 * last:
             break
@@ -228,7 +230,7 @@ def _mean(values: FloatArray, usable: BoolArray) -> FloatArray:
 
 
 def before(values: FloatArray, usable: BoolArray) -> FloatArray:
-    """The value of the last usable slot before each; of the first one for those before it."""
+    """The value of the last usable slot before each slot; slots before the first usable one have its value."""
     slots = np.arange(values.shape[1])
     last = np.maximum.accumulate(np.where(usable, slots, -1), axis=1)
     last = np.concatenate([np.full((len(values), 1), -1), last[:, :-1]], axis=1)
@@ -243,7 +245,7 @@ def _motion_about(sensor: Sensor, found: Readings, centre: FloatArray) -> float:
     whole = found.usable.any(axis=1)
     count = found.usable[whole].sum(axis=1)
     each = (squares * found.usable)[whole].sum(axis=1) / count
-    # What noise hides may be there.
+    # There may be as much motion as the noise can hide.
     sd = np.sqrt(((found.square_noise + 4 * away**2 * found.mean_noise) * found.usable)[whole].sum(axis=1)) / count
     least = (_LEAST_MOTION**2) * sensor.kernel.variance
     return math.sqrt(max(float((np.maximum(each, 0.0) + sd).max()), least))
@@ -252,7 +254,7 @@ def _motion_about(sensor: Sensor, found: Readings, centre: FloatArray) -> float:
 def _at(
     sensor: Sensor, density: FloatArray, mask: BoolArray, blank: Readings, centre: FloatArray, motion: float
 ) -> Readings:
-    """The readings about these places, for paths of this standard deviation."""
+    """The readings about these positions, for paths of this standard deviation."""
     D, gain = sensor.pixel_width, shot_gain(sensor)
     read = effective_noise_density(sensor) / D
     shape = centre.shape
@@ -285,7 +287,8 @@ def _at(
 def _weights(sensor: Sensor, centre: float, motion: float) -> FloatArray:
     """Weights of the pixels for theta - c and (theta - c)^2, (2, pixels), with the least noise.
 
-    Least squares for spots at points of the range, with as much of a ridge as leaves g right enough.
+    They are a ridge regression for spots at points of the range, with the largest ridge for which g is still accurate
+    enough.
     """
     edges, D = sensor.edges, sensor.pixel_width
     read = math.sqrt(effective_noise_density(sensor) * D)

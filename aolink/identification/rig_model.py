@@ -1,4 +1,4 @@
-"""What a rig file says of its disturbance, so that the likelihood can judge it beside what is identified.
+"""The disturbance that a rig file describes, so that the likelihood can judge it beside identified models.
 
 The noise of the plant and the model of the disturbance drive one linear system, x(k+1) = A x(k) + B_w w(k). With A =
 V diag(mu) V^-1 each eigenvalue is a pole log(mu) / T_f of the covariance of C x, in one sum of exponentials.
@@ -17,13 +17,13 @@ from aolink.numerics.covariance import psd_root
 from aolink.rig import Rig
 
 _WALK = 1e-9
-"""An eigenvalue this near to one is that of a random walk."""
+"""An eigenvalue this near to one belongs to a random walk."""
 _LEAST = 1e-12
-"""Modulus that an eigenvalue is taken to have at least: one of zero is forgotten within a step."""
+"""Least modulus that is assumed for an eigenvalue: a process with eigenvalue zero decays within a step."""
 _MOST_CONDITION = 1e10
-"""Condition number of the eigenvectors: beyond, two poles are the same, and rounding is all that tells them apart."""
+"""Condition number of the eigenvectors: beyond it, two poles are equal except for rounding."""
 _NUDGE = 1e-5
-"""By how much such poles are moved apart, as a share."""
+"""Relative distance by which such poles are moved apart."""
 _NOTHING = 1e-6
 """A pole with less than this share of the variance is left out: a fast one would cost the likelihood many nodes."""
 
@@ -68,12 +68,12 @@ class RigModel:
 
 
 def rig_model(rig: Rig, output: int) -> RigModel:
-    """What a rig's plant noise and its model of the disturbance make of one output of a copy of the plant.
+    """The disturbance of one output of a copy of the plant by a rig's plant noise and its model of the disturbance.
 
     Raises
     ------
     IdentificationError
-        Nothing disturbs the output by the rig file, or what does grows or rings without end.
+        By the rig file nothing disturbs the output, or the disturbance grows or rings without end.
     """
     plant, step = rig.plant, rig.timing.fast_step_s
     A = np.asarray(plant.A)
@@ -87,8 +87,8 @@ def rig_model(rig: Rig, output: int) -> RigModel:
     driven = np.abs(np.diagonal(Q)) * np.abs(seen) ** 2 > 0
     if (driven & ~walks & (np.abs(mu) >= 1)).any():
         raise IdentificationError(
-            "the rig file's disturbance grows or rings without end: it has no variance to be judged by; give what"
-            " rings a damping"
+            "the rig file's disturbance grows or rings without end: it has no stationary variance; give a"
+            " resonance a damping"
         )
     processes: list[Covariance] = []
     held = np.flatnonzero(driven & ~walks)
@@ -104,5 +104,5 @@ def rig_model(rig: Rig, output: int) -> RigModel:
         gained = (seen[free] @ Q[np.ix_(free, free)] @ seen[free].conj()).real
         processes.append(Process("random-walk", (float(gained) / step,)))
     if not processes:
-        raise IdentificationError("the rig file says that nothing disturbs this output: plant.process_noise is zero")
+        raise IdentificationError("by the rig file nothing disturbs this output: plant.process_noise is zero")
     return RigModel(tuple(processes))

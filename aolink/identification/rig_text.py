@@ -1,4 +1,4 @@
-"""What was identified, in the text of a rig file: ``[[disturbance.model]]``, and the plant where it is new."""
+"""Identified models in the text of a rig file: ``[[disturbance.model]]``, and the plant where it is new."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def identified_text(
     text: str, rig: Rig, models: Sequence[ProcessSum], *, plant: IdentifiedPlant | None = None, noise: float = 1.0,
     wider: float = 0.0,
 ) -> str:  # fmt: skip
-    """The text of a rig file with what was identified, all that disturbs: the plant's own noise is zero then.
+    """The text of a rig file with the identified models as the whole disturbance: the plant's own noise is zero then.
 
     Parameters
     ----------
@@ -31,12 +31,12 @@ def identified_text(
     plant:
         The plant, where it was identified; its own noise then stays in ``[plant]``.
     noise, wider:
-        Factor of the pixels' noise variance, and what the kernel's variance has over the file's, slope units squared.
+        Factor of the pixels' noise variance, and the kernel's variance less the file's, slope units squared.
 
     Raises
     ------
     RigError
-        The file cannot have it.
+        The file cannot hold the models.
     """
     step = rig.timing.fast_step_s
     if plant is not None:

@@ -17,16 +17,16 @@ from aolink.identification.readings import Readings, by_slot
 from aolink.numerics.arrays import FloatArray
 
 BLOCK = 16
-"""Exposures in a block: more of them tell little more, and take longer."""
+"""Exposures in a block: more of them add little information, and take longer."""
 CYCLES = 4.0
 """Highest frequency that is searched, in cycles per exposure."""
 _SPACING = 0.06
 """Spacing of the grid of frequencies, cycles per frame period: below the width of a maximum with the grid's damping."""
 _DECAY = 0.4
-"""By how much a resonance of the grid decays in a frame period, in nats."""
+"""Decay of the grid's resonances in a frame period, in nats."""
 _STARTS = 8
 _ROUNDS = 3
-"""How often, at most, the aliases of what is the highest maximum by then are looked at once more."""
+"""How often, at most, the aliases of the highest maximum so far are tried again."""
 _MOST = 3000
 """Most points of a grid of several processes."""
 KEPT = 12.0
@@ -45,9 +45,9 @@ class Space:
 
     kinds: tuple[str, ...]
     with_noise: bool
-    """Whether a factor of the pixels' noise variance is one more parameter, ..."""
+    """Whether a factor of the pixels' noise variance is one more parameter."""
     with_kernel: bool
-    """... and the kernel's variance over the rig file's another."""
+    """Whether the kernel's variance less the rig file's is one more parameter."""
     kernel_variance: float
     bounds: tuple[tuple[float, float], ...]
     plant: str | None = None
@@ -81,7 +81,7 @@ class Space:
         return IdentifiedPlant(self.plant, (self.sign * gain, *rest))
 
     def model(self, x: FloatArray) -> ProcessSum:
-        """The disturbance of a vector, with that by the fitted plant's own noise before the others."""
+        """The disturbance of a vector, with that from the fitted plant's own noise before the others."""
         plant = self.fitted_plant(x)
         values = np.exp(x[len(self._of_plant) :]).tolist()
         processes = [plant.noise] if plant else []
@@ -92,7 +92,7 @@ class Space:
         return ProcessSum(tuple(processes))
 
     def others(self, x: FloatArray) -> tuple[float, float]:
-        """Factor of the pixels' noise variance, and what the kernel's variance has over the rig file's."""
+        """Factor of the pixels' noise variance, and the kernel's variance less the rig file's."""
         own = len(self._of_plant) + sum(len(PARAMETERS[kind]) for kind in self.kinds)
         rest = np.exp(x[own:]).tolist()
         noise = rest.pop(0) if self.with_noise else 1.0
@@ -108,7 +108,7 @@ class Space:
     def driven(self, x: FloatArray, of: Likelihood, draws: int = 1) -> Likelihood:
         """A recording's likelihood with the fitted plant's response to its inputs, where a plant is fitted.
 
-        ``draws``: how often the recording's outputs are there, with the same inputs.
+        ``draws`` is the number of copies of the recording's outputs, with the same inputs.
         """
         if self.plant is None:
             return of
@@ -133,7 +133,7 @@ def space_of(
     Raises
     ------
     IdentificationError
-        A frequency is asked for that the fast rate cannot follow, or a plant, and the inputs say nothing of it.
+        The fast rate cannot follow a frequency that is asked for, or a plant is asked for that the inputs do not show.
     """
     one = seen[0]
     exposure, period = one.n_steps * one.step_s, one.period_steps * one.step_s
@@ -228,7 +228,8 @@ def maxima(space: Space, seen: Sequence[Readings], tell: Told | None = None) -> 
         raise IdentificationError("no model of this kind has a likelihood here: are there readings at all?")
     looked_at: list[Maximum] = []
     for _ in range(_ROUNDS):
-        # A sharp line beside a drift is often found at an alias first, and only from its very top is the true one.
+        # A sharp vibration beside a drift is often found at an alias first; the true one is found only from exactly
+        # that maximum.
         top = max(best, key=lambda each: each.log_likelihood)
         if any(_near(space, top.x, other.x, 5e-3) for other in looked_at):
             break
@@ -239,7 +240,7 @@ def maxima(space: Space, seen: Sequence[Readings], tell: Told | None = None) -> 
     best = [each for each in best if each.log_likelihood > highest - KEPT]
     apart: list[Maximum] = []
     for each in sorted(best, key=lambda each: -each.log_likelihood):
-        # Halfway along a ridge it is no lower: that is one maximum, not yet reached from both ends.
+        # If it is no lower halfway along a ridge, the two are one maximum, not yet reached from both ends.
         middles = (space.log_likelihood((each.x + other.x) / 2, of, other.nodes) for other in apart)
         if not any(middle > each.log_likelihood - _RIDGE for middle in middles):
             apart.append(each)
@@ -291,7 +292,7 @@ def climb(space: Space, start: FloatArray, of: Sequence[Likelihood], enough: flo
         value = space.log_likelihood(x, of, nodes)
         return -value if math.isfinite(value) else _NEVER
 
-    # Frequencies are known far better than the rest: in units of each one's own curvature all are alike.
+    # Frequencies are known far better than the other parameters: in units of their own curvature all are alike.
     low, high = np.array(space.bounds).T
     at = np.clip(start, low + 2 * _STEP, high - 2 * _STEP)
     here, scale = cost(at), np.empty(len(at))

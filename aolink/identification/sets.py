@@ -1,8 +1,8 @@
-"""What is identified: for each parameter a set that holds the truth with a probability of 95 %, in one or more pieces.
+"""Confidence sets: for each parameter a set that holds the truth with a probability of 95 %, in one or more pieces.
 
 The set is that of the values whose profile log-likelihood, the highest with that value, is below the highest of all by
-less than 1.92 a. With the true likelihood a = 1 (Wilks). `likelihood` takes exposures that depend on each other for
-independent and what is not Gaussian for Gaussian, so that a is the ratio of the parameter's variance as it is, H^-1 J
+less than 1.92 a. With the true likelihood a = 1 (Wilks). `likelihood` treats dependent exposures as independent and
+some distributions that are not Gaussian as Gaussian, so that a is the ratio of the parameter's true variance, H^-1 J
 H^-1, to the H^-1 that the curvature H shows (Kent, Biometrika 69 (1982)); J is the covariance of the gradient at the
 maximum over recordings that the model makes (`simulate`). An alias is a maximum of its own, far from the highest: it is
 in the set as well if recordings that it makes itself put it as far below the highest one in a twentieth of them.
@@ -26,14 +26,14 @@ QUANTILE = 3.841
 """Quantile of chi-square with one degree of freedom, at 95 %."""
 _DRAWS = 96
 _MOST = 8
-"""Local maxima that are looked at."""
+"""The most local maxima that are considered."""
 _STEP = 0.02
 _WIDEST = 3.0
-"""Farthest step along a profile at once, logarithm of the parameter."""
+"""Longest single step along a profile, in the logarithm of the parameter."""
 _SIDES = 12
 _NEWTON = 5
 _CLOSE = 0.1
-"""Nats to which an end of a piece is found."""
+"""Accuracy to which an end of a piece is found, nats."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class Piece:
     low: float
     high: float
     best: float
-    """The value in it that is most likely."""
+    """The value in it with the highest likelihood."""
     open_low: bool
     """Whether ``low`` is the limit of what was searched, not an end of the set."""
     open_high: bool
@@ -51,14 +51,14 @@ class Piece:
 
 @dataclass(frozen=True)
 class Identified:
-    """What is known of one parameter."""
+    """The set of one parameter."""
 
     name: str
     best: float
     pieces: tuple[Piece, ...]
-    """From low to high; more than one where the exposures leave aliases."""
+    """The pieces from low to high; more than one where the exposures leave aliases."""
     factor: float
-    """a."""
+    """The factor a."""
 
     def holds(self, value: float) -> bool:
         """Whether the set has a value."""
@@ -98,7 +98,7 @@ def identified(
 
 
 def _allowed(space: Space, top: Maximum, other: Maximum, seen: Sequence[Readings]) -> float:
-    """By how much ``other`` may be below the highest maximum if it is the truth, nats; rarely (1 in 20) it is more."""
+    """The most by which ``other`` is below the highest maximum if it is the truth, nats, except in 1 of 20 cases."""
     below = np.zeros(_DRAWS)
     for number, each in enumerate(seen):
         noise, _ = space.others(other.x)
@@ -113,7 +113,7 @@ def _allowed(space: Space, top: Maximum, other: Maximum, seen: Sequence[Readings
 
 
 def _curvature(space: Space, at: Maximum, of: Sequence[Likelihood]) -> FloatArray:
-    """H, minus the second derivatives, as far as they are positive."""
+    """H, minus the matrix of second derivatives, made positive."""
     n = len(at.x)
     steps = _STEP * np.eye(n)
     # Steps of about half a nat: below, rounding shows; above, the curvature changes.
@@ -148,14 +148,15 @@ def _value(space: Space, at: Maximum, x: FloatArray, of: Sequence[Likelihood]) -
 
 
 def _positive(H: FloatArray) -> FloatArray:
-    """H with what is not positive, or hardly known, raised to a curvature that says as little."""
+    """H with its eigenvalues that are not positive, or hardly known, raised to a curvature that carries as little
+    information."""
     scale = np.sqrt(np.maximum(np.abs(np.diagonal(H)), 1e-2))
     values, vectors = np.linalg.eigh((H + H.T) / 2 / np.outer(scale, scale))
     return np.asarray((vectors * np.maximum(values, 1e-3)) @ vectors.T * np.outer(scale, scale))
 
 
 def _factors(space: Space, top: Maximum, seen: Sequence[Readings], H: FloatArray) -> FloatArray:
-    """a of each parameter, at least one."""
+    """The factor a of each parameter, at least one."""
     n = len(top.x)
     low, high = np.array(space.bounds).T
     J = np.zeros((n, n))
@@ -232,7 +233,7 @@ def _piece(space: Space, at: Maximum, k: int, least: float, of: Sequence[Likelih
 def _highest(
     space: Space, at: Maximum, start: FloatArray, others: list[int], H: FloatArray, of: Sequence[Likelihood]
 ) -> tuple[FloatArray, float]:
-    """Where the likelihood is highest in the other parameters, and how high, by Newton's method with curvature H."""
+    """The maximum of the likelihood over the other parameters, and its value, by Newton's method with curvature H."""
     x, value = start, _value(space, at, start, of)
     if not others:
         return x, value
@@ -264,7 +265,8 @@ def _highest(
 
 
 def _joined(pieces: Sequence[Piece]) -> tuple[Piece, ...]:
-    """Pieces from low to high, those that overlap as one; ``best`` is that of the first one of them given."""
+    """Pieces from low to high, with overlapping ones joined; ``best`` is that of the one among them that was given
+    first."""
     out: list[Piece] = []
     rank = {id(piece): number for number, piece in enumerate(pieces)}
     ranks: list[int] = []

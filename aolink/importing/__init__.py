@@ -1,1 +1,1 @@
-"""Other people's data in: films, telemetry and bags become recordings."""
+"""Import of other people's data: films, telemetry and bags become recordings."""

@@ -32,7 +32,7 @@ class _Stamped:
     """A picture of a bag."""
 
     time_ns: int
-    """Its own stamp, or 0 where it has none."""
+    """The picture's own time stamp, or 0 where it has none."""
     arrival_ns: int
     picture: Frame
     """(rows, columns) or (rows, columns, 3 or 4)."""
@@ -201,4 +201,4 @@ _DECODERS: dict[str, Callable[[bytes, int], _Stamped]] = {
     "sensor_msgs/msg/Image in cdr": _ros2("Image"),
     "sensor_msgs/msg/CompressedImage in cdr": _ros2("CompressedImage"),
 }
-"""By the schema and the encoding of its messages."""
+"""Decoders of a channel, by the schema and the encoding of its messages."""

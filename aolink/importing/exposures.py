@@ -1,7 +1,7 @@
 """A film becomes the frames of a rig: light to counts, times to fast steps, several frames to one exposure.
 
-What comes out is what a session records of each exposure: a frame, the inputs of its fast steps, and, where objects
-were followed in the single frames, the true path.
+The result is the data that a session records for each exposure: a frame, the inputs of its fast steps, and, where
+objects were followed in the single frames, the true path.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from aolink.rig import Rig
 from aolink.wire.messages_pb2 import Applied
 
 _FASTER = 0.75
-"""Commands that follow each other after less of a fast step than this are too many for it."""
+"""Commands at a shorter distance than this part of a fast step are too many for the rig."""
 
 
 def imported(film: Film, rig: Rig, settings: Settings, account: Account) -> Iterator[ImportedExposure]:
@@ -43,7 +43,7 @@ def imported(film: Film, rig: Rig, settings: Settings, account: Account) -> Iter
     Raises
     ------
     ImportingError
-        The film is not what the rig file describes.
+        The film does not fit the rig file.
     """
     periods, notes = frame_times(film, rig, settings)
     account.notes = (*film.notes, *notes)
@@ -87,7 +87,7 @@ def imported(film: Film, rig: Rig, settings: Settings, account: Account) -> Iter
 def _of_slopes(
     film: Film, rig: Rig, settings: Settings, periods: NDArray[np.int64], account: Account
 ) -> Iterator[ImportedExposure]:
-    """The exposures of a film without pictures: every pixel of theirs is missing."""
+    """The exposures of a film without pictures: all of their pixels are missing."""
     if settings.track or settings.invert or settings.subtract_median or settings.gamma != 1.0:
         raise ImportingError(
             f"{film.name} has slopes and no pictures: --track, --invert, --background and --gamma need pixels"
@@ -109,12 +109,12 @@ def _of_slopes(
 
 
 class _Inputs:
-    """What the mirror held; its parked input where the film does not know."""
+    """The inputs that the mirror held; its parked input where the film has none."""
 
     def __init__(self, film: Film, rig: Rig, settings: Settings, periods: NDArray[np.int64]) -> None:
         self._rows, self._park, self._next = film.inputs, rig.mirror.park, 0
         self.notes: tuple[str, ...] = ()
-        """What a user should know of steps whose inputs are not known."""
+        """Notes for the user about steps whose inputs are not known."""
         if film.inputs is None:
             return
         if film.inputs.shape[1] != rig.n_inputs:
@@ -139,7 +139,7 @@ class _Inputs:
     def _at_times(
         self, rows: FloatArray, times_ns: NDArray[np.int64], name: str, rig: Rig, end: int
     ) -> tuple[FloatArray, tuple[str, ...]]:
-        """The rows in the steps 0 .. end - 1, each from the step that its time is nearest to until the next one's."""
+        """The rows in the steps 0 .. end - 1, each from the step nearest to its time until that of the next row."""
         first = np.rint(times_ns / rig.timing.fast_step_ns).astype(np.int64)
         period = float(np.median(np.diff(times_ns))) / 1e9 if len(rows) > 1 else np.inf
         if period < _FASTER * rig.timing.fast_step_s:
@@ -161,7 +161,7 @@ class _Inputs:
         return known, tuple(notes)
 
     def until(self, end: int) -> FloatArray:
-        """Inputs of the steps from where the last call ended, (steps, n_inputs)."""
+        """Inputs of the steps from the end of the last call on, (steps, n_inputs)."""
         steps = np.arange(self._next, end)
         self._next = end
         if self._rows is None:

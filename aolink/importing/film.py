@@ -1,4 +1,4 @@
-"""A film: frames of a camera from anywhere, one after the other, and what their file says of their times."""
+"""A film: frames of any camera, one after the other, and the times that their file has."""
 
 from __future__ import annotations
 
@@ -16,37 +16,37 @@ Frame = NDArray[np.generic]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Film:
-    """Frames of one size, read when they are asked for, and what is known about them."""
+    """Frames of one size, read when they are needed, and facts about them."""
 
     name: str
-    """What it was made from."""
+    """The source of the film."""
     shape: tuple[int, int]
     """Rows and columns of a frame."""
     dtype: np.dtype[np.generic]
     """Type of the pixels, as they are stored."""
     count: int
-    """Frames."""
+    """Number of frames."""
     frames: Callable[[], Iterator[Frame]]
     """The frames from the first on, (rows, columns) each."""
     rate_hz: float | None = None
-    """Frames a second, where the file says it."""
+    """Frames a second, where the file has it."""
     exposure_s: float | None = None
-    """How long each frame was exposed, where the file says it."""
+    """Exposure time of each frame, where the file has it."""
     start_ns: int | None = None
-    """When the first exposure began, ns since 1970, where the file says it."""
+    """Start of the first exposure, ns since 1970, where the file has it."""
     times_ns: NDArray[np.int64] | None = None
-    """When each exposure began, ns from any beginning, where the file says it, (count,)."""
+    """Start of each exposure, ns from an arbitrary zero, where the file has it, (count,)."""
     inputs: NDArray[np.float64] | None = None
-    """What the mirror held in each fast step, where the file has it, (steps, n_inputs)."""
+    """Inputs that the mirror held in each fast step, where the file has them, (steps, n_inputs)."""
     input_times_ns: NDArray[np.int64] | None = None
-    """When each row of ``inputs`` was put out, to be held until the next; ns from the start of the first exposure.
-    None: there is a row for each frame, or for each fast step from the first exposure on."""
+    """The time at which each row of ``inputs`` was put out, to be held until the next; ns from the start of the first
+    exposure. None: there is a row for each frame, or for each fast step from the first exposure on."""
     slopes: bool = False
     """Whether there are no pictures, but slopes alone: a frame is then one row of them, x and y of each spot."""
     nonlinear: str = ""
-    """Why pixel values may not be proportional to light; empty where nothing speaks against it."""
+    """The reason why pixel values may not be proportional to light; empty where there is none."""
     notes: tuple[str, ...] = field(default=())
-    """What a user should know about how it was read."""
+    """Notes for the user about how it was read."""
 
 
 def grey(picture: Frame, what: object) -> Frame:
@@ -57,7 +57,7 @@ def grey(picture: Frame, what: object) -> Frame:
     Raises
     ------
     ImportingError
-        It is neither.
+        The picture has another shape.
     """
     if picture.ndim == 3 and picture.shape[2] in (3, 4):
         red, green, blue = (picture[..., k] for k in range(3))  # far faster than along the last axis
@@ -77,9 +77,9 @@ def array_film(frames: NDArray[Any], name: str, **known: Any) -> Film:
     Raises
     ------
     ImportingError
-        It has another shape, or no numbers.
+        The array has another shape, or does not hold numbers.
     """
-    if frames.ndim == 4:  # one film for each spot, all of the same times
+    if frames.ndim == 4:  # one film for each spot, all with the same times
         spots, count, rows, columns = frames.shape
         frames = np.moveaxis(frames, 0, 2).reshape(count, rows, spots * columns)
         known["notes"] = (*known.get("notes", ()), f"the films of {spots} spots stand side by side in one picture")

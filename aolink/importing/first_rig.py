@@ -20,7 +20,7 @@ _COUNTS = 62_000
 _NOISE_SDS = 6
 """Standard deviations of a pixel's noise that fit below black and above the brightest pixel."""
 _SETTLED = 1e-9
-"""Change of a gain that is none."""
+"""A smaller change of a gain counts as none."""
 _LEAST_WINDOW = 12
 _ANYWHERE = 0.1
 """Variance of the place of an object in its window before it is seen, slope units squared."""
@@ -28,7 +28,7 @@ _ANYWHERE = 0.1
 
 @dataclass(frozen=True, kw_only=True)
 class Motion:
-    """A walk or an Ornstein-Uhlenbeck process that fits how objects move from frame to frame.
+    """A random walk or an Ornstein-Uhlenbeck process that fits the objects' motion from frame to frame.
 
     x(k+1) = a x(k) + w(k), Var w = q; a frame shows x with an error of variance r. All by maximum likelihood.
     """
@@ -48,8 +48,8 @@ class Motion:
 def fit_motion(places: FloatArray) -> Motion:
     """Fit series of places along one direction each, (frames, series), pixels; NaN where nothing was seen.
 
-    A random walk is fitted and an Ornstein-Uhlenbeck process (a < 1). The latter is taken where it explains the series
-    better by more than its parameters account for (Bayesian information criterion).
+    A random walk is fitted and an Ornstein-Uhlenbeck process (a < 1). The latter is taken where the Bayesian
+    information criterion favours it.
 
     Raises
     ------
@@ -62,7 +62,7 @@ def fit_motion(places: FloatArray) -> Motion:
     steps = np.diff(places, axis=0)
     start = math.log(max(float(np.nanvar(steps)), 1e-12))
 
-    # What is between two gaps is a series of its own; an Ornstein-Uhlenbeck process is about its mean.
+    # The part between two gaps is a series of its own; an Ornstein-Uhlenbeck process moves about its mean.
     runs = [(one, one.mean(axis=0)) for one in _runs(places)]
 
     def cost(values: FloatArray, bound: bool) -> float:
@@ -85,7 +85,7 @@ def fit_motion(places: FloatArray) -> Motion:
 
 
 def _runs(places: FloatArray) -> list[FloatArray]:
-    """Series without their gaps: what has the same length in one array, (frames, series)."""
+    """Series without their gaps: those of the same length in one array, (frames, series)."""
     whole = np.isfinite(places).all(axis=0)
     runs = [places[:, whole]] if whole.any() else []
     for one in places[:, ~whole].T:
@@ -117,7 +117,7 @@ def _negative_log_likelihood(y: FloatArray, a: float, q: float, r: float) -> flo
 
 
 def _inverse_curvature(cost: Callable[[FloatArray], float], at: FloatArray) -> FloatArray:
-    """Diagonal of the inverse of the Hessian by differences: variances of what maximises a likelihood."""
+    """Diagonal of the inverse Hessian, by differences: variances of maximum-likelihood estimates."""
     n, h = len(at), 0.05
     H = np.empty((n, n))
     for i in range(n):
@@ -142,7 +142,7 @@ def first_rig(film: Film, settings: Settings, name: str, progress: Callable[[int
     Raises
     ------
     ImportingError
-        There are not so many objects, or nothing says the frame rate.
+        There are fewer objects, or the frame rate is not known.
     """
     if film.slopes:
         raise ImportingError(f"{film.name} has slopes and no pictures: a first rig file is made from pictures")
@@ -154,7 +154,7 @@ def first_rig(film: Film, settings: Settings, name: str, progress: Callable[[int
     if rate is None and film.times_ns is not None and film.count > 1:
         rate = 1e9 / float(np.median(np.diff(film.times_ns)))
     if rate is None:
-        raise ImportingError(f"nothing says how many frames a second {film.name} has: give --rate")
+        raise ImportingError(f"it is not known how many frames a second {film.name} has: give --rate")
     places = known.places.reshape(len(known.places), -1)
     motion = fit_motion(places)
     K = settings.frames_per_exposure
@@ -229,14 +229,15 @@ queue_steps = 16
 def _noise(known: Survey, width: float) -> tuple[float, float, float]:
     """V of a window two slope units wide, its standard deviation, and electrons of a spot (0: many).
 
-    Variances of the residuals of sums over a window's rows and columns, against the light there, by least squares.
+    They come from a least-squares fit of the squared residuals of sums over a window's rows and columns to the light
+    there.
     """
     square, light = (known.residual / width) ** 2, np.maximum(known.model / width, 0.0)
     columns = np.column_stack([np.ones(len(light)), light])
     (read, gain), *_ = np.linalg.lstsq(columns, square, rcond=None)
     errors = square - columns @ np.array([read, gain])
     read_sd, gain_sd = np.sqrt(np.diagonal(np.linalg.inv(columns.T @ columns)) * errors.var())
-    density = width / 2  # of V on a line and across it
+    density = width / 2  # the factor from such a variance to V
     if gain > 3 * gain_sd and read > 0:
         return float(read * density), float(read_sd * density), float(1 / (gain * width))
     return float(square.mean() * density), float(square.std() / math.sqrt(len(square)) * density), 0.0

@@ -1,4 +1,5 @@
-"""Frames of a film as a rig's camera would have read them: how they are read, when they are, in which exposure."""
+"""Frames of a film as a rig's camera would have taken them: their light, their times, and the exposures that they
+belong to."""
 
 from __future__ import annotations
 
@@ -24,44 +25,47 @@ _IRREGULAR = 0.25
 
 @dataclass(frozen=True, kw_only=True)
 class Settings:
-    """How a film is read."""
+    """The options with which a film is read."""
 
     rate_hz: float | None = None
-    """Frames a second, where the film does not say it or is wrong."""
+    """Frames a second, where the film does not have it or is wrong."""
     exposure_s: float | None = None
-    """Exposure time of a frame, where the film does not say it or is wrong."""
+    """Exposure time of a frame, where the film does not have it or is wrong."""
     start_ns: int | None = None
-    """When it began, ns since 1970, where the film does not say it or is wrong."""
+    """Start of the film, ns since 1970, where the film does not have it or is wrong."""
     gamma: float = 1.0
-    """What light was raised to the inverse of before it was stored: 2.2 for most JPEG and video."""
+    """Exponent of the gamma curve: light was raised to its inverse before it was stored; 2.2 for most JPEG and
+    video."""
     scale: float | None = None
     """Counts for a pixel value of one; None: full scale becomes full scale."""
     invert: bool = False
-    """Dark objects on a bright ground: light is what each frame's median exceeds a pixel by."""
+    """Whether objects are dark on a bright ground: light is then each frame's median less the pixel."""
     subtract_median: bool = False
-    """Each frame's median is no light."""
+    """Whether each frame's median is background, which is subtracted."""
     frames_per_exposure: int = 1
-    """So many frames of a fast film become one exposure, their mean."""
+    """Number of frames of a fast film whose mean becomes one exposure."""
     track: int = 0
-    """So many objects are followed, each in a window of its own; 0: the frames are the rig's as they are."""
+    """Number of objects that are followed, each in a window of its own; 0: the frames are those of the rig's sensor."""
     places: tuple[tuple[float, float], ...] = ()
-    """Where these are in the first frame, (x, y) in pixels; empty: the brightest ones that are not at an edge."""
+    """Places of these objects in the first frame, (x, y) in pixels; empty: the brightest ones that are not at an
+    edge."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ImportedExposure:
-    """What a session would have recorded of one exposure."""
+    """The data that a session would have recorded for one exposure."""
 
     frame: RigFrame
     inputs: FloatArray
-    """What the mirror held from the end of the exposure before this one to the end of this, (steps, n_inputs)."""
+    """Inputs that the mirror held from the end of the exposure before this one to the end of this one, (steps,
+    n_inputs)."""
     truth: Truth | None = None
-    """What is known of the motion from the single frames."""
+    """The motion as measured in the single frames."""
 
 
 @dataclass(kw_only=True, eq=False)
 class Account:
-    """What a user should know of how a film was read."""
+    """Counts and notes for the user about how a film was read."""
 
     frames: int = 0
     exposures: int = 0
@@ -87,7 +91,7 @@ class Light:
         """Light of a frame and where its pixels are saturated, (rows, columns) each."""
         settings = self._settings
         values = frame.astype(np.float64)
-        # An object that is dark is not harmed by a ground that is too bright.
+        # A saturated background does not harm a dark object.
         bad = (values >= self.full_scale) & (self._is_integer and not settings.invert) | ~np.isfinite(values)
         values[~np.isfinite(values)] = 0.0
         if settings.gamma != 1.0:
@@ -136,7 +140,7 @@ def frame_times(film: Film, rig: Rig, settings: Settings) -> tuple[NDArray[np.in
         rate = 1 / period
     own = K / (timing.frame_period_steps * timing.fast_step_s)
     if rate is None:
-        notes.append(f"nothing says the frame rate: that of the rig file is assumed, {own:.6g} frames/s")
+        notes.append(f"the film does not state its frame rate: that of the rig file is assumed, {own:.6g} frames/s")
     elif abs(rate / own - 1) > _CLOSE:
         each = f"{K} frames" if K > 1 else "a frame"
         whole = round(rate / own)
@@ -169,7 +173,8 @@ def frame_times(film: Film, rig: Rig, settings: Settings) -> tuple[NDArray[np.in
 def counts_of(
     counts: FloatArray, usable: NDArray[np.bool_], rig: Rig, account: Account
 ) -> tuple[NDArray[np.uint16], NDArray[np.bool_]]:
-    """Whole counts and the mask of the pixels that can be used, (rows, columns) each; the others are accounted for."""
+    """Whole counts and the mask of the pixels that can be used, (rows, columns) each; the other pixels are counted in
+    ``account``."""
     whole = np.rint(counts)
     outside = (whole < 0) | (whole > rig.sensor.full_scale)
     account.pixels += whole.size
@@ -209,7 +214,7 @@ def grouped(film: Film, count: int, periods: NDArray[np.int64]) -> Iterator[Grou
             group = []
         if not group:
             if periods[k] % count:
-                continue  # exposures stay on one raster, as a camera's do
+                continue  # exposures stay at multiples of one period, as a camera's do
             first = k
         group.append(frame)
         if len(group) == count:
@@ -220,7 +225,7 @@ def grouped(film: Film, count: int, periods: NDArray[np.int64]) -> Iterator[Grou
 def rig_frame(
     film: Film, rig: Rig, settings: Settings, period: int, pixels: NDArray[np.uint16], mask: NDArray[np.bool_]
 ) -> RigFrame:  # fmt: skip
-    """The frame of an exposure that begins so many of the rig's frame periods after the film."""
+    """The frame of an exposure that begins the given number of the rig's frame periods after the film."""
     timing = rig.timing
     first = period * timing.frame_period_steps
     began_ns = settings.start_ns if settings.start_ns is not None else film.start_ns or 0

@@ -48,7 +48,7 @@ def open_film(source: str | Path, topic: str | None = None) -> Film:
     Raises
     ------
     ImportingError
-        It cannot be read, holds no film, or needs a package that is not installed; the message says which.
+        The source cannot be read, holds no film, or needs a package that is not installed; the message says which.
     """
     path = Path(source)
     if not path.exists():
@@ -72,7 +72,7 @@ def open_film(source: str | Path, topic: str | None = None) -> Film:
 
 @contextmanager
 def _one_error(path: Path) -> Iterator[None]:
-    """Whatever another package raises on a file that is damaged becomes an ImportingError of one line."""
+    """Turn any exception of another package on a damaged file into an ImportingError of one line."""
     try:
         yield
     except AolinkError as error:
@@ -91,7 +91,7 @@ def _first_line(error: Exception) -> str:
 
 
 def _checked(film: Film, path: Path) -> Iterator[Frame]:
-    """The frames of a film, of the size and as many as it announced."""
+    """The frames of a film, checked against the size and the number that it announced."""
     count = 0
     with _one_error(path):
         for frame in film.frames():
@@ -181,7 +181,8 @@ def _tiff(path: Path) -> Film:
 
 @contextmanager
 def _complaints(path: Path) -> Iterator[None]:
-    """Take what tifffile only logs, that a stack is cut off, as an error; damage to a tag is none to the pictures."""
+    """Raise an error for a stack that is cut off, which tifffile only logs; damage to a tag does not harm the
+    pictures."""
     said: list[str] = []
     listener = logging.Handler(logging.ERROR)
     listener.emit = lambda record: said.append(record.getMessage())  # type: ignore[method-assign]
@@ -223,7 +224,7 @@ def _folder(path: Path) -> Film:
 
 
 def _number_order(path: Path) -> tuple[list[tuple[str, int]], str]:
-    """frame2 comes before frame10."""
+    """A sort key by which frame2 comes before frame10."""
     parts = re.findall(r"([^0-9]*)([0-9]*)", path.name)
     return [(text, int(digits or 0)) for text, digits in parts], path.name
 
@@ -244,7 +245,7 @@ def _described(picture: Frame) -> str:
 
 
 def _values(stored: NDArray[Any], scale: float, zero: float) -> NDArray[Any]:
-    """FITS keeps unsigned numbers as signed ones and a shift of half their range."""
+    """The values of a FITS array, which keeps unsigned numbers as signed ones shifted by half their range."""
     if stored.dtype.kind == "i" and scale == 1 and zero == float(1 << (8 * stored.dtype.itemsize - 1)):
         unsigned = np.dtype(f"u{stored.dtype.itemsize}")
         return (stored.astype(np.int64) + int(zero)).astype(unsigned)
@@ -288,7 +289,7 @@ def _float(text: str | None) -> float | None:
 
 
 def _date(text: str | None) -> int | None:
-    """ns since 1970 of a date as FITS writes it, in UTC."""
+    """Nanoseconds since 1970 of a date in FITS notation, in UTC."""
     try:
         moment = datetime.fromisoformat(text or "")
     except ValueError:

@@ -37,14 +37,14 @@ def import_film(
     Raises
     ------
     ImportingError
-        The film is not what the rig file describes; no file is left then.
+        The film does not fit the rig file; no file is left then.
     RecordingError
         ``path`` exists and not ``overwrite``, or cannot be written.
     """
     check_target(path, overwrite=overwrite, sources=sources, error=RecordingError)
     account = Account()
     made = imported(film, rig, settings, account)
-    first = next(made, None)  # what is wrong with the whole shows before the file is made
+    first = next(made, None)  # errors of the whole film show before the file is made
     if first is None:
         raise ImportingError(
             f"{film.name} has {film.count} frames: not enough for an exposure of {settings.frames_per_exposure}"
@@ -69,7 +69,7 @@ def import_film(
                     digest.update(data)
                     file.add(topic, schema_of(type(message)), data, each.frame.host_receive_ns, sequence)
                 progress(account.exposures)
-            # Another film is another session, even one of the same name: known when its last pixel is.
+            # Another film is another session, even one of the same name; its digest is known after its last pixel.
             file.add_metadata(topics.SESSION_METADATA, {"session": digest.hexdigest()[:16]})
             file.add_metadata(topics.END_METADATA, {"ended": "end of the film", "exposures": str(account.exposures)})
             file.finish()

@@ -15,15 +15,14 @@ from aolink.numerics.arrays import FloatArray
 
 
 def aot_film(path: Path) -> Film:
-    """The pictures of the first wavefront sensor that has them, with what its loops commanded meanwhile.
-
-    Where none has pictures, the slopes of the first that has these. A command is held until the next one of its loop:
-    by the times of both, else by the loop's rate, else one for each frame.
+    """The pictures of the first wavefront sensor that has them, with the commands of its loops. Where none has
+    pictures, the result is the slopes of the first sensor that has them. A command is held until the next one of its
+    loop: by the times of both, otherwise by the loop's rate, otherwise one for each frame.
 
     Raises
     ------
     ImportingError
-        It is not such a file, or has neither pictures nor slopes.
+        The file is not of this format, or has neither pictures nor slopes.
     """
     with needs_extra("aot", ImportingError):
         import aotpy
@@ -68,21 +67,21 @@ def _slopes(found: FloatArray, path: Path) -> FloatArray:
     """Measurements (frames, directions, spots) as rows of slopes, spot after spot, (frames, 1, slopes)."""
     if found.ndim != 3 or found.size == 0:
         raise ImportingError(f"{path} has slopes of shape {found.shape}, expected (frames, directions, subapertures)")
-    measured = [d for d in range(found.shape[1]) if not np.isnan(found[:, d]).all()]  # a line has only one
+    measured = [d for d in range(found.shape[1]) if not np.isnan(found[:, d]).all()]  # a line sensor has one
     if not measured:
         raise ImportingError(f"{path} has no pictures, and its slopes are all NaN: there is nothing to import")
     return found[:, measured].swapaxes(1, 2).reshape(len(found), 1, -1)
 
 
 def _times(time: Any, count: int) -> FloatArray | None:
-    """Times of so many rows, s since 1970; None where there is none for each."""
+    """Times of a number of rows, s since 1970; None where some rows have none."""
     if time is None or len(time.timestamps) != count:
         return None
     return np.asarray(time.timestamps, dtype=np.float64)
 
 
 def _commands(loops: list[Any], known: dict[str, Any], count: int, start_s: float | None) -> list[str]:
-    """Put what loops commanded beside what is ``known`` of so many frames; says how, or why it cannot be done."""
+    """Add the loops' commands to the ``known`` facts about the frames; notes say how, or why this is not possible."""
     if not loops:
         return []
     rows = [np.asarray(each.commands.data, dtype=np.float64) for each in loops]

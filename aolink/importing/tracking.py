@@ -2,7 +2,7 @@
 
 A window moves between two exposures by whole pixels, so that its object stays near its middle. For the plant that move
 is an input: a rig whose inputs shift the positions of its spots, as `aolink.importing.first_rig` writes it, takes it
-without an error. Where the objects are in the single frames is the true path of an exposure that sums several.
+without an error. The positions of the objects in the single frames are the true path of an exposure that sums several.
 """
 
 from __future__ import annotations
@@ -29,7 +29,8 @@ from aolink.optics.sensor import BaseSensor
 from aolink.rig import Rig
 
 _EDGE = 4.0
-"""Standard deviations of an object that it is from an edge of the picture, and from another object, at first."""
+"""Least distance of an object from an edge of the picture and from other objects at first, in its standard
+deviations."""
 _FIRST_FRAMES = 5
 """Frames whose mean shows the objects."""
 _WEIGHT = 1.5
@@ -41,13 +42,14 @@ _FAINT = 0.3
 _SAMPLES = 100
 """Frames in which the objects' light is fitted."""
 STRAY = 1 / 8
-"""Share of a window by which an object may be off its middle before the window moves."""
+"""Distance of an object from the middle of its window at which the window moves, as a share of the window."""
 _STRETCH = 10
 """Of these frames, so many in a row are averaged to see what shines beside an object."""
 _ALONE = 1 / 3
 """Light beside an object that is less bright than this share of it does not matter."""
 _REST = 2.5
-"""Standard deviations of where an object's light may be, its walk in an exposure included: beyond is that of others."""
+"""Reach of an object's light, in standard deviations that include its walk in an exposure: light beyond belongs to
+other objects."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,13 +57,13 @@ class Objects:
     """Objects of a film's first frames, the brightest first."""
 
     places: FloatArray
-    """(n, 2) as (x, y), pixels, zero in the middle of the first pixel."""
+    """Positions (x, y), pixels, zero in the middle of the first pixel, (n, 2)."""
     sd: float
     """Standard deviation of an object's light in one direction, pixels."""
 
 
 class Tracker:
-    """Follows objects from frame to frame: the centroid under a Gaussian weight that starts where each was last.
+    """Follows objects from frame to frame, by the centroid under a Gaussian weight that starts at the last position.
 
     Crocker & Grier, J. Colloid Interface Sci. 179, 298 (1996), with the weight of Thomas et al., Mon. Not. R. Astron.
     Soc. 371, 323 (2006). Where trackpy is installed, it locates the objects (`locate`).
@@ -69,14 +71,14 @@ class Tracker:
 
     def __init__(self, objects: Objects, locate: Callable[[FloatArray], FloatArray] | None) -> None:
         self.places = objects.places.copy()
-        """Where each object is, (n, 2)."""
+        """Position of each object, (n, 2)."""
         self._sd, self._locate = objects.sd, locate
         self._usual = np.full(len(self.places), np.nan)
         self.lost = np.zeros(len(self.places), dtype=np.int64)
-        """Frames since each was seen, (n,)."""
+        """Number of frames since each object was last seen, (n,)."""
 
     def follow(self, light: FloatArray) -> FloatArray:
-        """Take the next frame; gives where the objects are, (n, 2), NaN where one is not seen."""
+        """Take the next frame; gives the positions of the objects, (n, 2), NaN where one is not seen."""
         half = math.ceil((_REACH + 2 * _WEIGHT) * self._sd)
         windows, corners = cut_windows(light, self.places, half)
         start = np.clip(self.places - corners, 0, 2 * half)
@@ -103,7 +105,7 @@ class Tracker:
         return np.asarray(np.einsum("nyx,ny,nx->n", windows, along, across))
 
     def _nearest(self, light: FloatArray, near: FloatArray) -> FloatArray:
-        """What trackpy locates nearest to each place; the place itself where it locates nothing near it."""
+        """The object that trackpy locates nearest to each place; the place itself where it locates none near it."""
         assert self._locate is not None
         located = self._locate(light)
         if not len(located):
@@ -125,7 +127,7 @@ def trackpy_locator(sd: float) -> Callable[[FloatArray], FloatArray] | None:
     diameter = 2 * math.ceil(2 * sd) + 1
 
     def locate(light: FloatArray) -> FloatArray:
-        with warnings.catch_warnings():  # of pandas, about how trackpy calls it
+        with warnings.catch_warnings():  # a warning of pandas, about how trackpy calls it
             warnings.simplefilter("ignore")
             found = trackpy.locate(np.maximum(light, 0.0), diameter)
         return np.asarray(found[["x", "y"]].to_numpy(dtype=np.float64))
@@ -134,12 +136,8 @@ def trackpy_locator(sd: float) -> Callable[[FloatArray], FloatArray] | None:
 
 
 def find_objects(film: Film, settings: Settings) -> Objects:
-    """The brightest objects of a film's first frames, as many as are asked for.
-
-    Raises
-    ------
-    ImportingError
-        There are fewer.
+    """The brightest objects of a film's first frames, as many as requested. Raises ------ ImportingError There are
+    fewer.
     """
     if settings.places and len(settings.places) != settings.track:
         raise ImportingError(f"{len(settings.places)} places are given for --track {settings.track}: give one for each")
@@ -171,7 +169,7 @@ def find_objects(film: Film, settings: Settings) -> Objects:
 
 
 def _apart(places: FloatArray, least: float) -> FloatArray:
-    """Places, the first ones first, without those that are near to an earlier one."""
+    """Places in their order, without those that are near to an earlier one."""
     kept: list[FloatArray] = []
     for place in places:
         if all(np.linalg.norm(place - other) >= least for other in kept):
@@ -180,7 +178,7 @@ def _apart(places: FloatArray, least: float) -> FloatArray:
 
 
 def _pitch(places: FloatArray, shape: tuple[int, int]) -> float:
-    """Distance of the two nearest, or what a picture has room for."""
+    """Distance of the two nearest objects, at most the shorter side of the picture."""
     distance = np.linalg.norm(places[:, None] - places, axis=2)
     np.fill_diagonal(distance, np.inf)
     return float(min(distance.min(), min(shape)))
@@ -188,22 +186,21 @@ def _pitch(places: FloatArray, shape: tuple[int, int]) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Survey:
-    """What the single frames of a film say of its objects."""
+    """The measurements of a film's objects in the single frames."""
 
     places: FloatArray
-    """Where each is in each frame, (frames, n, 2) as (x, y), pixels; NaN where it is not seen."""
+    """Position (x, y) of each object in each frame, pixels, (frames, n, 2); NaN where it is not seen."""
     sd: float
     """Standard deviation of the Gaussian that fits the objects best, pixels."""
     sd_sd: float
-    """Standard deviation of ``sd``, from what the objects differ by."""
+    """Standard deviation of ``sd``, from the differences of the objects."""
     light: FloatArray
     """Light of each object, (n,)."""
     ground: FloatArray
-    """What is left of the ground under each, for a pixel, (n,)."""
+    """Remaining background under each object, for one pixel, (n,)."""
     residual: FloatArray
-    """What the fits leave of sums over rows and over columns, as a share of the object's light, (samples,).
-
-    What a Gaussian does not describe is not independent from pixel to pixel: sums are what estimators see.
+    """Residuals of sums over rows and over columns, as a share of the object's light, (samples,). Deviations from a
+    Gaussian are not independent from pixel to pixel, and estimators use such sums.
     """
     model: FloatArray
     """The fits at the same places, as a share of the object's light, (samples,)."""
@@ -224,12 +221,12 @@ class Survey:
 
 
 def survey(film: Film, settings: Settings, objects: Objects, progress: Callable[[int], None] | None = None) -> Survey:
-    """Follow the objects through the whole film and fit what they look like in single frames.
+    """Follow the objects through the whole film and fit their images in single frames.
 
     Raises
     ------
     ImportingError
-        Not one of them can be followed.
+        None of the objects can be followed.
     """
     light = Light(film, settings)
     tracker = Tracker(objects, trackpy_locator(objects.sd))
@@ -256,7 +253,7 @@ def survey(film: Film, settings: Settings, objects: Objects, progress: Callable[
 def _fitted(
     windows: FloatArray, centres: FloatArray, start_sd: float
 ) -> tuple[float, float, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
-    """The Gaussian, integrated over pixels, and the ground that best fit windows (samples, n, side, side).
+    """The Gaussian, integrated over pixels, and the background that best fit windows (samples, n, side, side).
 
     What they leave of the windows, averaged over some of these, tells the light beside an object (`Survey.beside`).
     """
@@ -264,7 +261,7 @@ def _fitted(
     edges = np.arange(side + 1) - 0.5
 
     def amounts(sd: float, k: int) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Light and ground of an object, its model, and what is left of its pixels."""
+        """Light and background of an object, its model, and the residuals of its pixels."""
         seen = np.isfinite(centres[:, k]).all(axis=1)
         x, y = (pixel_masses(sd**2, edges, centres[seen, k, d], 0)[0] for d in (0, 1))
         shape = (y[:, :, None] * x[:, None, :]).ravel()
@@ -279,7 +276,7 @@ def _fitted(
     usable = [k for k in range(n) if np.isfinite(centres[:, k]).all(axis=1).any()]
     bounds = (max(0.3, start_sd / 3), 2 * start_sd)
     each = np.array([optimize.minimize_scalar(left, bounds=bounds, args=(k,), method="bounded").x for k in usable])
-    # The median: two objects that stick together are no wider spot.
+    # The median is used because two objects that stick together should not widen the fit.
     sd = float(np.median(each))
     sd_sd = float(each.std(ddof=1) / math.sqrt(len(each))) if len(each) > 1 else math.nan
     light, ground, residuals, models = np.full(n, np.nan), np.zeros(n), [], []
@@ -318,7 +315,7 @@ def _steps(places: FloatArray) -> tuple[float, float]:
 
 
 def reach(known: Survey, frames: int) -> float:
-    """How far from the middle of its blur an object's light may be in an exposure of so many frames, pixels."""
+    """Largest distance of an object's light from the middle of its blur in an exposure of ``frames`` frames, pixels."""
     return _REST * math.sqrt(known.sd**2 + known.walk * frames)
 
 
@@ -330,7 +327,7 @@ def tracked(
     Raises
     ------
     ImportingError
-        The rig file does not describe so many spots, or the film shows fewer objects.
+        The rig file describes another number of spots, or the film shows fewer objects.
     """
     sensor = rig.sensor
     if sensor.directions == 1 or sensor.spots != settings.track or sensor.spot_light is not None:
@@ -349,7 +346,7 @@ def tracked(
         bad = np.any([wrong for _, wrong in shown], axis=0)
         blurs = _blurs(mean, known.places[max(group.first_frame - 1, 0)], known, len(shown))
         values, usable, own = windows.cut(mean, ~bad, blurs)
-        # Beyond an object's reach there is no light of it: what shines there belongs to others.
+        # Beyond an object's reach there is none of its light: light there belongs to others.
         values = np.where(own, values - known.ground[:, None, None], 0.0)
         density = values / known.light[:, None, None] / area
         counts = sensor.black_level + sensor.counts_per_density * windows.as_frame(density)
@@ -392,9 +389,8 @@ def _crowded(film: Film, known: Survey) -> Iterator[str]:
 
 
 def _blurs(picture: FloatArray, last: FloatArray, known: Survey, frames: int) -> FloatArray:
-    """Where the objects' blurs are in an exposure of so many frames, after they were ``last`` (n, 2); NaN as there.
-
-    It is told from the exposure alone: what the single frames know must not show in its pixels.
+    """Positions of the objects' blurs in an exposure, after they were at ``last`` (n, 2); NaN as there. They are
+    measured in the exposure alone: knowledge from the single frames must not show in its pixels.
     """
     start = np.where(np.isfinite(last), last, 0.0)
     far = reach(known, frames)
@@ -406,7 +402,8 @@ def _blurs(picture: FloatArray, last: FloatArray, known: Survey, frames: int) ->
 
 
 def _state(rig: Rig, output: FloatArray | None) -> FloatArray:
-    """The state of a plant that has one for each output, (axes, n_states); NaN where outputs do not tell it."""
+    """The state of a plant that has one state for each output, (axes, n_states); NaN where outputs do not determine
+    it."""
     plant = rig.plant
     if output is None or plant.C.shape != (1, 1):
         return np.full((plant.axes, plant.n_states), np.nan)
@@ -414,13 +411,13 @@ def _state(rig: Rig, output: FloatArray | None) -> FloatArray:
 
 
 class _Windows:
-    """A window for each object; it moves by whole pixels where the rig's inputs can tell the estimators so."""
+    """A window for each object; it moves by whole pixels, if the rig's inputs can represent the moves."""
 
     def __init__(self, rig: Rig, sensor: BaseSensor, known: Survey) -> None:
         self._sensor, self._side = sensor, sensor.profile.pixels
         plant = rig.plant
         gain = plant.C @ plant.B
-        # An input moves the outputs at once, and for good.
+        # An input moves the outputs at once and permanently.
         self._moves = gain.shape[0] == gain.shape[1] and bool(
             np.allclose(plant.C @ plant.A @ plant.B, gain) and np.linalg.matrix_rank(gain) == len(gain)
         )
@@ -433,16 +430,15 @@ class _Windows:
         return np.rint(places - (self._side - 1) / 2).astype(np.int64)
 
     def positions(self, places: FloatArray) -> FloatArray:
-        """Places on the picture (frames, n, 2) as outputs of the rig, slope units, (2 n, frames)."""
+        """Places in the picture (frames, n, 2) as outputs of the rig, slope units, (2 n, frames)."""
         inside = (places - self._corners + 0.5) * self._sensor.pixel_width + self._sensor.field[0]
         return np.asarray(inside.reshape(len(places), 2 * len(self._corners)).T)
 
     def cut(
         self, picture: FloatArray, usable: BoolArray, places: FloatArray
     ) -> tuple[FloatArray, BoolArray, BoolArray]:
-        """What the windows see, which pixels can be used, and which may have light of the blurs at ``places``.
-
-        (n, side, side) each.
+        """The pixels in the windows, the mask of usable ones, and the mask of those that may have light of the blurs at
+        ``places``, (n, side, side) each.
         """
         span = np.arange(self._side)
         x, y = (self._corners[:, d, None] + span for d in (0, 1))
@@ -459,7 +455,7 @@ class _Windows:
         return windows.reshape(rows, columns, side, side).swapaxes(1, 2).reshape(rows * side, columns * side)
 
     def follow(self, places: FloatArray) -> FloatArray:
-        """Move windows after objects that have strayed; gives the inputs that say so, (n_inputs,)."""
+        """Move windows after objects that have strayed; gives the inputs for these moves, (n_inputs,)."""
         old = self._corners
         if not self._moves:
             return np.zeros(old.size)

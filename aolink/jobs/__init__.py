@@ -1,1 +1,1 @@
-"""Whole jobs that commands do: the demo, a calibration, many recordings at once."""
+"""Jobs, the work of commands that need several subpackages: the demo, a calibration, many recordings at once."""

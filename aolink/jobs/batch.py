@@ -1,4 +1,4 @@
-"""Many recordings, many models: each recording is estimated again with each, and what came of it is one table."""
+"""Many recordings and many models: each recording is estimated again with each model, and the results are one table."""
 
 from __future__ import annotations
 
@@ -39,17 +39,17 @@ class Job:
     source: Path
     model: Model
     estimators: tuple[str, ...]
-    """Empty: those that the recording has."""
+    """The estimators to run; where empty, those that the recording has."""
     output: Path
     engine: Engine = "aolink"
     overwrite: bool = False
-    """Do it even if it was done before."""
+    """Whether to do the job even if it was done before."""
     only: bool = False
-    """Leave the estimates of other estimators out of the output."""
+    """Whether to leave the estimates of other estimators out of the output."""
 
     @property
     def record(self) -> Path:
-        """Where the job writes what came of it, when it is done."""
+        """The file to which the job writes its result when it is done."""
         return self.output.with_suffix(".json")
 
     def digest(self) -> str:
@@ -69,7 +69,7 @@ class Job:
         return hashlib.sha256(json.dumps(facts).encode()).hexdigest()
 
     def done_before(self) -> Done | None:
-        """What came of it if it was done before, and nothing has changed since."""
+        """The result of the job if it was done before, and nothing has changed since."""
         record = None if self.overwrite else _record(self.record)
         try:
             if record and record["digest"] == self.digest() and self.output.exists():
@@ -79,10 +79,10 @@ class Job:
         return None
 
     def rows(self) -> tuple[list[dict[str, Any]], bool]:
-        """Do it; gives the rows, and whether it had been done before."""
+        """Do the job; gives the rows, and whether it had been done before."""
         with writing(self.output, overwrite=True, sources=[self.source], error=RecordingError) as partial:
             rows = _estimated(self, partial)
-            # A result is never there without the record that says whose it is and what it depends on.
+            # A result is never there without the record that has its job and what it depends on.
             self.output.unlink(missing_ok=True)
             with writing(self.record, overwrite=True) as record:
                 record.write_text(json.dumps({"digest": self.digest(), "rows": rows}))
@@ -91,7 +91,7 @@ class Job:
 
 @dataclass(frozen=True, slots=True)
 class SideJob:
-    """One recording with one model and one estimator, to be a side file."""
+    """One recording with one model and one estimator, whose result is a side file."""
 
     source: str
     """A file or a URL."""
@@ -100,15 +100,15 @@ class SideJob:
 
     @property
     def model(self) -> Model:
-        """What the recording is estimated with."""
+        """The model that the recording is estimated with."""
         return self.settings.model
 
     def done_before(self) -> Done | None:
-        """Nothing: whether it was done is found out where it would be done, with the recording at hand."""
+        """None: the worker that would do the job finds out whether it was done, with the recording at hand."""
         return None
 
     def rows(self) -> tuple[list[dict[str, Any]], bool]:
-        """Do it; gives the row, and whether it had been done before."""
+        """Do the job; gives the row, and whether it had been done before."""
         row, before = estimated(self.source, self.output, self.settings)
         return [row], before
 
@@ -119,10 +119,10 @@ class Done:
 
     job: Job | SideJob
     rows: list[dict[str, Any]]
-    """By `COLUMNS`."""
+    """The rows, by `COLUMNS`."""
     error: str = ""
     skipped: bool = False
-    """It had been done before."""
+    """Whether the job had been done before."""
 
     @property
     def nothing_measured(self) -> list[str]:
@@ -132,7 +132,7 @@ class Done:
 
     @property
     def warnings(self) -> list[str]:
-        """What is doubtful about the result, in words: what of the recording could not be read or estimated."""
+        """Warnings about the result, in words: the parts of the recording that could not be read or estimated."""
         damage = self.rows[0].get("damage") if self.rows else ""
         return [*([str(damage)] if damage else []), *self.nothing_measured]
 
@@ -179,8 +179,7 @@ def jobs(
     Raises
     ------
     RigError
-        Two would write the same file.
-    RecordingError
+        Two jobs would write the same file. RecordingError
         An output would take the place of a recording that is read, or, without ``overwrite``, of a file that no
         job has written.
     """
@@ -239,9 +238,8 @@ def _check_all_differ(outputs: Iterable[Path]) -> None:
 
 
 def shard(sources: Sequence[str], part: str) -> list[str]:
-    """The recordings of one part of several, ``i/n`` with i from 1 to n: the same whatever their order.
-
-    The parts differ by one recording at most in size, have none in common, and all of them together are all.
+    """The recordings of one part of several, ``i/n`` with i from 1 to n: the same for any order of the recordings. The
+    parts' sizes differ by one recording at most, they have none in common, and together they are all recordings.
 
     Raises
     ------
@@ -269,7 +267,7 @@ def run(
 ) -> Iterator[Done]:
     """Do the jobs on ``workers`` processes; gives each when it is done, in no order. A failed one stops no other.
 
-    When ``stop()`` says so no other job is begun, and those that are on the way are ended in good order.
+    When ``stop()`` gives True no other job is begun, and those under way are ended in good order.
     """
     fresh: list[Job | SideJob] = []
     for job in todo:
@@ -294,7 +292,7 @@ def _in_parallel(todo: Sequence[Job | SideJob], workers: int, stop: Callable[[],
         try:
             with processes(workers) as pool:
                 while running or (queue and not lost and not stop()):
-                    # No more than can run: what waits in a pool cannot be taken back.
+                    # No more than can run: a job that waits in a pool cannot be taken back.
                     while queue and not lost and len(running) < workers and not stop():
                         try:
                             running[pool.submit(do, queue[0])] = queue[0]
@@ -344,7 +342,7 @@ def _numerically(text: str) -> list[tuple[str, float]]:
 
 
 def _record(path: Path) -> dict[str, Any] | None:
-    """What a job has written of itself; None if there is nothing, or something else."""
+    """The record that a job has written; None if there is none, or another file."""
     try:
         record = json.loads(path.read_text())
         rows = record["rows"]
@@ -356,12 +354,12 @@ def _record(path: Path) -> dict[str, Any] | None:
 
 
 def do(job: Job | SideJob) -> Done:
-    """Do a job; whatever goes wrong is the result."""
+    """Do a job; any error becomes its result."""
     try:
         rows, before = job.rows()
     except (AolinkError, OSError) as error:
         return Done(job, [], f"{error}")
-    except Exception as error:  # a value that nobody thought of stops no other job
+    except Exception as error:  # an unforeseen error stops no other job
         return Done(job, [], f"it cannot be estimated with this model: {error!r}")
     return Done(job, rows, skipped=before)
 

@@ -1,4 +1,5 @@
-"""The job of `aolink calibrate`: frames from recordings, made on the spot or before, into a rig file."""
+"""The job of `aolink calibrate`: it makes a rig file from frames of recordings, which are made on the spot or
+before."""
 
 from __future__ import annotations
 
@@ -30,9 +31,9 @@ _ASKED = (
     ("flat-2", "flat", "change that light by a factor of two or so"),
     ("still", "still", "let the spot rest, with nothing else that shines"),
 )
-"""Name, kind, and what to do before; in this order."""
+"""Name and kind of each recording, and what to do before it; in this order."""
 _SAME = ("kind", "pixels", "field", "bit_depth")
-"""What recordings must share with the rig file's sensor."""
+"""Keys whose values a recording's sensor and the rig file's must share."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,7 +41,7 @@ class Calibrated:
     """A calibration and the text of the rig file that it makes."""
 
     rig: Rig
-    """As it was before."""
+    """The rig before the calibration."""
     calibration: Calibration
     text: str
 
@@ -56,9 +57,8 @@ def calibrate_recordings(rig: Rig, text: str, paths: Sequence[Path]) -> Calibrat
     Raises
     ------
     RecordingError
-        One cannot be read.
-    CalibrationError
-        One is of another sensor, is not marked, or its frames are not what they are said to be.
+        A recording cannot be read. CalibrationError A recording is of another sensor, is not marked, or its frames are
+        not of the kind that it is marked with.
     """
     frames = [read_frames(path, rig) for path in paths]
     calibration = calibrate(rig, frames)
@@ -110,9 +110,10 @@ def record_frames(
     folder:
         Where the recordings go.
     ask:
-        Puts a question; gives the answer: nothing to go on, "s" to skip. EOFError if nobody is there.
+        Puts a question; gives the answer: an empty text to go on, "s" to skip. EOFError if nobody is there.
     stoppable:
-        For each recording, what says whether it is to be stopped; leaving it raises what ends the job, if so.
+        For each recording, a context that gives the function ``stop``; leaving the context raises the error that ends
+        the job, if it was stopped.
     progress:
         For each recording, takes its name and the number of frames so far.
 
@@ -145,7 +146,7 @@ def record_frames(
                 "nobody answers: run `aolink calibrate` on a terminal, or give it recordings made with"
                 " `aolink record --calibration`"
             ) from None
-        if answer == "s" and kind != "dark":  # nothing can be known without the dark frames
+        if answer == "s" and kind != "dark":  # without the dark frames nothing can be measured
             skipped = kind
             continue
         path = folder / f"{name}.mcap"
@@ -160,20 +161,20 @@ def record_frames(
 
 @dataclass(frozen=True, kw_only=True)
 class Poked:
-    """An interaction matrix as it was measured, and as the rig file's plant has it for the same inputs."""
+    """A measured interaction matrix, and the one of the rig file's plant for the same inputs."""
 
     measured: Interaction
     modelled: Interaction
 
     @property
     def noise(self) -> float:
-        """Rms of the measured matrix's error to be expected, as a share of its rms."""
+        """Expected rms error of the measured matrix, as a share of its rms."""
         error = np.sqrt(len(self.measured.matrix) * (self.measured.sd**2).sum())
         return float(error / max(np.linalg.norm(self.measured.matrix), 1e-300))
 
     @property
     def difference(self) -> float:
-        """Rms of what the plant leaves unexplained of the measured matrix, as a share of its rms."""
+        """Rms of the measured matrix less the plant's, as a share of its rms."""
         apart = self.measured.matrix - self.modelled.matrix
         return float(np.linalg.norm(apart)) / max(float(np.linalg.norm(self.measured.matrix)), 1e-300)
 
@@ -208,9 +209,8 @@ def record_pokes(
 
 
 def interaction(rig: Rig, path: Path, hold_s: float = 0.0) -> Poked:
-    """The interaction matrix of a recording with pokes, and what the rig file's plant makes of the same inputs.
-
-    What is measured are pokes that have rested for ``hold_s``, one frame period at least. Raises RecordingError and
+    """The interaction matrix of a recording with pokes, and that of the rig file's plant for the same inputs. Only
+    pokes that have rested for ``hold_s``, one frame period at least, are measured. Raises RecordingError and
     CalibrationError.
     """
     recording, rest = Recording(path), rest_exposures(rig, hold_s)
@@ -224,9 +224,9 @@ def interaction(rig: Rig, path: Path, hold_s: float = 0.0) -> Poked:
 
 
 def rig_text(path_or_name: str, rig: Rig) -> str:
-    """The text of the file that ``rig`` was loaded from, with the line ends that it has. Raises RigError."""
+    """The text of the file that ``rig`` was loaded from, with its own line ends. Raises RigError."""
     path = Path(path_or_name)
-    if not path.exists():  # one that comes with aolink
+    if not path.exists():  # a rig that comes with aolink
         return rig.toml
     try:
         with path.open(newline="") as file:

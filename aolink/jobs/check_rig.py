@@ -1,4 +1,5 @@
-"""What a rig file says, judged before anything runs on it: what cannot work, and what is probably a slip."""
+"""The check of a rig file before anything runs on it: errors that cannot work, and values that are probably
+mistakes."""
 
 from __future__ import annotations
 
@@ -28,25 +29,25 @@ _FASTEST_STEP_S, _SLOWEST_STEP_S = 1e-6, 0.05
 _SHORTEST_EXPOSURE_S, _LONGEST_EXPOSURE_S = 20e-6, 30.0
 _FASTEST_FRAMES_HZ = 2000.0
 _MOST_DEAD = 0.95
-"""Share of the time in which the camera does not look."""
+"""Share of the time in which the camera does not expose."""
 _FEWEST_STEPS = 4
-"""An exposure of fewer fast steps holds hardly any motion that the blur could tell."""
+"""An exposure of fewer fast steps has hardly any motion that the blur could show."""
 _STEPS_IN_PERIOD = 8
 """Fast steps in one period of the drive below which a sine is no longer one."""
 _LEAST_QUEUE_S = 0.02
-"""A host's operating system holds a program up for some milliseconds now and then."""
+"""Shortest queue without a finding, s: an operating system holds a program up for some milliseconds now and then."""
 _LONGEST_WATCHDOG_S = 60.0
 _COARSE = 0.05
-"""Share of the drive's range that the converter may round it by."""
+"""Largest rounding by the converter without a finding, as a share of the drive's range."""
 _ROUNDED = 101
-"""Inputs along the drive's range that are rounded to see that."""
+"""Number of inputs along the drive's range that are rounded for this check."""
 _LARGEST_DRIFT_PPM = 1000.0
 """Quartz clocks keep to 100 ppm."""
 _LONGEST_LATENCY_S = 0.1
 _GAINS = (1e-3, 1e3)
-"""Counts per photo-electron that cameras have, generously."""
+"""Least and largest counts per photo-electron of any camera."""
 _STILL = 0.01
-"""Motion inside an exposure, in kernel sds, below which there is nothing to see."""
+"""Motion inside an exposure, in kernel sds, below which the blur does not show it."""
 _WINDOWS = 64
 """Exposures along the drive's path whose blur is checked."""
 
@@ -56,7 +57,7 @@ Severity = Literal["error", "warning", "info"]
 
 @dataclass(frozen=True)
 class Finding:
-    """Something that `check_rig` has to say."""
+    """One finding of `check_rig`."""
 
     severity: Severity
     key: str
@@ -68,7 +69,7 @@ _error, _warning, _info = (partial(Finding, severity) for severity in get_args(S
 
 
 def check_rig(rig: Rig) -> list[Finding]:
-    """What will not work, what is probably a slip, and what the file comes to in plain numbers; errors first."""
+    """The errors of a rig file, its probable mistakes, and the numbers that follow from it; errors first."""
     try:
         with np.errstate(all="ignore"):
             path, sd = nominal_path(_different_copies(rig))
@@ -133,13 +134,13 @@ def _check_timing(rig: Rig) -> Iterator[Finding]:
     if dead > _MOST_DEAD:
         yield _warning(
             "timing.frame_period_steps",
-            f"the camera looks for {1 - dead:.2g} of the time only, {timing.exposure_steps} of"
+            f"the camera exposes for {1 - dead:.2g} of the time only, {timing.exposure_steps} of"
             f" {timing.frame_period_steps} fast steps",
         )
     if timing.exposure_steps < _FEWEST_STEPS:
         yield _warning(
             "timing.exposure_steps",
-            f"{timing.exposure_steps} fast step(s) in an exposure hold no motion that its blur could tell:"
+            f"{timing.exposure_steps} fast step(s) in an exposure hold no motion that the blur could show:"
             " the mirror should be many times as fast as the camera",
         )
 
@@ -193,7 +194,7 @@ def _check_sensor(rig: Rig) -> Iterator[Finding]:
 
 
 def _check_signal(rig: Rig, path: FloatArray) -> Iterator[Finding]:
-    """How the spot stands out of the noise: resting, and blurred as the drive moves it."""
+    """Check the spot's signal to noise: at rest, and blurred as the drive moves it."""
     sensor, line = rig.sensor, rig.sensor.profile
     peak = sensor.peak_density
     snr = peak_snr(rig)
@@ -232,7 +233,7 @@ def _check_signal(rig: Rig, path: FloatArray) -> Iterator[Finding]:
 
 
 def _check_motion(rig: Rig, path: FloatArray) -> Iterator[Finding]:
-    """How far the spot goes within an exposure and from one fast step to the next."""
+    """Check how far the spot moves within an exposure and from one fast step to the next."""
     plant, steps, pixel = rig.plant, rig.timing.exposure_steps, rig.sensor.pixel_width
     kernel_sd = math.sqrt(rig.sensor.kernel.variance)
     inside = min(steps, path.shape[1])
@@ -261,7 +262,7 @@ def _check_motion(rig: Rig, path: FloatArray) -> Iterator[Finding]:
     if not (plant.process_noise.any() or plant.initial_covariance.any()):
         yield _warning(
             "plant.process_noise",
-            "neither process noise nor doubt about the start: estimators are sure of their prediction and never look",
+            "neither process noise nor doubt about the start: estimators trust their prediction and use no frame",
         )
     drive = rig.drive
     if drive.kind == "sine" and drive.amplitude.any() and drive.period_s < _STEPS_IN_PERIOD * rig.timing.fast_step_s:
@@ -272,7 +273,7 @@ def _check_motion(rig: Rig, path: FloatArray) -> Iterator[Finding]:
 
 
 def _wandered(rig: Rig, steps: int) -> float:
-    """Standard deviation of how far process noise carries the spot in some fast steps, the largest of all outputs."""
+    """Standard deviation of the spot's motion by process noise in some fast steps, the largest of all outputs."""
     plant = rig.plant
     transition, noise = lift(plant, steps)
     change = transition - np.eye(plant.n_states)
@@ -282,7 +283,7 @@ def _wandered(rig: Rig, steps: int) -> float:
 
 
 def _check_field(rig: Rig, path: FloatArray, sd: FloatArray) -> Iterator[Finding]:
-    """Whether the spot stays on the sensor, as it should go and with three standard deviations around that."""
+    """Check whether the spot stays on the sensor, on its expected path and three standard deviations around it."""
     low, high = rig.sensor.field
     least, most = float(path.min()), float(path.max())
     key = "drive.amplitude" if rig.drive.kind == "sine" else "drive.offset"
@@ -366,7 +367,7 @@ def _check_observability(rig: Rig) -> Iterator[Finding]:
         yield _error("plant.C", "the camera sees no state of the plant")
         return
     for mode in report.unseen:
-        harm = "it dies out by itself" if abs(mode.eigenvalue) < 1 - 1e-9 else "its estimate will never converge"
+        harm = "it decays by itself" if abs(mode.eigenvalue) < 1 - 1e-9 else "its estimate will never converge"
         yield _warning("plant.C", f"the outputs do not see all of {mode}; {harm}")
     for mode in report.lost_by_centroid:
         yield _warning(

@@ -1,4 +1,4 @@
-"""A closed loop on a simulated rig in memory: the session's loop without its wire, as fast as it goes."""
+"""A closed loop on a simulated rig in memory: the session's loop without its wire, as fast as possible."""
 
 from __future__ import annotations
 
@@ -29,14 +29,15 @@ class Closed(NamedTuple):
     """One exposure of a closed loop."""
 
     exposure: Exposure
-    """With its truth: ``exposure.truth.path`` is the residual slopes at each fast step."""
+    """The exposure with its truth: ``exposure.truth.path`` is the residual slopes at each fast step."""
     estimate: Estimate | None
     act: Act | None
-    """None where no controller closes the loop."""
+    """The controller's act; None where no controller closes the loop."""
 
 
 def seed_of(recording: Recording) -> int | None:
-    """Seed of the simulated rig that a recording is of; None where it is not of one that its rig file describes."""
+    """Seed of the simulated rig that made a recording; None where its rig file does not describe the rig that made
+    it."""
     if (found := _SIMULATED.search(recording.metadata.get("camera", ""))) is None:
         return None
     return int(found[2]) if recording.rig.digest.startswith(found[1]) else None
@@ -85,7 +86,7 @@ def closed_loop(
 
 @dataclass(frozen=True, kw_only=True)
 class Replayed:
-    """What a controller would have done in a session, and what would have come of it."""
+    """The commands of a controller in a recorded session, and the slopes that it would have left."""
 
     controller: str
     estimator: str
@@ -96,22 +97,24 @@ class Replayed:
     input_rms: float
     """Root mean square of the inputs that it would have commanded, less the safe input."""
     difference_rms: float
-    """The same of their difference to what the mirror held; NaN where the recording does not say."""
+    """Root mean square of their difference from the inputs that the mirror held; NaN where the recording lacks
+    these."""
     stability: str
     seed: int | None
-    """Seed of the simulated rig; None where the recording is of none, and the rest is NaN."""
+    """Seed of the simulated rig; None where the recording is not of one, and the fields below are NaN."""
     recorded_rms: float
-    """Residual slopes at the fast rate, root mean square, slope units: in the recording, ..."""
+    """Residual slopes in the recording, root mean square at the fast rate, slope units."""
     open_rms: float = math.nan
-    """... with the mirror at its safe input, ..."""
+    """The same with the mirror at its safe input."""
     closed_rms: float = math.nan
-    """... and with the loop closed by this controller, from the same seed."""
+    """The same with the loop closed by this controller, from the same seed."""
 
 
 def replayed(
     recording: Recording, controller: str, estimator: str, stop: Callable[[], bool], progress: Callable[[int], None]
 ) -> Replayed:
-    """Ask a controller what it would have commanded; on a simulated rig, close its loop from the same seed.
+    """Compute the commands of a controller in a recorded session; on a simulated rig, close its loop from the same
+    seed.
 
     Raises
     ------

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 _CONNECT_S = 5.0
 _POLL_S = 0.02
-"""How often the user's wish to stop is looked for."""
+"""Time between two checks whether the user wants to stop, s."""
 
 
 def run_on(
@@ -32,8 +32,8 @@ def run_on(
     """Do jobs on the workers of a scheduler; gives each when it is done, in no order. A failed one stops no other.
 
     Recordings and results are where the workers find them: on a file system that all share, or behind URLs. When
-    ``stop()`` says so those that no worker has begun are taken back; what is on the way is finished there, but not
-    waited for.
+    ``stop()`` gives True, jobs that no worker has begun are taken back; workers finish those under way, but this does
+    not wait for them.
 
     Raises
     ------
@@ -69,7 +69,8 @@ def run_on(
 
 
 def _on_worker(job: Job | SideJob, version: str) -> Done:
-    """What a worker does; one that came late was not asked before what aolink it has."""
+    """Do a job on a worker. The version of aolink is checked here, because a worker that joined late was not asked
+    before."""
     if aolink_version() != version:
         return Done(job, [], f"a worker has aolink {aolink_version()}, this is {version}: install the same everywhere")
     return do(job)
@@ -88,7 +89,7 @@ def _connected(address: str) -> Iterator[Client]:
     except ImportError:
         raise AolinkError("--scheduler needs Dask: pip install 'aolink[cluster]'") from None
     for name in ("distributed", "distributed.client", "distributed.core"):
-        logging.getLogger(name).setLevel(logging.CRITICAL)  # what is wrong is said here, once
+        logging.getLogger(name).setLevel(logging.CRITICAL)  # the error is raised here, once
     try:
         client = Client(address, timeout=_CONNECT_S, set_as_default=False)
     except (OSError, ValueError) as error:

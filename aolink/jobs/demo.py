@@ -1,4 +1,4 @@
-"""The main job from end to end: a rig, a session, the estimates again, the pictures, the table."""
+"""The job of `aolink demo`, from end to end: a rig, a session, the estimates again, the pictures, the table."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from aolink.session import Report, record
 _RIG_START_S = 60.0
 _RIG_END_S = 5.0
 _SERVING = ("moments", "o1", "open-loop")
-"""Which estimator serves the demo's controller: the first that can work on the rig."""
+"""Estimators for the demo's controller: the first that can work on the rig serves it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,20 +36,20 @@ class DemoResult:
 
     recording: Path
     rrd: Path | None = None
-    """None if the demo was interrupted before."""
+    """The Rerun file; None if the demo was interrupted before."""
     picture: Path | None = None
     not_of_viewer: str = ""
-    """Why the picture is not one of the viewer, but of matplotlib or None; empty where it is the viewer's."""
+    """The reason why the picture is not the viewer's, but matplotlib's or None; empty where it is the viewer's."""
     report: Report
     residuals: Mapping[str, float] = field(default_factory=dict)
-    """Where the loop was closed: true slopes at the fast rate, root mean square, slope units, by the controller's name;
-    "open" for none. Each has a recording of its name beside the session's."""
+    """True slopes at the fast rate where the loop was closed, root mean square, slope units, by the controller's name;
+    "open" for none. Each controller has a recording of its name beside the session's."""
     deblurred: Summary | None = None
     """Summary of the restored pictures; None where the rig has no picture sensor."""
     deblurred_by: str = ""
     """Estimator whose path they were restored with."""
     deblurred_recording: Path | None = None
-    """The session with them."""
+    """The session's recording with the restored pictures."""
     differences: Mapping[str, str] = field(default_factory=dict)
     """Where online and offline estimates differ, by estimator; empty if nowhere."""
     seconds: dict[str, float]
@@ -71,8 +71,8 @@ def simulated_rig(rig: str | Path, *options: str) -> Iterator[tuple[str, str]]:
         The process does not start.
     """
     command = [sys.executable, "-m", "aolink", "rig", str(rig), "--json", "--tied", *options]
-    # A group of its own: Ctrl-C is for the session, which still has to park the mirror.
-    # Its input is a pipe that ends with this process, and the rig with it, whatever ends this process.
+    # It has a process group of its own: Ctrl-C goes to the session, which still has to park the mirror.
+    # Its input is a pipe that ends with this process, however that ends, and the rig ends with the pipe.
     started = False
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stdin=subprocess.PIPE, start_new_session=True)
     try:
@@ -85,7 +85,7 @@ def simulated_rig(rig: str | Path, *options: str) -> Iterator[tuple[str, str]]:
         yield ports["camera"], ports["mirror"]
     finally:
         if process.stdin is not None:
-            process.stdin.close()  # a rig that serves ends with it, and says nothing; one that does not is killed
+            process.stdin.close()  # a serving rig then ends silently; otherwise it is killed
         with contextlib.suppress(subprocess.TimeoutExpired):
             process.wait(_RIG_END_S if started else 0)
         process.kill()
@@ -121,12 +121,12 @@ def run_demo(
     stoppable: Callable[[], AbstractContextManager[Callable[[], bool]]],
     progress: Callable[[str, int], None],
 ) -> DemoResult:
-    """Do the main job into ``folder``. Raises AolinkError; what was recorded until then stays.
+    """Run the demo in ``folder``. Raises AolinkError; the recording up to then stays.
 
-    The rig runs from its ``source``, file or name: what that names is relative to it. ``stoppable`` is entered for
-    the session alone, which ends in good order when what it gives says so; nothing else is made then. With ``control``
-    the session's loop is closed by that controller, and two others are recorded before, from the same seed: with
-    the loop open, and closed by the integrator.
+    The rig runs from its ``source``, a file or a name; paths in the file are relative to it. ``stoppable`` is entered
+    for the session alone, which ends in good order when the function that it gives returns True; nothing else is made
+    then. With ``control`` the session's loop is closed by that controller, and two others are recorded before, from the
+    same seed: with the loop open, and closed by the integrator.
     """
     from aolink import plotting, viewing
 

@@ -1,4 +1,5 @@
-"""The job of `aolink identify --follow`: exposures as they come, and a new model where the old one no longer fits.
+"""The job of `aolink identify --follow`: it takes exposures as they come, and fits a new model where the old one no
+longer fits.
 
 The innovations of an estimator of its own say whether a model fits, with or without estimators in the recording, as
 those of the loop's estimator do in a session (`aolink.control.FitMonitor`). A new model is fitted to exposures that no
@@ -25,28 +26,29 @@ from aolink.jobs.identify import Result, Tell, Wanted, from_readings, outputs_of
 from aolink.rig import Rig, parse_rig
 
 FITTED = 96
-"""Exposures that a new model is fitted to: with 64, sums of two processes are often not told apart."""
+"""Exposures that a new model is fitted to: with 64, the two processes of a sum often cannot be separated."""
 HELD_OUT = 32
-"""Exposures after those that it is judged on."""
+"""Exposures after these on which it is judged."""
 LEAST_GAIN = 3.0
-"""Nats by which these must be likelier by the new model than by any before: odds of twenty to one."""
+"""Nats by which the log-likelihood of these must be higher by the new model than by any before: odds of twenty to
+one."""
 REPORT = 60
-"""Exposures between two lines that say how the models fit."""
+"""Exposures between two lines of output about the models' fit."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class News:
-    """What can be said after an exposure."""
+    """The news after an exposure."""
 
     frame_id: int
     fits: bool | None
-    """Whether one of the models fits; None where that is not what is said."""
+    """Whether one of the models fits; None where the news is about something else."""
     text: str
 
 
 @dataclass(frozen=True, kw_only=True)
 class Offer:
-    """A new model by which the exposures that were held out are likelier."""
+    """A new model with a higher likelihood of the exposures that were held out."""
 
     frame_id: int
     path: Path
@@ -58,16 +60,15 @@ class Offer:
     log_likelihood: float
     """Log-likelihood of the exposures that were held out, nats."""
     before: float
-    """Their log-likelihood by the best of the models before."""
+    """Their log-likelihood by the best of the earlier models."""
     before_name: str
     before_model: str
-    """Its poles in words."""
+    """The poles of that model, in words."""
 
 
 def with_own_kinds(wanted: Wanted, rig: Rig) -> Wanted:
-    """Where no model was asked for, the kinds that the rig file's own has, if it has one of a single output.
-
-    To choose among nine takes minutes, while a session goes on; what drifts keeps its kind.
+    """If no model was asked for, take the kinds of the rig file's own model, if it has one of a single output. A choice
+    among nine takes minutes, while a session goes on; a process that drifts keeps its kind.
     """
     tables = tomllib.loads(rig.toml).get("disturbance", {}).get("model", [])
     kinds = [each["kind"] for each in tables]
@@ -82,7 +83,7 @@ def offer_path(target: Path, number: int) -> Path:
 
 
 class _Followed:
-    """A model, an estimator that believes in it, and how it fits."""
+    """A model, an estimator that uses it, and how well it fits."""
 
     def __init__(self, rig: Rig, name: str) -> None:
         self.rig, self.name = rig, name
@@ -90,7 +91,7 @@ class _Followed:
         self._monitor = FitMonitor()
         try:
             self._estimator = make_estimator(rig, "moments")
-        except EstimatorError:  # more spots than it takes; the centroids show less
+        except EstimatorError:  # more spots than `moments` takes; centroids show less of a misfit
             self._estimator = make_estimator(rig, "o1")
 
     def see(self, exposure: Exposure) -> None:
@@ -111,11 +112,11 @@ class Following:
     Parameters
     ----------
     wanted:
-        What a new model is made of; the plant is taken as known.
+        The kinds of a new model; the plant is taken as known.
     target:
         The file of the first offer.
     tell:
-        Told how far a fit is.
+        Called with the progress of a fit.
 
     Raises
     ------
@@ -134,13 +135,15 @@ class Following:
         self._unfitted: list[Exposure]
         """The exposures since the models no longer fit."""
         self._result: Result | None
-        """What was fitted to the first of them, and waits for its judgement."""
+        """The model that was fitted to the first of them, and waits for its judgement."""
         self._missed: bool
-        """Whether there are such. That ends where a model has fitted for so long that it is judged by others only."""
+        """Whether the models miss exposures. This ends once a model has fitted for so long that its judgement depends
+        on new exposures only."""
         self._agreed = 0
         """Exposures in a row after which a model fitted."""
         self._said, self._said_missed = 0, False
-        """Number of exposures at the last line that said how the models fit, and whether one was missing."""
+        """Number of exposures at the last line of output about the models' fit, and whether the models missed them
+        then."""
         self._begin()
 
     def see(self, exposure: Exposure) -> Iterator[News | Offer]:
@@ -165,7 +168,7 @@ class Following:
             yield News(frame_id=exposure.frame_id, fits=fitting is not None, text=text)
         if explained:
             return
-        # Before the first judgement as well: if nothing fits then, these are what is to be explained.
+        # They are kept before the first judgement as well: if no model fits then, a new one is fitted to them.
         self._unfitted.append(exposure)
         if not self._missed:
             del self._unfitted[:-FITTED]
@@ -177,7 +180,7 @@ class Following:
             yield News(frame_id=exposure.frame_id, fits=None, text=f"no new model: {error}")
 
     def _begin(self) -> None:
-        """There is nothing to be explained."""
+        """Forget the exposures that no model fits."""
         self._unfitted, self._result, self._missed = [], None, False
 
     def _fit(self, frame_id: int) -> Iterator[News | Offer]:
@@ -190,7 +193,7 @@ class Following:
             self._begin()
 
     def _judge(self, frame_id: int, result: Result) -> News | Offer:
-        """An offer, if what was held out is likelier by the new model than by those before."""
+        """An offer, if the exposures held out have a higher likelihood by the new model than by the earlier ones."""
         exposures = self._unfitted
         seen = readings(self._rig, exposures)
         first = exposures[FITTED].first_step - exposures[0].first_step
@@ -220,7 +223,7 @@ class Following:
 
 
 def _log_likelihood(rig: Rig, seen: Readings) -> float:
-    """Log-likelihood of readings by a rig file's model, nats; -inf where nothing disturbs by it."""
+    """Log-likelihood of readings by a rig file's model, nats; -inf where that model has no disturbance."""
     per_copy = rig.plant.n_outputs
     try:
         return sum(

@@ -1,4 +1,5 @@
-"""The job of `aolink identify`: recordings of blurred frames into a rig file with a model of what disturbs."""
+"""The job of `aolink identify`: it makes a rig file with a model of the disturbance from recordings of blurred
+frames."""
 
 from __future__ import annotations
 
@@ -30,17 +31,17 @@ from aolink.recording.reestimate import check_has_exposures
 from aolink.rig import Rig
 
 _MOST_OUTPUTS = 24
-"""Outputs that a model is fitted to; of more, as many at equal distances."""
+"""The most outputs that a model is fitted to; from more outputs, as many are taken at equal distances."""
 _APART = 2
-"""Up to so many outputs of a copy of the plant have a model each; more have one for all."""
+"""Up to this many outputs of a copy of the plant have a model each; more outputs share one."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Wanted:
-    """What is to be identified."""
+    """The quantities to identify."""
 
     models: tuple[str, ...] = CANDIDATES
-    """Sums of kinds to choose from; one is taken as it is."""
+    """Sums of kinds to choose from; a single one is taken without a choice."""
     plant: str | None = None
     """Kind of the plant, where it is fitted as well."""
     noise: bool = False
@@ -52,7 +53,7 @@ class Wanted:
 
 @dataclass(frozen=True, kw_only=True)
 class Found:
-    """What was identified of one output, or of all that share a model."""
+    """The identified model of one output, or of all outputs that share it."""
 
     output: str
     model: ProcessSum
@@ -62,7 +63,7 @@ class Found:
     wider: float
     parameters: tuple[Identified, ...]
     tried: tuple[Tried, ...]
-    """Empty where one model was asked for."""
+    """The models that were tried; empty where one model was asked for."""
     log_likelihood: float
     exposures: int
     notes: tuple[str, ...]
@@ -77,18 +78,17 @@ class Result:
 
 
 Tell = Callable[[str, int, int], None]
-"""Told what is done, how many of it, of how many."""
+"""Called with the present task, how much of it is done, and how much there is."""
 
 
 def identify(recordings: Sequence[Recording], rig: Rig | None, wanted: Wanted, tell: Tell | None = None) -> Result:
-    """Identify from recordings of one rig; ``rig`` in the place of their own where given.
+    """Identify models from recordings of one rig; ``rig``, if given, takes the place of their own.
 
     Raises
     ------
     IdentificationError
-        They are of several rigs, too short, without pixels, or without inputs to identify a plant from.
-    RecordingError
-        One cannot be read.
+        The recordings are of several rigs, too short, without pixels, or without inputs to identify a plant from.
+        RecordingError A recording cannot be read.
     """
     for name in wanted.models:
         kinds_of(name)
@@ -109,7 +109,7 @@ def identify(recordings: Sequence[Recording], rig: Rig | None, wanted: Wanted, t
 
 
 def from_readings(rig: Rig, seen: Sequence[Readings], wanted: Wanted, tell: Tell | None = None) -> Result:
-    """As `identify`, from the readings of each recording."""
+    """Identify models as `identify` does, from the readings of each recording."""
     found = [_of_output(rig, label, each, wanted, tell) for label, each in _by_output(rig, seen)]
     one = found[0]
     if wanted.plant and len(found) > 1:
@@ -135,7 +135,7 @@ def _some(seen: Readings, which: Sequence[int]) -> Readings:
 
 
 def outputs_of(seen: Readings, which: Sequence[int]) -> list[int]:
-    """Which of some outputs a model is fitted to. Raises IdentificationError where none shows a spot."""
+    """The outputs among those given that a model is fitted to. Raises IdentificationError where none shows a spot."""
     seeing = [o for o in which if seen.usable[o].any()]
     if not seeing:
         raise IdentificationError("no exposure shows a spot of this output")

@@ -16,7 +16,7 @@ COLUMNS = (
     "nis", "nis_low", "nis_high", "start_nees", "end_nees", "nees_low", "nees_high", "not_ok", "nothing_measured",
     "seconds", "output", "damage", "error",
 )  # fmt: skip
-"""Columns of the table of recordings: one row for each recording, model and estimator; what is not known is empty."""
+"""Columns of the table of recordings: one row for each recording, model and estimator; unknown values are empty."""
 EXPOSURE_COLUMNS = (
     "recording", "model", "estimator", "frame_id", "time_ns", "first_step", "status", "reason", "nis", "nis_degrees",
     "path_rms", "path_sd", "path_rmse", "start_rmse", "end_rmse",
@@ -50,10 +50,9 @@ def fill_table(partial: Path, rows: Sequence[Mapping[str, Any]], suffix: str) ->
 
 @contextmanager
 def rows_into(path: Path | None, job: str) -> Iterator[Callable[[Mapping[str, Any]], None]]:
-    """Gives what takes the rows of a table of exposures, by `EXPOSURE_COLUMNS`, some thousands of them in memory.
-
-    The table has its name, and the digest of its ``job`` in its metadata, when the block has ended well. Without a
-    path there is none. Raises AolinkError where it cannot be written or pyarrow is missing.
+    """A context that gives a function for the rows of a table of exposures, by `EXPOSURE_COLUMNS`; some thousands of
+    them are kept in memory. The table has its name, and the digest of its ``job`` in its metadata, when the block has
+    ended well. Without a path there is none. Raises AolinkError where it cannot be written or pyarrow is missing.
     """
     if path is None:
         yield lambda row: None
@@ -82,7 +81,7 @@ def join_tables(parts: Sequence[Path], path: Path) -> None:
     Raises
     ------
     AolinkError
-        It cannot be written, or a part is no such table.
+        The table cannot be written, or a part is not such a table.
     """
     _, pq = parquet()
     schema = _schema(EXPOSURE_COLUMNS)
@@ -122,7 +121,7 @@ def parquet() -> tuple[Any, Any]:
 
 
 def _schema(columns: Sequence[str]) -> Any:
-    """One for all tables, also for those in which a column is empty: they can be read as one."""
+    """One schema for all tables, also for those in which a column is empty, so that they can be read as one."""
     pa, _ = parquet()
     return pa.schema(
         [(each, pa.string() if each in _TEXTS else pa.int64() if each in _WHOLE else pa.float64()) for each in columns]

@@ -33,9 +33,9 @@ class Model:
     """The rig that recordings are estimated with: their own, or another, with some values changed."""
 
     name: str = ""
-    """The other rig's name and what was changed; empty for the recording's own."""
+    """The other rig's name and the changed values; empty for the recording's own rig."""
     rig_text: str | None = None
-    """Instead of the rig file in the recording."""
+    """Text of a rig file to use instead of the one in the recording; None for the latter."""
     changes: tuple[tuple[str, Any], ...] = ()
     """Dotted keys of the rig file, with their new values."""
 
@@ -50,7 +50,7 @@ class Model:
         return text
 
     def applied_to(self, recording: Recording) -> Recording:
-        """The same recording to be estimated with this model. Raises RigError where that cannot be."""
+        """The same recording, to be estimated with this model. Raises RigError where this is not possible."""
         text = self.text_for(recording.rig.toml)
         return recording if text == recording.rig.toml else Recording(recording.path, rig=parse_rig(text))
 
@@ -60,21 +60,22 @@ class Settings:
     """How a recording is estimated: plain data, which can be pickled."""
 
     estimator: str = "o3"
-    """One of `aolink.estimation.ESTIMATOR_NAMES`."""
+    """The estimator, one of `aolink.estimation.ESTIMATOR_NAMES`."""
     model: Model = Model()
-    """The recording's own rig, if nothing else is said."""
+    """The model, by default the recording's own rig."""
     engine: Engine = "aolink"
     table: bool = False
-    """Write a table in Parquet too, with a row for each exposure: a file of the side file's name that ends with
-    ``.parquet``. Its columns are those of `exposure_row`."""
+    """Whether to write a table in Parquet too, with a row for each exposure: a file of the side file's name that ends
+    with ``.parquet``. Its columns are those of `exposure_row`."""
     overwrite: bool = False
-    """Estimate again what was done before, and replace a file of that name that is no side file."""
+    """Whether to estimate again a recording that was done before, and to replace a file of that name that is not a side
+    file."""
 
 
 def estimate_file(url: str | Path, out: str | Path, settings: Settings | None = None) -> dict[str, Any]:
     """Estimate one recording and write a side file: its estimates alone, which refer to the recording.
 
-    What was done before with the same recording, settings and version of aolink is not done again. The recording is
+    A recording that was done before with the same settings and version of aolink is not done again. The recording is
     read once from its start to its end. Several processes may call this at the same time, on any machines that share
     the folder of ``out``; the file appears when it is whole.
 
@@ -90,7 +91,8 @@ def estimate_file(url: str | Path, out: str | Path, settings: Settings | None = 
 
     Returns
     -------
-    A row by `COLUMNS` of numbers and texts; what is not known is None. RMSE in slope units, ``seconds`` of this call.
+    A row by `COLUMNS` of numbers and texts; unknown values are None. RMSE is in slope units, ``seconds`` is the time of
+    this call.
 
     Raises
     ------
@@ -137,7 +139,7 @@ def estimated(url: str | Path, out: Path, settings: Settings) -> tuple[dict[str,
 
 
 def exposure_row(time_ns: int, exposure: Exposure, estimate: Estimate) -> dict[str, Any]:
-    """What the table of exposures has of one, besides recording, model and estimator.
+    """The row of an exposure in the table of exposures, without recording, model and estimator.
 
     ``time_ns`` is the log time. ``nis`` is the sum over the axes that were measured, and follows chi-square with
     ``nis_degrees`` degrees of freedom. In slope units: ``path_rms`` of the estimated path, ``path_sd`` of its standard
@@ -167,7 +169,7 @@ def _rms(values: np.ndarray[Any, np.dtype[np.float64]]) -> float:
 
 
 def _estimates(recording: Recording, settings: Settings) -> Iterator[tuple[int, Exposure, Estimate]]:
-    """Log times, exposures and their estimates."""
+    """Give log times, exposures and their estimates."""
     times: deque[int] = deque()
 
     def exposures() -> Iterator[Exposure]:
@@ -182,13 +184,13 @@ def _estimates(recording: Recording, settings: Settings) -> Iterator[tuple[int, 
         if settings.model == Model():
             raise
         raise EstimatorError(
-            f"{recording.path} cannot be estimated with this model: {error!r}; are its numbers meant?"
+            f"{recording.path} cannot be estimated with this model: {error!r}; are its numbers intended?"
         ) from None
 
 
 @lru_cache(maxsize=1)
 def aolink_version() -> str:
-    """The installed one, looked up once: that takes longer than to open a recording."""
+    """The installed version of aolink. It is found once, because that takes longer than opening a recording."""
     return version("aolink")
 
 
@@ -202,9 +204,8 @@ def _digest(recording: Recording, settings: Settings) -> str:
 
 
 def _row_before(out: Path, digest: str, settings: Settings) -> dict[str, Any] | None:
-    """The row of a side file that is there already; None if it is to be made.
-
-    Raises RecordingError where something else has the name.
+    """The row of a side file that is there already; None if it is to be made. Raises RecordingError where another file
+    has the name.
     """
     if not out.exists():
         return None
@@ -223,7 +224,7 @@ def _row_before(out: Path, digest: str, settings: Settings) -> dict[str, Any] | 
 
 
 def score_row(score: Score) -> dict[str, Any]:
-    """What a row of a table says of a score, by column; None for what is not known."""
+    """The values of a score in a row of a table, by column; unknown values are None."""
     values = {
         "path_rmse": score.path_rmse, "start_rmse": score.start_rmse, "end_rmse": score.end_rmse,
         "nis": score.nis.mean, "nis_low": score.nis.low, "nis_high": score.nis.high,

@@ -1,1 +1,1 @@
-"""Linear algebra of many small and of few large matrices, and the threads and processes that share the cores."""
+"""Linear algebra for many small and for a few large matrices, and the threads and processes that share the cores."""

@@ -1,4 +1,4 @@
-"""Small matrices, many at once, the batch axis first.
+"""Operations on many small matrices at once, with the batch axis first.
 
 The result for one matrix does not depend on how many there are, nor on the number of threads, bit for bit: sizes up to
 four are written out in elementwise operations, larger ones are one product each.
@@ -12,7 +12,7 @@ from aolink.numerics.arrays import FloatArray
 
 _WRITTEN_OUT = 4
 SMALL_PRODUCT = 100_000
-"""A product of matrices with so many multiplications is not shared among threads by any library."""
+"""No library shares a product of matrices with at most this many multiplications among threads."""
 
 
 def tile(matrix: FloatArray, axes: int) -> FloatArray:
@@ -75,7 +75,7 @@ def _sum_of_products(left: list[FloatArray], right: list[FloatArray]) -> FloatAr
 
 
 def mean_over_path(values: FloatArray) -> FloatArray:
-    """Mean over the fast steps, (..., n_steps) -> (...)."""
+    """Mean over the fast steps: (..., n_steps) gives (...)."""
     return np.asarray(np.add.reduce(np.ascontiguousarray(values), axis=-1) / values.shape[-1])
 
 

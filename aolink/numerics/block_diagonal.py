@@ -1,4 +1,4 @@
-"""Block-diagonal systems: a mirror's actuators are many small systems side by side, and most of them are alike."""
+"""Block-diagonal systems: a mirror's actuators are many small systems side by side, and most of them are equal."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from aolink.numerics.arrays import FloatArray, Indices
 
 _MANY = 10
-"""States of which a stationary covariance is not found by solving linear equations for its entries."""
+"""With this many states or more, a stationary covariance is not found by linear equations for its entries."""
 
 
 def components(*matrices: FloatArray) -> list[Indices]:
@@ -35,7 +35,7 @@ def components(*matrices: FloatArray) -> list[Indices]:
 def blockwise(
     function: Callable[..., tuple[FloatArray, ...]], matrices: tuple[FloatArray, ...], parts: list[Indices]
 ) -> tuple[FloatArray, ...]:
-    """Apply a function of square matrices to each component by itself, once to those that are alike."""
+    """Apply a function of square matrices to each component by itself, only once for equal ones."""
     if len(parts) == 1:
         return function(*matrices)
     known: dict[bytes, tuple[FloatArray, ...]] = {}
@@ -52,7 +52,7 @@ def blockwise(
 
 
 def alike(A: FloatArray, *columns: FloatArray) -> Indices | None:
-    """States of block-diagonal systems that are all the same, each with one column of its own in other matrices.
+    """States of block-diagonal systems that are all equal, each with one column of its own in other matrices.
 
     Returns
     -------
@@ -87,7 +87,7 @@ def stationary_covariance(A: FloatArray, Q: FloatArray) -> FloatArray:
 
 
 def eigenvalues(A: FloatArray, parts: list[Indices]) -> NDArray[np.complex128]:
-    """Eigenvalues of A, (k,), those of components that are alike only once."""
+    """Eigenvalues of A, (k,), those of equal components only once."""
     blocks = {block.tobytes(): block for block in (np.ascontiguousarray(A[np.ix_(part, part)]) for part in parts)}
     return np.concatenate([np.linalg.eigvals(block) for block in blocks.values()]).astype(np.complex128)
 

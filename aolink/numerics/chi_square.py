@@ -1,6 +1,6 @@
 """Quantiles of the chi-square distribution.
 
-SciPy has them, too, but takes a third of a second to load: too long where a recording is only looked at.
+SciPy has them, too, but takes a third of a second to load: too long where a recording is only viewed.
 """
 
 from __future__ import annotations
@@ -8,12 +8,12 @@ from __future__ import annotations
 import math
 
 _CLOSE = 1e-9
-"""A last step, over x: the one before was about its square root."""
+"""Relative size of the last step: the step before it was about its square root."""
 _ROUNDS = 100
 
 
 def chi_square_quantile(share: float, degrees: int) -> float:
-    """What a chi-square variable of so many degrees of freedom stays below with a probability of ``share``.
+    """The value below which a chi-square variable with a number of degrees of freedom stays with probability ``share``.
 
     Newton's iteration on the regularised incomplete gamma function, P(a, x) = share with a = degrees / 2: the quantile
     is 2 x.
@@ -34,7 +34,7 @@ def chi_square_quantile(share: float, degrees: int) -> float:
         step = (share - below) / density if density else math.inf
         if low <= x + step <= high:
             x += step
-        else:  # beyond what is known to contain the solution, which is halved instead, on a scale of ratios
+        else:  # the step leaves the interval of the solution, which is halved instead, as a ratio
             x = math.sqrt((low or 1e-6 * x) * high) if high < math.inf else 2 * x
         if abs(step) <= _CLOSE * x:
             break

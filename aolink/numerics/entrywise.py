@@ -1,4 +1,4 @@
-"""Matrices of one or two rows, many at once, as their entries: arithmetic written out.
+"""Operations on many matrices of one or two rows at once, entry by entry, with the arithmetic written out.
 
 An entry is an array with a value for each axis, or one number for all axes; with a single axis all are numbers, since
 NumPy would take ten times as long. Every operation is then one pass over arrays that lie in the processor's cache, and
@@ -20,7 +20,7 @@ Entry = FloatArray | float
 Matrix = list[list[Entry]]
 
 MOST_ROWS = 2
-"""Most rows or columns of a matrix that is worth doing entry by entry."""
+"""Most rows or columns of a matrix that is computed entry by entry."""
 
 
 def unpack(a: FloatArray) -> Matrix:

@@ -28,7 +28,8 @@ def _libraries() -> ThreadpoolController:
 
 
 class _ByOneThread(ContextDecorator):
-    """BLAS has one thread while anybody is inside. One at a time, for that number is the process's."""
+    """A context in which BLAS has one thread. One thread at a time may be inside, because that number is the
+    process's."""
 
     def __init__(self) -> None:
         self._lock = RLock()
@@ -68,7 +69,7 @@ def gram(a: FloatArray) -> FloatArray:
 
 @by_one_thread
 def congruence_one_thread(a: FloatArray, p: FloatArray) -> FloatArray:
-    """a p a' for a symmetric p, (m, n) and (n, n) -> (m, m); ``a`` is taken as sparse where few entries are not zero.
+    """a p a' for a symmetric p, (m, n) and (n, n) -> (m, m); ``a`` is treated as sparse where few entries are not zero.
 
     Rows of ``p`` at its end that are those of the identity cost next to nothing.
     """
@@ -91,7 +92,7 @@ def inverse_by_cholesky(a: FloatArray) -> FloatArray:
     Raises
     ------
     numpy.linalg.LinAlgError
-        It is not positive definite.
+        The matrix is not positive definite.
     """
     lower, _ = scipy.linalg.lapack.dpotri(_cholesky_factor(a), lower=1, overwrite_c=1)
     whole = lower + lower.T

@@ -1,7 +1,7 @@
 """Processes and threads that share the cores.
 
 A process of a pool has one thread for its linear algebra, so that numbers do not depend on how many cores there are.
-It ends with the process that made it, in whatever way that ends.
+It ends with the process that made it, however that ends.
 """
 
 from __future__ import annotations
@@ -34,7 +34,8 @@ _FOR_THE_PARENT = {signal.SIGINT, signal.SIGHUP}
 
 
 def in_threads(function: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
-    """A function of each item, on as many threads as this process has cores; for functions that release the GIL."""
+    """Apply a function to each item, on one thread for each core of this process; for functions that release the
+    GIL."""
     threads = min(thread_count(), len(items))
     if threads < 2:
         return [function(item) for item in items]
@@ -51,10 +52,9 @@ def thread_count() -> int:
 
 @contextmanager
 def processes(count: int) -> Iterator[ProcessPoolExecutor]:
-    """A pool of ``count`` processes, whose linear algebra has one thread. Ctrl-C is for this process alone.
-
-    Whatever is raised in the block ends the processes at once. They also end when this process does, even if it is
-    killed; what they are doing is given up in good order, so that nothing half written stays.
+    """A pool of ``count`` processes, whose linear algebra has one thread. Ctrl-C goes to this process alone. Any
+    exception in the block ends the processes at once. They also end when this process does, even if it is killed; their
+    work is then given up in good order, so that nothing half written stays.
     """
     environment = {name: os.environ.get(name) for name in THREAD_VARIABLES}
     os.environ.update(dict.fromkeys(THREAD_VARIABLES, "1"))
@@ -70,7 +70,7 @@ def processes(count: int) -> Iterator[ProcessPoolExecutor]:
                 _end(pool, calls)
                 raise
             else:
-                if pool._broken:  # a process that began while the pool broke would be waited for without end
+                if pool._broken:  # otherwise the pool would wait for ever for a process that began while the pool broke
                     _end(pool, calls)
             finally:
                 os.close(calls)
@@ -83,7 +83,7 @@ def processes(count: int) -> Iterator[ProcessPoolExecutor]:
 
 
 def end_with_parent() -> None:
-    """In a process that multiprocessing has started: end it on SIGTERM or when its parent is gone, in good order.
+    """Make this process, which multiprocessing has started, end in good order on SIGTERM or when its parent is gone.
 
     The standard library gives each child one end of a pipe that closes when the parent ends, however that comes about.
     """
@@ -99,13 +99,13 @@ def _watch_parent() -> None:
     parent = multiprocessing.parent_process()
     assert parent is not None
     parent.join()
-    os.kill(os.getpid(), signal.SIGTERM)  # heard by the main thread, which gives up what it is doing
+    os.kill(os.getpid(), signal.SIGTERM)  # the main thread handles it, and gives up its work
     time.sleep(_PATIENCE_S)
     os._exit(128 + signal.SIGTERM)
 
 
 class _Pool(ProcessPoolExecutor):
-    """A pool whose processes hear nothing that a terminal sends, from their first instant on."""
+    """A pool whose processes get no signal from a terminal, from their first instant on."""
 
     def submit(self, function: Callable[..., Any], /, *arguments: Any, **options: Any) -> Future[Any]:
         """Submit a call, which may start a process: that inherits which signals are blocked."""
@@ -115,7 +115,8 @@ class _Pool(ProcessPoolExecutor):
 
 @contextmanager
 def _unheard_by_children() -> Iterator[None]:
-    """Block what a terminal sends; a process that is started meanwhile never hears it, and this one a moment later."""
+    """Block a terminal's signals; a process that is started meanwhile never gets them, and this one gets them a moment
+    later."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, _FOR_THE_PARENT)
     try:
         yield

@@ -1,6 +1,5 @@
-"""The camera as an integer device: densities become counts and counts become densities.
-
-A pixel's size D is its length on a line of pixels, and its area on a plane of them.
+"""The camera as an integer device: densities become counts and counts become densities. A pixel's size D is its length
+on a line sensor, and its area on a plane.
 """
 
 from __future__ import annotations

@@ -17,8 +17,8 @@ def centre_of_gravity(windows: FloatArray, threshold: FloatArray | float = 0.0) 
     Parameters
     ----------
     threshold:
-        Subtracted from each window, of which only what is above zero then counts; one for all or (n,). At zero all
-        pixels count, those of negative noise as well, so that the noise's mean stays zero.
+        Threshold that is subtracted from each window, after which only values above zero count; one for all windows or
+        (n,). With zero all pixels count, negative ones as well, so that the noise's mean stays zero.
     """
     if np.any(threshold):
         windows = np.maximum(windows - np.broadcast_to(threshold, len(windows))[:, None, None], 0.0)
@@ -66,7 +66,7 @@ def correlation_centroid(windows: FloatArray, template: FloatArray, iterations: 
     template:
         An image of the spot, without background, no larger than a window, (rows, columns).
     """
-    rows, columns = (2 * n for n in windows.shape[1:])  # so that nothing comes round the edge
+    rows, columns = (2 * n for n in windows.shape[1:])  # so that the correlation is not periodic
     product = np.fft.fft2(windows, (rows, columns)) * np.fft.fft2(template, (rows, columns)).conj()
     correlation = np.fft.ifft2(product).real.reshape(len(windows), -1)
     best = correlation.argmax(axis=1)
@@ -84,7 +84,7 @@ def correlation_centroid(windows: FloatArray, template: FloatArray, iterations: 
         xx, yy = -(by_x * k_x**2).sum(axis=1).real, -(by_y * k_y**2).sum(axis=1).real
         xy = -((waves @ k_x) @ k_y).real
         determinant = xx * yy - xy**2
-        uphill = (determinant > 0) & (xx < 0)  # at a maximum's foot: elsewhere Newton's step leads away
+        uphill = (determinant > 0) & (xx < 0)  # near a maximum: elsewhere Newton's step leads away from it
         safe = np.where(uphill, determinant, 1.0)
         step = np.stack([yy * gradient[:, 0] - xy * gradient[:, 1], xx * gradient[:, 1] - xy * gradient[:, 0]], 1)
         shift = np.clip(shift - np.where(uphill, 1 / safe, 0.0)[:, None] * step, start - 1, start + 1)

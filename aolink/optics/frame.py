@@ -1,4 +1,4 @@
-"""Whole frames of an exposure, without noise: a line of pixels, or a spot in each of many windows."""
+"""Whole frames of an exposure, without noise: those of a line sensor, or a spot in each of many windows."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def frame_density(sensor: BaseSensor, path: FloatArray) -> FloatArray:
 
     Returns
     -------
-    (rows, columns); the spot of a lenslet that is lit in part has that share of the light.
+    Densities, (rows, columns); the spot of a partly lit lenslet has that share of the light.
     """
     edges = sensor.profile.edges
     if sensor.directions == 1:
@@ -66,8 +66,8 @@ def spot_windows(sensor: BaseSensor, frame: NDArray[Scalar]) -> NDArray[Scalar]:
 def spots_density(kernel: Kernel, edges: FloatArray, path: FloatArray) -> FloatArray:
     """Mean density in the pixels of one square window for each spot.
 
-    (1/N) sum_i of the round kernel integrated over each pixel: the kernel is a product of its two directions,
-    so the sum over the fast steps is one matrix product of their masses.
+    The density is (1/N) sum_i of the round kernel integrated over each pixel: the kernel is a product of its two
+    directions, so the sum over the fast steps is one matrix product of their masses.
 
     Parameters
     ----------
@@ -91,7 +91,8 @@ def spots_density(kernel: Kernel, edges: FloatArray, path: FloatArray) -> FloatA
 
 
 def _masses(kernel: Kernel, edges: FloatArray, positions: FloatArray) -> FloatArray:
-    """`pixel_mass` to 2e-9, five times as fast: a table of it and its derivatives, expanded to the second order."""
+    """The masses of `pixel_mass` to 2e-9, five times as fast: a table of them and their derivatives, expanded to the
+    second order."""
     if _table_rows(kernel.sigma, edges) * (len(edges) - 1) > _LARGEST_TABLE:
         return pixel_mass(kernel, edges, positions)
     mass, first, second = _mass_table(kernel.sigma, tuple(edges.tolist()))

@@ -46,7 +46,8 @@ def read_frame(path: str | Path) -> FloatArray:
 
 
 def read_fits(path: Path, error: type[AolinkError]) -> bytes:
-    """The bytes of a FITS file without its compression; raises ``error`` for a file that is no file or very large."""
+    """The bytes of a FITS file without its compression; raises ``error`` for a path that is not a plain file, and for a
+    very large file."""
     with path.open("rb") as file:
         if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
             raise error(f"{path} is a pipe or a device: copy what it gives into a file")
@@ -82,7 +83,7 @@ def parse_fits_array(data: bytes) -> tuple[dict[str, str], NDArray[Any], float, 
     Raises
     ------
     FrameError
-        It is not such a file.
+        The data are not a FITS file.
     """
     if not data[:9] == b"SIMPLE  =":
         raise FrameError("it is not a FITS file: it does not begin with SIMPLE")

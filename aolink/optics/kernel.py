@@ -1,6 +1,5 @@
-"""The image kernel as pixels see it: integrated over them, averaged over an exposure.
-
-All integrals of a Gaussian up to an edge or over a pixel come from here; the compiled loops have a twin of their own.
+"""The image kernel integrated over pixels, and averaged over an exposure. All integrals of a Gaussian up to an edge or
+over a pixel come from here; the compiled loops have a copy of their own.
 """
 
 from __future__ import annotations
@@ -99,10 +98,10 @@ def exposure_density(kernel: Kernel, edges: FloatArray, path: FloatArray) -> Flo
 
 
 def kernel_moments(kernel: Kernel, pixel_width: float, highest: int) -> FloatArray:
-    """Moments of a resting spot about its position, as sums over pixel centres find them, (highest + 1,).
+    """Moments of a resting spot about its position, as sums over pixel centres give them, (highest + 1,).
 
     The kernel and a pixel's width add like independent variables, so the second one is
-    var(Psi) + D^2/12; what is left out is the aliasing of a kernel much narrower than a pixel.
+    var(Psi) + D^2/12; the aliasing of a kernel much narrower than a pixel is left out.
     """
     orders = np.arange(highest + 1)
     even = orders % 2 == 0

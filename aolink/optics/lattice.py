@@ -44,9 +44,9 @@ _ANGLE: dict[Kind, float] = {"square": math.pi / 2, "hexagonal": math.pi / 3}
 _NEIGHBOURS, _ASKED, _STEPS, _GUESSES = 24, 400, 16, 6
 # How often a lattice is fitted anew to the spots that lie on it, each time further out.
 _ROUNDS = 12
-# A guessed step and a difference of two spots are alike if they differ by less than this share of the step.
+# A guessed step and a difference of two spots count as equal if they differ by less than this share of the step.
 _ALIKE = 0.15
-# A maximum less bright than this share of the spots' median is a ring or a ghost, no rival that must be explained.
+# A maximum less bright than this share of the spots' median is a ring or a ghost, which the lattice need not explain.
 _RIVAL = 0.25
 # A lattice that explains this share of the maxima is taken at once; below it, other scales may show a better one.
 _CONVINCING = 0.8
@@ -74,9 +74,9 @@ class Lattice:
     kind: Kind
     origin: FloatArray
     column_step: FloatArray
-    """From a spot to the next one along the row, (2,)."""
+    """Step from a spot to the next one along the row, (2,)."""
     row_step: FloatArray
-    """From a spot to the one in the next row, (2,)."""
+    """Step from a spot to the one in the next row, (2,)."""
     nodes: IntArray
     """Column i and row j of each spot, from 0, (n, 2), in the order of rows."""
     spots: FloatArray
@@ -106,7 +106,7 @@ class Lattice:
 
     @property
     def lit(self) -> BoolArray:
-        """Which nodes have a spot, `shape`."""
+        """Mask of the nodes that have a spot, of shape `shape`."""
         lit = np.zeros(self.shape, dtype=np.bool_)
         lit[self.nodes[:, 1], self.nodes[:, 0]] = True
         return lit
@@ -117,7 +117,7 @@ class Lattice:
 
     @property
     def displacements(self) -> FloatArray:
-        """From each spot's node to the spot, pixels, (n, 2)."""
+        """Displacement from each spot's node to the spot, pixels, (n, 2)."""
         return self.spots - self.node_positions(self.nodes)
 
     @property
@@ -138,7 +138,7 @@ class Lattice:
 def find_lattice(frame: NDArray[np.generic]) -> Lattice:
     """Find the spots of a Shack-Hartmann frame and the square or hexagonal lattice that they lie on.
 
-    Background and single hot pixels are taken out, and maxima above the noise are found. The differences between
+    Background and single hot pixels are removed, and maxima above the noise are found. The differences between
     neighbouring maxima suggest lattices; each one is followed from spot to spot over the largest connected group, and
     from there to all other spots that lie on its nodes. The lattice that explains most spots is taken. Spots may be
     missing anywhere, and the groups that remain need not touch.
@@ -151,7 +151,7 @@ def find_lattice(frame: NDArray[np.generic]) -> Lattice:
     Raises
     ------
     FrameError
-        There are no spots, or they lie on no lattice.
+        There are no spots, or they do not lie on a lattice.
     """
     flat, background = flatten(frame)
     most, rejected = 0, ""
@@ -183,7 +183,8 @@ def find_lattice(frame: NDArray[np.generic]) -> Lattice:
 
 
 def _explain(maxima: Maxima, background: float) -> tuple[float, Lattice]:
-    """The lattice that explains most of the maxima, which are its spots, and their share among those as bright."""
+    """The lattice that explains most of the maxima, which are its spots, and the share of these among the maxima of
+    their brightness."""
     followed = [_follow(kind, steps, maxima, background) for kind, steps in _guesses(maxima.places)]
     best = max((lattice for lattice in followed if lattice), key=lambda each: len(each.spots), default=None)
     if best is None:
@@ -218,11 +219,11 @@ def _guesses(places: FloatArray) -> list[tuple[Kind, FloatArray]]:
             moves = _MOVES[kind] @ pair
             support = int(np.min(tree.query_ball_point(moves, _ALIKE * np.linalg.norm(step), return_length=True)))
             found.append((support, float(np.linalg.norm(step)), kind, pair))
-            # Differences like this step, or like what the lattice's symmetry makes of it, suggest nothing new.
+            # Differences like this step, or like its images under the lattice's symmetry, suggest nothing new.
             for quarter in range(round(2 * math.pi / angle)):
                 votes[tree.query_ball_point(step @ _turned(quarter * angle), radius)] = 0
     most = max((support for support, *_ in found), default=0)
-    # Twice a step is common as well: of those with good support the shortest come first.
+    # Twice a step is common as well: among those with good support the shortest come first.
     found.sort(key=lambda guess: (guess[0] < 0.6 * most, guess[1]))
     return [(kind, pair) for support, _, kind, pair in found[:_GUESSES] if support > 0]
 
@@ -244,7 +245,7 @@ def _pitch(kind: Kind, steps: FloatArray) -> float:
 
 
 def _regular(lattice: Lattice) -> bool:
-    """Whether the steps are about as long and as far apart in angle as the kind has them."""
+    """Whether the steps have about the lengths and the angle of the kind of lattice."""
     column, row = lattice.steps
     ideal = column @ _turned(_ANGLE[lattice.kind])
     return bool(np.linalg.norm(row - ideal) < _IRREGULAR * np.linalg.norm(column))
@@ -261,7 +262,7 @@ def _follow(kind: Kind, steps: FloatArray, maxima: Maxima, background: float) ->
 def _grow(lattice: Lattice, maxima: Maxima) -> Lattice | None:
     """The lattice with all maxima that lie on it, round by round, or None where they bend it out of shape."""
     for _ in range(_ROUNDS):
-        # From the spots that are known the lattice reaches as far again: further out its nodes are not known yet.
+        # The lattice is extended by its present size about the known spots: further out its nodes are not known yet.
         middle = lattice.spots.mean(axis=0)
         extent = np.linalg.norm(lattice.spots - middle, axis=1).max()
         reached = np.asarray(np.linalg.norm(maxima.places - middle, axis=1) < 2 * extent)
@@ -278,7 +279,7 @@ def _grow(lattice: Lattice, maxima: Maxima) -> Lattice | None:
 def _bend(lattice: Lattice, maxima: Maxima) -> Lattice:
     """The lattice with the maxima that lie on it where it bends, as an aberrated wavefront makes it.
 
-    A polynomial of the third degree of a maximum's position tells which node it belongs to.
+    A polynomial of the third degree of a maximum's position gives the node that it belongs to.
     """
     for _ in range(_ROUNDS):
         before, spots = lattice, lattice.spots
@@ -294,7 +295,8 @@ def _bend(lattice: Lattice, maxima: Maxima) -> Lattice:
 
 
 def _assign(lattice: Lattice, maxima: Maxima, fine: FloatArray, reached: BoolArray) -> Lattice | None:
-    """The lattice of those maxima whose places in steps, ``fine`` (n, 2), are near a node, the brightest of each."""
+    """The lattice of those maxima whose places in steps, ``fine`` (n, 2), are near a node; the brightest at each node
+    is taken."""
     nodes = np.rint(fine).astype(np.int64)
     near = np.flatnonzero(reached & (np.linalg.norm((fine - nodes) @ lattice.steps, axis=1) < _NEAR * lattice.pitch))
     near = near[np.argsort(-maxima.heights[near], kind="stable")]
@@ -347,7 +349,7 @@ def _look_again(lattice: Lattice, flat: FloatArray) -> Lattice:
 
 
 def _refuse_veiled(lattice: Lattice, flat: FloatArray, background: FloatArray) -> None:
-    """Raise `FrameError` where blurred spots have more light between them than they stand out by."""
+    """Raise `FrameError` where the light between blurred spots exceeds their height above it."""
     x, y = np.rint(lattice.spots).astype(np.int64).T
     height = float(np.median(flat[y, x]))
     veil = float(np.median(background[y, x]) - np.quantile(background, _DARKEST))
@@ -412,15 +414,15 @@ def _fit(kind: Kind, spots: FloatArray, nodes: IntArray, background: float) -> L
 def match(lattice: Lattice, reference: Lattice) -> Lattice:
     """The lattice with its nodes counted as the reference counts them, and the spots that both have.
 
-    Spots correspond up to a whole step of the lattice: the step is taken that moves the spots least.
+    Spots correspond up to whole steps of the lattice: the correspondence that moves the spots least is taken.
 
     Raises
     ------
     FrameError
-        The two are not of one instrument, or share too few spots.
+        The two lattices do not belong to one instrument, or share too few spots.
     """
     back = np.linalg.inv(reference.steps)
-    # The two may have called different ones of a lattice's directions its rows: 44 and -46 degrees are one square grid.
+    # The two may have chosen different directions of a lattice as its rows: 44 and -46 degrees are one square grid.
     turn = np.rint(lattice.steps @ back)
     moved = np.linalg.norm(lattice.steps - turn @ reference.steps, axis=1) / reference.pitch
     if lattice.kind != reference.kind or abs(np.linalg.det(turn) - 1) > 1e-9 or moved.max() > _FOREIGN:

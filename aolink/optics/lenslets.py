@@ -29,7 +29,7 @@ class Lenslets:
     pitch_m: float
     """Side of a lenslet, m."""
     focal_length_m: float
-    """From the lenslets to the camera, m."""
+    """Distance from the lenslets to the camera, m."""
     pupil_diameter_m: float | None = None
     """Diameter of the round pupil, centred on the grid, m; None where the light covers the whole grid."""
     obstruction: float = 0.0
@@ -70,7 +70,7 @@ class Lenslets:
         return self.pitch_m * ((np.arange(per_side) + 0.5) / per_side - 0.5)
 
     def lit_part(self, spot: int, per_side: int = _EDGE_POINTS) -> BoolArray:
-        """Which of a lenslet's evenly spaced points are in the pupil, (per_side, per_side), y before x."""
+        """Mask of a lenslet's evenly spaced points that are in the pupil, (per_side, per_side), y before x."""
         points = self.centres_m[spot] + _square(self.offsets_m(per_side))
         return self.is_lit(points).reshape(per_side, per_side)
 
@@ -80,11 +80,11 @@ class Lenslets:
         Parameters
         ----------
         gradient:
-            From points (..., 2), m, to gradients (..., 2, *more): of one wavefront, or of many at once.
+            Function from points (..., 2), m, to gradients (..., 2, *more), of one wavefront or of many at once.
 
         Returns
         -------
-        (spots, 2, *more); NaN for lenslets in the dark.
+        Slopes, (spots, 2, *more); NaN for lenslets in the dark.
         """
         nodes, weights = np.polynomial.legendre.leggauss(_SMOOTH_POINTS)
         smooth, smooth_weight = _square(nodes * self.pitch_m / 2), np.outer(weights, weights).ravel() / 4

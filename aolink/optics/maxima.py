@@ -33,16 +33,16 @@ _SCALES = (1.5, 3.0, 6.0, 0.75)
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Maxima:
-    """Maxima of a smoothed frame that stand out of its noise."""
+    """Maxima of a smoothed frame that exceed its noise."""
 
     places: FloatArray
-    """(n, 2) as (x, y), pixels."""
+    """Positions (x, y), pixels, (n, 2)."""
     heights: FloatArray
     """Value of the smoothed frame there, counts above the background, (n,)."""
     scale: float
     """Standard deviation of the Gaussian that the frame was smoothed by, pixels."""
     dense: bool
-    """Whether they stand out of the pixels' noise only, not of the spread of the whole frame."""
+    """Whether they exceed the pixels' noise only, and not the spread of the whole frame."""
 
 
 def flatten(frame: NDArray[np.generic]) -> tuple[FloatArray, FloatArray]:
@@ -83,7 +83,7 @@ def find_maxima(flat: FloatArray) -> Iterator[Maxima]:
     """The maxima of a flattened frame for several widths of smoothing and two estimates of its noise, one at a time.
 
     Where most pixels are dark, the noise is the standard deviation of all pixels. Where spots stand close together that
-    is the spots' own, and the noise is estimated from second differences from pixel to pixel.
+    would be the spots' own spread, so the noise is estimated from second differences from pixel to pixel.
     """
     for scale in _SCALES:
         smooth = ndimage.gaussian_filter(flat, scale)
@@ -120,7 +120,7 @@ def maxima_above(
 ) -> Maxima:
     """Maxima of a frame smoothed by a Gaussian of sd ``scale`` that are far above its ``noise``.
 
-    ``dark`` is the smoothed frame's level without spots, which is above zero where a camera cuts its noise off below.
+    ``dark`` is the smoothed frame's level without spots, which is above zero where a camera clips its noise at zero.
     """
     smooth = smooth - dark
     at_top = smooth == ndimage.maximum_filter(smooth, 2 * math.ceil(2 * scale) + 1)
@@ -145,10 +145,10 @@ def spread(values: FloatArray) -> float:
 def refine(flat: FloatArray, places: FloatArray, pitch: float) -> FloatArray:
     """Each spot's weighted centroid, pixels, (n, 2); the weight's width is that of the spots.
 
-    A centroid that leaves its maximum by more than a quarter of the pitch is not taken.
+    A centroid further than a quarter of the pitch from its maximum is not used.
     """
     windows, corners = cut_windows(flat, places, _half(pitch))
-    # A wider weight sees the spots beside this one.
+    # A wider weight would include neighbouring spots.
     weight_sd = min(1.5 * spot_sd(flat, places, pitch), pitch / 6)
     found = corners + weighted_centroid(windows, weight_sd, start=places - corners)
     moved = np.linalg.norm(found - places, axis=1) < pitch / 4
@@ -163,7 +163,7 @@ def likeness(flat: FloatArray, places: FloatArray, models: FloatArray, pitch: fl
     sd = spot_sd(flat, models, pitch)
     half = min(math.ceil(3 * sd), _half(pitch))
     y, x = np.mgrid[-half : half + 1, -half : half + 1]
-    weight = np.exp(-(x**2 + y**2) / (2 * (1.5 * sd) ** 2))  # little of the spots beside it
+    weight = np.exp(-(x**2 + y**2) / (2 * (1.5 * sd) ** 2))  # it has little light of neighbouring spots
     weight /= weight.sum()
 
     def even(windows: FloatArray) -> FloatArray:
@@ -171,7 +171,7 @@ def likeness(flat: FloatArray, places: FloatArray, models: FloatArray, pitch: fl
 
     model = even(_median_spot(cut_windows(flat, models, half)[0]))
     best = np.zeros(len(places))
-    # A spot between two pixels may be in either one's window: the models' is the pixel beside it, perhaps.
+    # A spot between two pixels may be centred on either: the models may be centred on the other pixel.
     for shift in np.ndindex(3, 3):
         windows = even(cut_windows(flat, places + np.array(shift) - 1, half)[0])
         power = (weight * windows**2).sum(axis=(1, 2)) * (weight * model**2).sum()

@@ -44,7 +44,7 @@ class Membrane:
 
         Returns
         -------
-        m/Pa, (..., actuators); towards the actuators is positive.
+        Deflections, m/Pa, (..., actuators), positive towards the actuators.
         """
         z, source, pad = self._scaled(points_m)
         away = np.abs(z - source)
@@ -121,7 +121,7 @@ def second_order(frequency_hz: float, damping: float, fast_step_s: float) -> tup
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class MirrorPlant:
-    """A_f, B_f, B_w and C_f of a mirror, Mishra & Wen (1)."""
+    """The matrices A_f, B_f, B_w and C_f of a mirror, Mishra & Wen (1)."""
 
     A: FloatArray
     B: FloatArray
@@ -132,7 +132,7 @@ class MirrorPlant:
 def mirror_plant(
     slopes: FloatArray, dynamics: tuple[FloatArray, FloatArray], drift_per_step: float | None = None
 ) -> MirrorPlant:
-    """A mirror whose every actuator has the same dynamics.
+    """A mirror whose actuators all have the same dynamics.
 
     The states are the inputs as the mirror follows them. Actuators are coupled by their influence functions (in C), not
     in their dynamics: A is block diagonal, and a mirror of a thousand actuators can be computed.
@@ -140,7 +140,7 @@ def mirror_plant(
     Parameters
     ----------
     slopes:
-        Slopes for each input, at rest, (outputs, inputs): of the deflection that the actuators make together.
+        Slopes for each input, at rest, (outputs, inputs), from the deflection that the actuators make together.
     dynamics:
         A (n, n) and B (n, 1) of one actuator, whose first state follows its input with unit gain.
     drift_per_step:

@@ -1,4 +1,4 @@
-"""Single pictures and PSFs as files."""
+"""Files of single pictures and PSFs."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def opened_image(source: Path | IO[bytes], error: type[AolinkError]) -> Iterator
     """An image of Pillow's, whose pixels are not read yet; raises ``error`` for one with more than the limit's."""
     from PIL import Image
 
-    with warnings.catch_warnings():  # Pillow's own limits are others
+    with warnings.catch_warnings():  # Pillow has other limits of its own
         warnings.simplefilter("ignore", Image.DecompressionBombWarning)
         try:
             image = Image.open(source)
@@ -70,7 +70,8 @@ def image_pixels(image: Image.Image) -> NDArray[Any]:
 
 
 def finite_pixels(picture: NDArray[Any]) -> BoolArray | None:
-    """Where a picture (rows, columns, any colours) holds numbers, (rows, columns); None where it does everywhere."""
+    """Mask of the pixels of a picture (rows, columns, any colours) that are finite, (rows, columns); None where all
+    are."""
     if picture.dtype.kind != "f" or picture.ndim not in (2, 3):
         return None
     finite = np.isfinite(picture).reshape(*picture.shape[:2], -1).all(axis=2)
@@ -102,7 +103,7 @@ def write_picture(path: Path, picture: NDArray[Any], *, overwrite: bool = False,
 
 
 def _format(path: Path) -> str:
-    """Pillow's word for the kind of file that a name asks for. Raises ValueError."""
+    """Pillow's name of the format for a file name. Raises ValueError."""
     from PIL import Image
 
     kind = Image.registered_extensions().get(path.suffix.lower())

@@ -13,7 +13,7 @@ from aolink.numerics.arrays import FloatArray
 from aolink.optics.kernel import pixel_masses
 
 _QUADRATURE = np.polynomial.legendre.leggauss(8)
-# Mehler's series of a kernel that couples the two directions is cut where its terms are below this.
+# Mehler's series of a kernel that couples the two directions is truncated where its terms are below this.
 _SERIES = 1e-6
 _MOST_TERMS = 30
 
@@ -23,7 +23,7 @@ def pixel_mass_2d(
 ) -> FloatArray:
     """Share of a resting spot's light that each pixel gets.
 
-    Along x by quadrature within each column, along y given x by error functions.
+    It is computed along x by quadrature within each column, and along y given x by error functions.
 
     Parameters
     ----------
@@ -72,7 +72,7 @@ def exposure_density_2d(
 
 
 def kernel_moments_2d(covariance: FloatArray, pixel: tuple[float, float], highest: int) -> FloatArray:
-    """E[x^p y^q] of a resting spot about its position, as sums over pixel centres find it, by p and q.
+    """Moments E[x^p y^q] of a resting spot about its position, as sums over pixel centres give them, by p and q.
 
     Parameters
     ----------
@@ -107,7 +107,8 @@ def kernel_moments_2d(covariance: FloatArray, pixel: tuple[float, float], highes
 
 
 def mehler_series(kernel: FloatArray) -> list[float]:
-    """Terms c^j / j! of Mehler's series that matter, c the covariance of the two directions in ``kernel`` (2, 2)."""
+    """Terms c^j / j! of Mehler's series that are not negligible, with c the covariance of the two directions in
+    ``kernel`` (2, 2)."""
     (xx, xy), (_, yy) = kernel
     rho = abs(xy) / math.sqrt(xx * yy)
     count = 1 if rho == 0 else min(_MOST_TERMS, math.ceil(math.log(_SERIES) / math.log(rho)))

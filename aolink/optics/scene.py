@@ -1,4 +1,4 @@
-"""A second, picture sensor that shares the spot's exposure: a scene that the same mirror moves.
+"""The picture sensor, a second sensor that shares the spot's exposure and sees a scene that the same mirror moves.
 
 An intensity of one is the brightest that a picture file of whole numbers can hold, and 0 is dark.
 """
@@ -55,27 +55,27 @@ class SceneSensor:
 
 
 def scene_motion(n_outputs: int) -> FloatArray:
-    """How the scene moves with the spots: by their mean displacement along x and y, or along x for a line sensor.
+    """Matrix of the scene's motion, which is the spots' mean displacement along x and y, or along x for a line sensor.
 
     Returns
     -------
-    (1 or 2, n_outputs): times the rig's outputs it is the scene's displacement, slope units.
+    The matrix, (1 or 2, n_outputs); its product with the rig's outputs is the scene's displacement, slope units.
     """
     return np.eye(1) if n_outputs == 1 else np.tile(np.eye(2), (1, n_outputs // 2)) / (n_outputs // 2)
 
 
 def framed(sensor: SceneSensor, picture: FloatArray) -> FloatArray:
-    """The middle of a picture in the sensor's pixels, each the mean of its own, (rows, columns)."""
+    """The middle of a picture in the sensor's pixels, each the mean of the picture's pixels in it, (rows, columns)."""
     return framed_columns(sensor, framed_rows(sensor, picture))
 
 
 def framed_rows(sensor: SceneSensor, picture: FloatArray) -> FloatArray:
-    """`framed` for the rows alone, (rows, the picture's columns)."""
+    """The picture as by `framed`, for the rows alone, (rows, the picture's columns)."""
     n, rows = sensor.picture_pixels, sensor.shape[0]
     top = (picture.shape[0] - n * rows) // 2
     return np.asarray(picture[top : top + n * rows].reshape(rows, n, -1).mean(axis=1))
 
 
 def framed_columns(sensor: SceneSensor, picture: FloatArray) -> FloatArray:
-    """`framed` for the columns alone, (the picture's rows, columns)."""
+    """The picture as by `framed`, for the columns alone, (the picture's rows, columns)."""
     return framed_rows(replace(sensor, shape=sensor.shape[::-1]), picture.T).T

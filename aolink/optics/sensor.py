@@ -1,7 +1,7 @@
 """Sensors as dataclasses: pixels, image kernel, counts and noise.
 
 Quantities are in the rig's own slope unit: that of ``sensor.field``, of the plant's output and of the
-kernel's width. A density is light over length for a line of pixels, and over area where pixels have two sides.
+kernel's width. A density is light over length for a line sensor, and over area on a plane.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from aolink.numerics.arrays import FloatArray, Indices
 
 @dataclass(frozen=True, kw_only=True)
 class Kernel:
-    """Image kernel Psi, the spot that a resting beam makes; of unit mass."""
+    """Image kernel Psi of unit mass: the spot that a resting beam makes."""
 
     shape: Literal["gaussian"]
     sigma: float
@@ -65,7 +65,7 @@ class BaseSensor(ABC):
     counts_per_density: float
     """Counts for a density of one."""
     photoelectrons: float = 0.0
-    """Photo-electrons of a whole spot in one exposure; 0 means so many that shot noise does not matter."""
+    """Photo-electrons of a whole spot in one exposure; 0 means that shot noise is negligible."""
 
     @property
     @abstractmethod
@@ -80,7 +80,7 @@ class BaseSensor(ABC):
     @property
     @abstractmethod
     def pixel_size(self) -> float:
-        """D: a pixel's length (slope units) on a line, its area on a plane."""
+        """D: a pixel's length (slope units) on a line sensor, its area on a plane."""
 
     @property
     @abstractmethod
@@ -147,7 +147,7 @@ class Sensor(BaseSensor):
 
     @property
     def profile(self) -> Sensor:
-        """Itself."""
+        """The sensor itself."""
         return self
 
     @property
@@ -182,7 +182,8 @@ class SpotSensor(BaseSensor):
     window: tuple[int, int]
     """Rows and columns of pixels in a window; a square."""
     light: tuple[float, ...] | None = None
-    """Share of each window's lenslet that is lit, along the rows of the grid; 0 without a spot. None: all is."""
+    """Share of each window's lenslet that is lit, along the rows of the grid; 0 without a spot; None where all are
+    fully lit."""
 
     @cached_property
     def lit(self) -> Indices:
@@ -191,7 +192,7 @@ class SpotSensor(BaseSensor):
 
     @cached_property
     def spot_light(self) -> FloatArray | None:
-        """Share of each spot's lenslet that is lit, (spots,); None where all is."""
+        """Share of each spot's lenslet that is lit, (spots,); None where all are fully lit."""
         return None if self.light is None else np.array(self.light)[self.lit]
 
     @property
@@ -236,6 +237,6 @@ class SpotSensor(BaseSensor):
         half = self.pixel_width / 2
         if self.kernel.matrix is None:
             return (math.erf(half / self.kernel.sigma) / self.pixel_width) ** 2
-        # To the second order in a pixel's width over the kernel's.
+        # The density is right to second order in a pixel's width over the kernel's.
         covariance = self.kernel.covariance + np.eye(2) * half**2 / 3
         return 1 / (2 * math.pi * math.sqrt(float(np.linalg.det(covariance))))

@@ -17,7 +17,8 @@ from aolink.optics.lattice import Lattice, find_lattice, match
 from aolink.optics.wavefront import SpotReconstructor, modal_reconstructor, residual_rms, zernike_slopes
 from aolink.optics.zernike import zernike
 
-# Zernike modes that are fitted, by Noll's index, up to the fourth order; fewer where the spots do not determine them.
+# Highest fitted Zernike mode by Noll's index, that of the fourth order; fewer modes are fitted where the spots do not
+# determine them.
 _HIGHEST = (15, 10, 6, 3)
 
 
@@ -26,10 +27,10 @@ class ZernikeFit:
     """The wavefront as Zernike modes over the smallest circle that holds all lenslets of the reference."""
 
     centre_px: FloatArray
-    """(2,)"""
+    """Middle of the circle, pixels, (2,)."""
     radius_px: float
     indices: tuple[int, ...]
-    """Noll's, from 2."""
+    """Noll's indices, from 2."""
     coefficients: FloatArray
     """Rms of each mode over the pupil, in the unit of the wavefront, (modes,)."""
     wavefront: FloatArray
@@ -52,15 +53,16 @@ class FrameSlopes:
     positions_px: FloatArray
     """Positions of the nodes of the reference's lattice, with spots or without, pixels, (rows, columns, 2)."""
     displacements_px: FloatArray
-    """From the reference's spot to the frame's, without their mean, pixels, (rows, columns, 2)."""
+    """Displacements from the reference's spot to the frame's, without their mean, pixels, (rows, columns, 2)."""
     shift_px: FloatArray
     """The mean displacement, (2,): known up to whole steps of the lattice."""
     slopes: FloatArray
-    """(rows, columns, 2): radians, or pixels where the optics are not known."""
+    """Slopes, (rows, columns, 2), in radians, or in pixels where the optics are not known."""
     wavefront: FloatArray
     """Zonal wavefront, (rows, columns), without piston and tilt: metres, or pixels times the pitch of a lenslet."""
     pieces: IntArray
-    """Connected piece that each lenslet belongs to, from 0, -1 where the frame has no spot, (rows, columns).
+    """Number of the connected piece that each lenslet belongs to, from 0, -1 where the frame has no spot, (rows,
+    columns).
 
     Slopes do not determine the step from one piece to another; the wavefront's mean is zero in each.
     """
@@ -92,13 +94,13 @@ def measure_slopes(
     frame, reference:
         Counts of any real type and scale, (rows, columns), of the same camera.
     pitch_m, focal_m:
-        From a lenslet's middle to the next one's, and focal length, m; the pitch in pixels is the reference's own.
-        Where both are None, slopes are left in pixels.
+        Distance from a lenslet's middle to the next one's, and focal length, m; the pitch in pixels is the reference's
+        own. Where both are None, slopes are left in pixels.
 
     Raises
     ------
     FrameError
-        A frame has no spots, they lie on no grid, or the two grids are not of one instrument.
+        A frame has no spots, they do not lie on a grid, or the two grids do not belong to one instrument.
     """
     if frame.shape != reference.shape:
         raise FrameError(f"the frame has {frame.shape} pixels, the reference {reference.shape}: take one camera's")
@@ -153,14 +155,14 @@ def _zernikes(
         coefficients = matrix @ slopes.ravel()
         values = np.tensordot(coefficients, [zernike(i, positions / (radius * scale)) for i in indices], axes=1)
         return indices, coefficients, np.asarray(values), (centre, radius)
-    raise AssertionError("two tilts are always told apart")
+    raise AssertionError("two tilts can always be distinguished")
 
 
 def _circle(points: FloatArray) -> tuple[FloatArray, float]:
     """Middle (2,) and radius of the smallest circle about points (n, 2), to a thousandth.
 
-    The middle goes a smaller and smaller share of the way to the point that is furthest from it; Badoiu and Clarkson,
-    Smaller core-sets for balls, SODA (2003).
+    The middle moves towards the point that is furthest from it, by a smaller and smaller share of the distance; Badoiu
+    and Clarkson, Smaller core-sets for balls, SODA (2003).
     """
     points = points[ConvexHull(points).vertices]
     middle = points.mean(axis=0)
@@ -179,7 +181,7 @@ def _found(frame: NDArray[np.generic], name: str) -> Lattice:
 def measure_files(
     frame: str | Path, reference: str | Path, *, pitch_m: float | None = None, focal_m: float | None = None
 ) -> FrameSlopes:
-    """`measure_slopes` of two files, .fits, .fits.gz or .npy. Raises `FrameError`."""
+    """The result of `measure_slopes` for two files, .fits, .fits.gz or .npy. Raises `FrameError`."""
     return measure_slopes(read_frame(frame), read_frame(reference), pitch_m=pitch_m, focal_m=focal_m)
 
 

@@ -1,7 +1,6 @@
-"""Frames as a camera makes them, pixel by pixel: any kernel along any path, and the faults of real detectors.
-
-`aolink.optics.frame` makes the frames of rigs, whose kernel is a Gaussian; here are the other kernels, to see what
-estimators do with light that they do not expect.
+"""Synthesis of a camera's frames, pixel by pixel, with any kernel along any path, and with the faults of real
+detectors. `aolink.optics.frame` makes the frames of rigs, whose kernel is a Gaussian; this module has other kernels, to
+test estimators with light that their models do not describe.
 """
 
 from __future__ import annotations
@@ -21,9 +20,9 @@ from aolink.numerics.arrays import BoolArray, FloatArray, IntArray
 
 # Spots computed together: their masses stay in the processor's cache.
 _AT_ONCE = 16
-# Rows of the table of diffraction's masses from the middle to the first zero: linearly between them, 1e-6 is left out.
+# Rows of the table of diffraction's masses from the middle to the first zero: linear interpolation is wrong by 1e-6.
 _POINTS = 512
-# Most numbers in a table; for wider windows it is not worth its memory.
+# Most numbers in a table; for wider windows it would take too much memory.
 _LARGEST_TABLE = 4_000_000
 
 
@@ -33,7 +32,8 @@ class Psi:
 
     shape: Literal["delta", "sinc2", "image"]
     zero_px: float = 0.0
-    """For kind ``sinc2``, diffraction at a square lenslet: from the middle to the first zero, wavelength over pitch."""
+    """For kind ``sinc2``, diffraction at a square lenslet: distance from the middle to the first zero, wavelength over
+    pitch."""
     image: FloatArray | None = None
     """For kind ``image``: the spot on a grid of ``finer`` points a pixel; odd sides, the middle point is its origin."""
     finer: int = 1
@@ -59,7 +59,7 @@ def spot_windows(psi: Psi, side: int, path_px: FloatArray) -> FloatArray:
 
     Returns
     -------
-    (spots, side, side); a spot that is wholly in its window sums to one.
+    Shares, (spots, side, side); a spot that is wholly in its window sums to one.
     """
     if psi.shape == "image":
         return _image_windows(psi, side, path_px)
@@ -79,7 +79,7 @@ def _delta_masses(side: int, positions: FloatArray) -> FloatArray:
 
 
 def _sinc2_masses(psi: Psi, side: int, positions: FloatArray) -> FloatArray:
-    """Mass of one direction in each pixel, (..., n_steps, side): between the rows of a table, linearly."""
+    """Mass of one direction in each pixel, (..., n_steps, side), interpolated linearly in a table."""
     if _table_rows(psi.zero_px, side) * side > _LARGEST_TABLE:
         away = np.arange(side + 1) - 0.5 - positions[..., None]
         return np.asarray(np.diff(_sinc2_below(away / psi.zero_px), axis=-1))
@@ -123,9 +123,9 @@ def _image_windows(psi: Psi, side: int, path_px: FloatArray) -> FloatArray:
 
 
 def _image_of_some(psi: Psi, side: int, path_px: FloatArray) -> FloatArray:
-    """The image, and the path's own picture on the fine grid, convolved by their spectra.
+    """Convolve the image with the path's histogram on the fine grid, by their spectra.
 
-    A step's place between fine points goes to the four of them by its distances, so that its mean is exact. Spots
+    The light of a step is divided among the four nearest fine points by its distances, so that its mean is exact. Spots
     have squares just large enough for their paths; the squares' spectra, folded, are those of sums over pixels.
     """
     assert psi.image is not None
@@ -152,7 +152,7 @@ def _image_of_some(psi: Psi, side: int, path_px: FloatArray) -> FloatArray:
     trace = np.bincount(places.ravel(), weights.ravel(), spots * size**2).reshape(spots, size, size)
     spectrum = fft.rfft2(trace)
     spectrum *= _image_spectrum(psi.image, fine, size)
-    # Every fine-th row has the spectrum of all rows, with frequencies so far apart that they look alike added up.
+    # Every fine-th row has the spectrum of all rows, with frequencies folded together as an aliased sum.
     folded = spectrum.reshape(spots, fine, pixels, -1).sum(axis=1) / fine
     light = fft.irfft2(folded, (pixels, size)).reshape(spots, pixels, pixels, fine).sum(axis=3)
     return _cut(light, corner[..., 0].astype(np.int64), side)
@@ -182,12 +182,12 @@ class Detector:
     """An integer camera and its faults. Light is in photo-electrons; values of single pixels are (rows, columns)."""
 
     bits: int = 16
-    """8 to 16."""
+    """Bits of a count, 8 to 16."""
     electrons_per_count: float = 1.0
     offset_counts: float = 0.0
     read_noise_electrons: float = 0.0
     background_electrons: FloatArray | float = 0.0
-    """Light that is everywhere; it has shot noise."""
+    """Background light in every pixel, photo-electrons; it has shot noise."""
     dark_electrons: FloatArray | float = 0.0
     """Dark current of a pixel in one exposure, photo-electrons; it has shot noise."""
     flat: FloatArray | float = 1.0

@@ -1,4 +1,5 @@
-"""Frozen-flow turbulence, which the wind blows past the pupil: von Karman's spectrum, several layers, at any time.
+"""Frozen-flow turbulence, which the wind blows past the pupil, with von Karman's spectrum and several layers, at any
+time.
 
 A layer is a sum of plane waves of random direction, phase and size, one for each stretch of a logarithmic ladder
 of wave numbers: Charnotskii, "Sparse spectrum model for a turbulent phase", J. Opt. Soc. Am. A 30, 479 (2013). Its
@@ -32,7 +33,7 @@ class Layer:
     r0_m: float
     """Fried's parameter at ``wavelength_m``, m."""
     wind_m_s: tuple[float, float]
-    """Along x and y."""
+    """Wind along x and y, m/s."""
     outer_scale_m: float = 25.0
     wavelength_m: float = 500e-9
 
@@ -54,11 +55,11 @@ class FrozenFlow:
         k = np.sqrt(rungs[:-1] ** 2 + (rungs[1:] ** 2 - rungs[:-1] ** 2) * rng.random(waves))
         turn = rng.uniform(0, 2 * math.pi, waves)
         self.wave_numbers = k[:, None] * np.stack([np.cos(turn), np.sin(turn)], axis=1)
-        """Radians per metre, (waves, 2)."""
+        """Wave vectors, radians per metre, (waves, 2)."""
         power = _spectrum(layer, k) * math.pi * (rungs[1:] ** 2 - rungs[:-1] ** 2)  # variance of each wave, rad^2
         scatter = rng.standard_normal((2, waves))
         self.amplitudes = np.sqrt(power) * (scatter[0] + 1j * scatter[1]) * layer.wavelength_m / (2 * math.pi)
-        """Metres, complex, (waves,): W(r) = Re sum_k a_k exp(i k r)."""
+        """Complex amplitudes, metres, (waves,): W(r) = Re sum_k a_k exp(i k r)."""
 
     def wavefront(self, points_m: FloatArray, time_s: float = 0.0) -> FloatArray:
         """Path difference at points (..., 2), m, (...)."""
@@ -90,7 +91,7 @@ class FrozenFlow:
 def _spectrum(layer: Layer, k: FloatArray) -> FloatArray:
     """von Karman's phase spectrum over the plane of wave numbers, rad^2 m^2; it integrates to the variance.
 
-    0.0229 r0^(-5/3) (f^2 + L0^-2)^(-11/6) over cycles per metre, and (2 pi)^-2 of that over radians per metre.
+    It is 0.0229 r0^(-5/3) (f^2 + L0^-2)^(-11/6) over cycles per metre, and (2 pi)^-2 of that over radians per metre.
     """
     gamma = scipy.special.gamma
     exact = gamma(11 / 6) ** 2 / (2 * math.pi ** (11 / 3)) * (24 / 5 * gamma(6 / 5)) ** (5 / 6)  # 0.0229

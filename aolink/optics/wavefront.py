@@ -1,6 +1,6 @@
 """Wavefront reconstruction from slopes: zonal and modal least squares; residual rms and Strehl ratio.
 
-Slopes are means over lenslets as `aolink.optics.lenslets` has them, (rows, columns, 2) on a grid or (spots, 2);
+Slopes are means over lenslets as in `aolink.optics.lenslets`, (rows, columns, 2) on a grid or (spots, 2);
 wavefronts come in the unit of slopes times the lenslets' pitch.
 """
 
@@ -22,9 +22,10 @@ from aolink.optics.zernike import noll_to_orders, zernike, zernike_gradient
 
 
 class SpotReconstructor:
-    """Least squares of a wavefront's values at spots anywhere, sparse, factored once for a pattern of spots.
+    """A least-squares reconstructor of a wavefront's values at spots anywhere, sparse, factored once for a pattern of
+    spots.
 
-    Southwell's geometry (J. Opt. Soc. Am. 70, 998 (1980)) on the graph of neighbours, whatever lattice they are on:
+    It has Southwell's geometry (J. Opt. Soc. Am. 70, 998 (1980)) on the graph of neighbours, for any lattice:
     along each edge the wavefront changes by the mean slope of its two spots times the vector from one to the other. It
     is exact for wavefronts of the second degree.
 
@@ -164,7 +165,7 @@ def modal_reconstructor(
     normal = (H.T * both) @ H
     if prior_variance is not None:
         normal += np.diag(noise_variance / prior_variance)
-    # The modes may have any size: what counts is how alike their slopes are.
+    # The modes may have any size: only the similarity of their slopes matters.
     size = np.sqrt(np.maximum(np.diag(normal), 1e-300))
     if np.linalg.cond(normal / np.outer(size, size)) > 1e10:
         raise ValueError("the lit lenslets do not determine the modes: use fewer modes, or a prior")

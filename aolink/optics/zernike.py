@@ -27,7 +27,7 @@ def noll_to_orders(index: int) -> tuple[int, int]:
 
 @lru_cache(maxsize=1024)
 def _terms(index: int) -> tuple[tuple[int, float], ...]:
-    """(k, coefficient) of r^(2k) in the radial polynomial over r^|m|, normalised."""
+    """Terms (k, coefficient) of r^(2k) in the radial polynomial over r^|m|, normalised."""
     n, m = noll_to_orders(index)
     a, scale = abs(m), math.sqrt((n + 1) * (2 if m else 1))
     f = math.factorial

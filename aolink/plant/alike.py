@@ -1,4 +1,4 @@
-"""Plants that are many small systems side by side, all alike, such as the actuators of a mirror."""
+"""Plants that consist of many small equal systems side by side, such as the actuators of a mirror."""
 
 from __future__ import annotations
 
@@ -17,15 +17,16 @@ MANY_STATES = 64
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class AlikeSystems:
-    """A plant of many inputs, each of which moves a small system of its own, all alike; outputs mix their outputs.
+    """A plant of many inputs, each of which moves a small system of its own, all equal; the plant's outputs are sums of
+    theirs.
 
     A = I (x) A_1, B and B_w likewise, and C = gains (x) C_1, with (x) the Kronecker product.
     """
 
     one: Plant
-    """One of them, with unit noise; its output is the one that the plant's outputs mix."""
+    """One of the systems, with unit noise; the plant's outputs are sums of its output over the systems."""
     gains: FloatArray
-    """(n_outputs, systems)"""
+    """Weights of the systems in the plant's outputs, (n_outputs, systems)."""
     noise_sd: FloatArray
     """Standard deviation of the noise of each, (systems,)."""
     order: Indices
@@ -34,7 +35,7 @@ class AlikeSystems:
 
 @lru_cache(maxsize=16)
 def alike_systems(plant: Plant) -> AlikeSystems | None:
-    """The systems that a large plant consists of; None where it is not large or not of alike systems.
+    """The systems that a large plant consists of; None where it is not large or does not consist of equal systems.
 
     A plant is large with more than `MANY_STATES` states, and also with more outputs than states where each output has
     a coefficient of its own (`UnmodelledSlopes`): for 48 spots `moments` takes 4 s with dense matrices, and a fiftieth

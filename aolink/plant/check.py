@@ -19,7 +19,7 @@ def nominal_path(rig: Rig) -> tuple[FloatArray, FloatArray]:
 
     Returns
     -------
-    The path from the initial mean until the drive has been round twice after the plant settled,
+    The path from the initial mean until two periods of the drive have passed after the plant settled,
     (axes * n_outputs, steps), and the largest standard deviation of each output in that time, (axes * n_outputs,).
     """
     plant, timing = rig.plant, rig.timing

@@ -32,7 +32,7 @@ def output_rows(plant: Plant, n_steps: int) -> FloatArray:
 def lift(plant: Plant, n_steps: int) -> tuple[FloatArray, FloatArray]:
     """The plant over ``n_steps`` fast steps: A^N and Q_N = sum_i A^i B_w W B_w' A^i', both (n_states, n_states).
 
-    By doubling, so that a gap of an hour costs no more than one of a second.
+    They are computed by doubling, so that a gap of an hour costs hardly more than one of a second.
     """
     Q = plant.B_w @ plant.process_noise @ plant.B_w.T
     transition, noise = blockwise(partial(_lifted, n_steps), (plant.A, Q), components(plant.A, Q))
@@ -120,7 +120,8 @@ def input_response(plant: Plant, u: FloatArray) -> tuple[FloatArray, FloatArray]
 
 
 def _times(blocks: FloatArray, matrix: FloatArray) -> FloatArray:
-    """blocks @ matrix, axis by axis in pieces so small that BLAS uses one thread: no bit depends on their number."""
+    """The product blocks @ matrix, axis by axis in pieces so small that BLAS uses one thread, so that no bit depends on
+    the number of axes."""
     piece = max(1, SMALL_PRODUCT // matrix.size)
     products = [blocks[:, k : k + piece] @ matrix for k in range(0, max(1, blocks.shape[1]), piece)]
     return products[0] if len(products) == 1 else np.concatenate(products, axis=1)

@@ -14,11 +14,12 @@ from aolink.numerics.arrays import FloatArray, Indices
 from aolink.numerics.block_diagonal import blockwise, components, eigenvalues, null_space
 from aolink.rig import Plant
 
-# A mode that decays to this over one exposure is gone before the next, observed or not.
+# An eigenmode that decays to this share over one exposure is gone before the next, observed or not.
 _FORGOTTEN = 1e-3
 
 
-# Eigenvalues closer than this are one; and a vector that A moves less from its multiple is an eigenvector.
+# Eigenvalues closer than this count as equal; and v counts as an eigenvector if A v differs by less from a multiple of
+# v.
 _SAME = 1e-7
 
 
@@ -28,12 +29,12 @@ _UNSEEN = 1e-9
 
 @dataclass(frozen=True, kw_only=True)
 class Mode:
-    """A mode of the plant, an eigenvalue of A (of a complex pair, the one above the real axis)."""
+    """An eigenmode of the plant: an eigenvalue of A (of a complex pair, the one above the real axis)."""
 
     eigenvalue: complex
     frequency_hz: float
     time_constant_s: float
-    """Time in which it falls to 1/e; infinite where it does not."""
+    """Time in which it decays to 1/e; infinite where it does not decay."""
     seen: bool
     """Whether it is observable from the outputs at the fast rate, (A, C)."""
     seen_by_centroid: bool
@@ -41,12 +42,13 @@ class Mode:
 
     def __str__(self) -> str:
         lasts = "undamped" if math.isinf(self.time_constant_s) else f"time constant {self.time_constant_s:.3g} s"
-        return f"the mode at {self.frequency_hz:.4g} Hz ({lasts})"
+        return f"the eigenmode at {self.frequency_hz:.4g} Hz ({lasts})"
 
 
 @dataclass(frozen=True, kw_only=True)
 class ObservabilityReport:
-    """Which modes of the plant are observable, and from what (remarks 1 and 2 of Mishra & Wen)."""
+    """The eigenmodes of the plant that are observable, and from which measurements (remarks 1 and 2 of Mishra &
+    Wen)."""
 
     n_states: int
     rank: int
@@ -55,21 +57,22 @@ class ObservabilityReport:
     """The same for (A^N, C-bar), the means over exposures; remark 1 holds where it equals ``rank``, and it need not."""
     modes: tuple[Mode, ...]
     o2_needs: str
-    """What an estimator of the second moment alone (`o2`) needs before it can work."""
+    """The condition under which an estimator of the second moment alone (`o2`) works."""
 
     @property
     def unseen(self) -> tuple[Mode, ...]:
-        """Modes that are not observable at the fast rate."""
+        """Eigenmodes that are not observable at the fast rate."""
         return tuple(m for m in self.modes if not m.seen)
 
     @property
     def lost_by_centroid(self) -> tuple[Mode, ...]:
-        """Modes that are observable at the fast rate and not from the means over exposures."""
+        """Eigenmodes that are observable at the fast rate but not from the means over exposures."""
         return tuple(m for m in self.modes if m.seen and not m.seen_by_centroid)
 
 
 def observability(plant: Plant, n_steps: int, fast_step_s: float) -> ObservabilityReport:
-    """Observability of a plant, mode by mode (Popov-Belevitch-Hautus test), for exposures of ``n_steps`` fast steps."""
+    """Observability of a plant, eigenmode by eigenmode (Popov-Belevitch-Hautus test), for exposures of ``n_steps`` fast
+    steps."""
     A, parts = plant.A, components(plant.A)
     transition, mean, square = blockwise(partial(_powers, n_steps), (A,), parts)
     values = _distinct(eigenvalues(A, parts))
@@ -144,10 +147,10 @@ def _unobservable(A: FloatArray, C: FloatArray, value: complex, parts: list[Indi
 
 
 def _has_part_in(A: FloatArray, value: complex, space: NDArray[Any], parts: list[Indices]) -> bool:
-    """Whether the invariant subspace of an eigenvalue of A has a part in ``space``."""
+    """Whether the invariant subspace of an eigenvalue of A has a component in ``space``."""
     if not space.shape[1]:
         return False
-    # The eigenvalue's own left space: what it cannot annihilate has a part in the mode.
+    # The eigenvalue's left invariant space: a vector that it does not annihilate has a component in the eigenmode.
     left = null_space(A, value, parts, _SAME, left=True, power=len(A))
     return bool(np.linalg.norm(left.conj().T @ space) > 1e-6)
 

@@ -1,7 +1,6 @@
-"""Figures of recordings with matplotlib, on axes or figures that are given or made; and a report of them.
-
-`overview` reads a series once; figures of the whole session are drawn of it, figures of one exposure of the
-series. `save_figure` writes one in a paper's size, `write_report` puts them on one page.
+"""Figures of recordings with matplotlib, on given axes or figures or new ones; and a report of them. `overview` reads a
+series once; figures of the whole session are drawn from it, figures of one exposure from the series. `save_figure`
+writes one in a paper's size, `write_report` puts them on one page.
 """
 
 from typing import TYPE_CHECKING
@@ -18,7 +17,7 @@ if TYPE_CHECKING:
     from aolink.plotting.scene import plot_scene
     from aolink.plotting.session import plot_blur, plot_errors, plot_nis
     from aolink.plotting.style import new_figure, paper
-else:  # the type checker would believe in any name
+else:  # the type checker would accept any name
     from aolink.names import at_first_use
 
     __getattr__ = at_first_use(

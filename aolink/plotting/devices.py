@@ -1,4 +1,4 @@
-"""Figures of what a session's devices did: losses on a time line, and when each step of the loop was done."""
+"""Figures about a session's devices: losses along time, and the time at which each step of the loop was done."""
 
 from __future__ import annotations
 
@@ -34,14 +34,13 @@ _LANES = {
     Status.REINITIALISED: ("reinitialised", "tab:purple"),
     Status.INPUT_INVALID: ("not usable", "tab:brown"),
 }
-"""What is said of an estimate that is not as it should be."""
+"""Labels for an estimate whose exposure was not used normally."""
 
 
 def incidents(view: Overview) -> dict[str, FloatArray]:
-    """What went wrong: the fast steps at which it did, from the first exposure on, by what it was.
-
-    Frames lost and incomplete, exposures with inputs that the mirror did not report, estimates that were gated,
-    diverged, began anew or could not use their exposure, and those that the session had no time for.
+    """Incidents by their kind, each with its fast steps, counted from the first exposure. The kinds are frames lost and
+    incomplete, exposures with inputs that the mirror did not report, estimates that were gated, diverged, began anew or
+    could not use their exposure, and those that the session had no time for.
     """
     steps = view.steps.astype(np.float64)
     found = {
@@ -61,7 +60,7 @@ def incidents(view: Overview) -> dict[str, FloatArray]:
 
 
 def plot_losses(view: Overview, axes: Axes | None = None, *, unit: TimeUnit = "s") -> Axes:
-    """What went wrong and when: a line of marks for each kind of incident (`incidents`), with their number.
+    """Draw what went wrong and when: a row of marks for each kind of incident (`incidents`), with their number.
 
     Raises
     ------
@@ -84,7 +83,8 @@ def plot_losses(view: Overview, axes: Axes | None = None, *, unit: TimeUnit = "s
 
 
 def plot_latency(view: Overview, axes: Axes | None = None, *, unit: TimeUnit = "s") -> Axes:
-    """When each step of the loop was done after the end of its exposure, and how long each estimate took, ms.
+    """Draw the time from the end of an exposure until each step of the loop was done, and the time of each estimate,
+    ms.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""The figure that explains the method: one exposure's path, how long it was where, and the blur that it left."""
+"""The figure that explains the method: one exposure's path, its histogram, and the blur that it left."""
 
 from __future__ import annotations
 
@@ -34,9 +34,8 @@ _SEGMENTS = 120
 def exposure_with_estimates(
     series: Series, number: int, estimators: Sequence[str] | None = None
 ) -> tuple[Exposure, dict[str, Estimate]]:
-    """An exposure by its number, counted from 0, and what there is of its estimates.
-
-    Without names those of the baseline and of the estimator to look at first.
+    """An exposure by its number, counted from 0, and its estimates. Without names they are those of the baseline and of
+    the estimator with the highest rank.
 
     Raises
     ------
@@ -69,19 +68,19 @@ def plot_exposure(
     """Draw one exposure: the path over its blur, the path's histogram, and the intensity profile beside them.
 
     The three panels of a row share the axis of the spot's position. The path's histogram, blurred by the kernel, is
-    the intensity that the path predicts; grey is what was measured. A spot on a plane has a row for x and one for y,
-    and its picture.
+    the intensity that the path predicts; grey is the measured intensity. A spot on a plane has a row for x and one for
+    y, and its picture.
 
     Parameters
     ----------
     number:
         Number of the exposure in the series, counted from 0.
     figure:
-        Where to draw; by default a new figure.
+        The figure to draw on; by default a new one.
     estimators:
-        Whose paths; by default those of the baseline `o1` and of the estimator to look at first.
+        Estimators whose paths are drawn; by default the baseline `o1` and the estimator with the highest rank.
     spot:
-        Which spot of a sensor with many.
+        Number of the spot, on a sensor with many.
     unit:
         Whether the time axis counts milliseconds of the exposure or its fast steps.
 
@@ -100,7 +99,7 @@ def draw_exposure(
     series: Series, exposure: Exposure, estimates: dict[str, Estimate], figure: Figure | SubFigure | None = None, *,
     spot: int = 0, unit: TimeUnit = "s",
 ) -> Figure | SubFigure:  # fmt: skip
-    """What `plot_exposure` draws, of an exposure that has been read."""
+    """Draw the figure of `plot_exposure` for an exposure that has been read."""
     sensor = series.rig.sensor
     on_plane = sensor.directions == 2
     if not 0 <= spot < sensor.spots:
@@ -130,7 +129,7 @@ def _draw_row(
     panels: Sequence[Axes], series: Series, exposure: Exposure, estimates: dict[str, Estimate], output: int,
     unit: TimeUnit,
 ) -> None:  # fmt: skip
-    """Path, histogram and intensity profile of one output."""
+    """Draw path, histogram and intensity profile of one output."""
     over_time, histogram, intensity = panels
     line: Sensor = series.rig.sensor.profile
     seen = profile_density(series.rig.sensor, exposure, output)
@@ -160,7 +159,7 @@ def _draw_row(
         intensity.stairs(predicted, line.edges, orientation="horizontal", color=colour(name), linewidth=width)
     over_time.set(ylim=(low, high), xlim=(0, exposure.n_steps * scale))
     over_time.set_xlabel("time in the exposure (ms)" if unit == "s" else "fast step in the exposure")
-    histogram.set_xlabel("time at a place\n(1 / slope unit)")
+    histogram.set_xlabel("time at a position\n(1 / slope unit)")
     intensity.set_xlabel("intensity\n(1 / slope unit)")
     for panel in (histogram, intensity):
         panel.tick_params(labelleft=False)
@@ -168,7 +167,7 @@ def _draw_row(
 
 
 def _draw_path(axes: Axes, times: FloatArray, path: FloatArray, sd: FloatArray | None, name: str) -> None:
-    """A path with the band of its estimate; one that swings too fast to be seen as a line, as its range."""
+    """Draw a path with the band of its estimate; one that swings too fast for a line is drawn as its range."""
     low, high = extremes(path, _SEGMENTS)
     if hides_swings(path, _SEGMENTS):
         edges = np.linspace(times[0], times[-1], len(low))
@@ -183,7 +182,7 @@ def _draw_path(axes: Axes, times: FloatArray, path: FloatArray, sd: FloatArray |
 def _draw_spot(
     axes: Axes, sensor: BaseSensor, exposure: Exposure, estimates: dict[str, Estimate], spot: int
 ) -> None:  # fmt: skip
-    """The picture of one spot with the paths over it."""
+    """Draw the picture of one spot with the paths over it."""
     window = sensor.window_of(spot)
     counts = np.where(exposure.mask[window], exposure.pixels[window].astype(float), np.nan)
     low, high = sensor.field

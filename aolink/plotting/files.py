@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 FORMATS = (".png", ".svg", ".pdf")
 _DATED = {".svg": "Date", ".pdf": "CreationDate"}
-"""What matplotlib would write the time of day into: the same recording is to give the same file."""
+"""Metadata into which matplotlib would write the time of day: the same recording must give the same file."""
 
 
 @dataclass(frozen=True)
@@ -34,19 +34,19 @@ class _Figure:
     """A figure that has a name."""
 
     what: str
-    """What it shows, in words."""
+    """The content of the figure, in words."""
     height: float
-    """Over its width."""
+    """Height of the figure as a share of its width."""
     draw: Callable[..., Axes] | None = None
-    """Draws it of an overview, on axes; None for those of one exposure, or of the pupil."""
+    """Function that draws it from an overview, on axes; None for figures of one exposure, or of the pupil."""
 
 
 FIGURES = {
-    "blur": _Figure("what the camera saw over the session, and the paths", 0.42, plot_blur),
+    "blur": _Figure("the camera's blur over the session, and the paths", 0.42, plot_blur),
     "exposure": _Figure("one exposure: path over blur, its histogram, the intensity profile", 0.40),
     "nis": _Figure("the NIS of each estimator with its bounds", 0.55, plot_nis),
     "errors": _Figure("the error of each estimator's path along the session", 0.55, plot_errors),
-    "losses": _Figure("what was lost, late, gated or skipped, and when", 0.45, plot_losses),
+    "losses": _Figure("frames and exposures lost, late, gated or skipped, and when", 0.45, plot_losses),
     "latency": _Figure("when each step of the loop was done", 0.55, plot_latency),
     "pupil": _Figure("maps over the lenslets: light, slopes, blur, NIS", 0.62),
     "scene": _Figure("the picture of one exposure as it came, restored, and at rest", 0.36),
@@ -66,21 +66,21 @@ def save_figure(
     what:
         Name of the figure.
     path:
-        The file to write; its ending says the format.
+        The file to write; its suffix sets the format.
     estimators:
-        Whose paths and NIS; by default what the figure's own function takes.
+        Estimators whose paths and NIS are drawn; the default is that of the figure's own function.
     exposure:
         Number of the exposure, for ``exposure`` and ``scene``; by default the one with the largest blur.
     output, spot:
         Output whose blur is drawn, and spot of the exposure that is drawn.
     unit:
-        What time axes count.
+        The unit of time axes.
     width_mm:
         Width on paper.
     overwrite:
         Whether a file of that name may be replaced.
     progress:
-        Is told how many exposures have been read.
+        Called with the number of exposures read.
 
     Raises
     ------

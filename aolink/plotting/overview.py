@@ -1,4 +1,4 @@
-"""What the figures need of a whole series, read in one pass: a few numbers for each exposure."""
+"""The data of a whole series for the figures, read in one pass: a few numbers for each exposure."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ _COLUMNS = 1500
 _POINTS = 17
 """Points of a path within its exposure."""
 _KERNELS = 4.0
-"""What is drawn reaches this many of the kernel's standard deviations beyond the paths."""
+"""The drawn field reaches this many of the kernel's standard deviations beyond the paths."""
 _NONE = -1
-"""In the place of a status where there is no estimate."""
+"""The number instead of a status where there is no estimate."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -41,23 +41,24 @@ class Paths:
     points: FloatArray
     """Some points of each path, slope units, (columns, points); NaN where there is no path."""
     places: FloatArray
-    """Where they are in their column, from 0 to 1, (points,)."""
+    """Positions of the points in their column, from 0 to 1, (points,)."""
     low: FloatArray
     high: FloatArray
-    """``low`` and ``high``: between which the path is around each point, slope units, (columns, points)."""
+    """``low`` and ``high`` are the limits of the path around each point, slope units, (columns, points)."""
     envelope: bool
     """Whether the path swings more than its points show."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Overview:
-    """A series of n exposures as `aolink.plotting` draws it. Arrays by name have NaN where there is no estimate."""
+    """The data of a series of n exposures that `aolink.plotting` draws. Arrays by name have NaN where there is no
+    estimate."""
 
     series: Series
     names: list[str]
-    """The estimators, from the plainest to the one to look at first."""
+    """The estimators in the order of their ranks."""
     output: int
-    """Which output ``blur`` and ``paths`` are of."""
+    """Number of the output of ``blur`` and ``paths``."""
     frame_ids: IntArray
     first_steps: IntArray
     n_steps: IntArray
@@ -66,26 +67,28 @@ class Overview:
     assumed: IntArray
     """Steps of each exposure whose input the mirror did not report, (n,)."""
     moved: FloatArray
-    """How far the spots moved: RMS of the path about its mean, slope units, (n,); of the truth or of the last name."""
+    """Motion of the spots: RMS of the path about its mean, slope units, (n,), from the truth or from the last name's
+    estimates."""
     apart: FloatArray
     """RMS of the last name's path minus the truth, or without a truth minus the first name's, slope units, (n,)."""
     errors: dict[str, FloatArray]
     """RMS of the path minus the truth by estimator, slope units, (n,)."""
     status: dict[str, IntArray]
-    """A `Status` by estimator, -1 where there is no estimate, (n,)."""
+    """The `Status` by estimator, -1 where there is no estimate, (n,)."""
     nis: dict[str, FloatArray]
-    """NIS of the output's axis by estimator, of those that measure something, (n,)."""
+    """NIS of the output's axis by estimator, for those that measure something, (n,)."""
     mean_nis: dict[str, FloatArray]
-    """The same as a mean over all axes of which something was measured, (n,)."""
+    """Mean NIS over all axes with a measurement, by estimator, (n,)."""
     measurements: dict[str, int]
-    """Numbers that an estimator measures of an axis."""
+    """Number of measurements of an estimator for an axis."""
     scores: dict[str, Score]
     spans: FloatArray
     """First step and end of each column of the blur, from the first exposure on, (columns, 2)."""
     blur: FloatArray
-    """Intensity density over the output's positions, one over slope units, (columns, pixels); NaN: never came."""
+    """Intensity density over the output's positions, one over slope units, (columns, pixels); NaN where a pixel never
+    came."""
     paths: dict[str, Paths] = field(default_factory=dict)
-    """By ``truth`` and by estimator; those that have any."""
+    """Paths by name, which is ``truth`` or an estimator that has any."""
 
     def __len__(self) -> int:
         return len(self.frame_ids)
@@ -97,15 +100,15 @@ class Overview:
 
     @property
     def frames_lost(self) -> IntArray:
-        """Frames lost between the exposure before and each, (n,)."""
+        """Frames lost between each exposure and the one before it, (n,)."""
         return np.asarray(np.maximum(np.diff(self.frame_ids, prepend=self.frame_ids[:1] - 1) - 1, 0))
 
     def scale(self, unit: TimeUnit) -> float:
-        """What a fast step is in a unit."""
+        """The length of a fast step in a unit."""
         return self.series.rig.timing.fast_step_s if unit == "s" else 1.0
 
     def telling(self) -> dict[int, str]:
-        """The exposures that tell most, by number: why each is one of them. Fewer where they are the same."""
+        """The most telling exposures, by number, each with the reason; fewer where one exposure has several reasons."""
         told: dict[int, str] = {}
 
         def tell(number: int, why: str) -> None:
@@ -141,7 +144,7 @@ def overview(
     output:
         Number of the output (a row of a path) whose blur and paths are drawn.
     progress:
-        Is told how many exposures have been read.
+        Called with the number of exposures read.
 
     Raises
     ------
@@ -217,7 +220,7 @@ class _Gathered:
             self._close_column()
 
     def _close_column(self) -> None:
-        """What the exposures of a column have in common: their mean blur, the range of their paths."""
+        """Finish a column: the mean blur of its exposures, and the range of their paths."""
         if not self.column:
             return
         exposures = [exposure for exposure, _ in self.column]
@@ -283,13 +286,15 @@ class _Gathered:
 
 
 def profile_density(sensor: BaseSensor, exposure: Exposure, output: int) -> FloatArray:
-    """Intensity density over the positions of one output, one over slope units, (pixels,); NaN: it never came."""
+    """Intensity density over the positions of one output, one over slope units, (pixels,); NaN where a pixel never
+    came."""
     found = profiles_of(sensor, exposure.pixels, exposure.mask)
     return np.where(found.mask[output], to_density(sensor.profile, found.counts[output]), np.nan)
 
 
 def limits_of(line: Sensor, paths: Sequence[FloatArray]) -> tuple[float, float]:
-    """The part of the field that paths and their blur are in, slope units; the whole field where there is none."""
+    """The part of the field that holds the paths and their blur, slope units; the whole field where there are no
+    paths."""
     known = [path for path in paths if np.isfinite(path).any()]
     if not known:
         return line.field
@@ -301,7 +306,7 @@ def limits_of(line: Sensor, paths: Sequence[FloatArray]) -> tuple[float, float]:
 
 @lru_cache(maxsize=64)
 def nis_bounds(degrees_of_freedom: int) -> tuple[float, float]:
-    """Between which a consistent estimator's NIS lies in `NIS_COVERAGE` of the exposures (two-sided)."""
+    """The bounds of a consistent estimator's NIS in `NIS_COVERAGE` of the exposures (two-sided)."""
     tail = (1 - NIS_COVERAGE) / 2
     return chi_square_quantile(tail, degrees_of_freedom), chi_square_quantile(1 - tail, degrees_of_freedom)
 

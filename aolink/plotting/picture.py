@@ -1,4 +1,4 @@
-"""A recording at one look, as one PNG: for machines on which the viewer cannot draw."""
+"""An overview of a recording as one PNG, for machines on which the viewer cannot draw."""
 
 from __future__ import annotations
 
@@ -68,14 +68,14 @@ def draw_session(series: Series, path: str | Path) -> Path:
 
 
 def _close_ups(view: Overview) -> list[int]:
-    """From each third of the session the exposure in which the spot moved most."""
+    """The exposure in which the spot moved most, from each third of the session."""
     edges = np.unique(np.linspace(0, len(view), _CLOSE_UPS + 1).astype(int))
     moved = np.nan_to_num(view.moved, nan=-1.0)
     return [int(a + np.argmax(moved[a:b])) for a, b in pairwise(edges)]
 
 
 def _draw_errors(figure: Any, view: Overview) -> None:
-    """Error of the path along the session, and over all of it."""
+    """Draw the error of the path along the session, and over all of it."""
     over_time, whole = figure.subplots(1, 2, width_ratios=[2, 1])
     if not view.errors:
         for axes in (over_time, whole):

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure, SubFigure
 
 _EXPOSURES = 24
-"""Read for the maps, spread evenly over the series."""
+"""Most exposures that are read for the maps, spread evenly over the series."""
 _MAP_IN = (2.6, 2.3)
 _LEAST_SPOTS = 4
 
@@ -46,9 +46,9 @@ def plot_pupil(
     Parameters
     ----------
     figure:
-        Where to draw; by default a new figure.
+        The figure to draw on; by default a new one.
     estimator:
-        Whose paths; by default those of the estimator to look at first.
+        Estimator whose paths are drawn; by default the one with the highest rank.
     columns:
         Maps in a row.
 
@@ -87,11 +87,12 @@ MAPS = {
     "blur": ("blur", "RMS of the path, slope units", "magma"),
     "nis": ("NIS", "no unit", "magma"),
 }
-"""Maps by the name of their values: title, what the colours are, colour map."""
+"""Maps by the name of their values: title, meaning of the colours, colour map."""
 
 
 def spot_values(rig: Rig, exposure: Exposure, estimate: Estimate | None) -> dict[str, FloatArray]:
-    """A number for each lit lenslet, (spots,), by the names of `MAPS`: those that an exposure and its estimate tell.
+    """A number for each lit lenslet, (spots,), by the names of `MAPS`, as far as an exposure and its estimate have
+    them.
 
     Without an estimate slopes are the spots' centroids. NIS is there where each spot has axes of its own, and NaN
     where nothing was measured.
@@ -115,7 +116,7 @@ def spot_values(rig: Rig, exposure: Exposure, estimate: Estimate | None) -> dict
 
 
 def _maps(series: Series, names: Sequence[str]) -> dict[str, tuple[str, FloatArray, str]]:
-    """Each map by its title: what its colours are, a value for each spot, a colour map."""
+    """Each map by its title: the meaning of its colours, a value for each spot, a colour map."""
     seen: dict[str, list[FloatArray]] = {}
     for number in np.unique(np.linspace(0, max(len(series) - 1, 0), _EXPOSURES).astype(int)):
         for exposure, estimates in series[int(number) : int(number) + 1].with_estimates(names):

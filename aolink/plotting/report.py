@@ -30,9 +30,10 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _SIDE_BY_SIDE = 3
-"""So many recordings have all their figures, beside each other; of more there is a table, and one figure of each."""
+"""Up to this many recordings stand beside each other with all their figures; for more there is a table, and one figure
+of each."""
 _DPI = 150
-"""Resolution of what is no line in a figure, dots per inch."""
+"""Resolution of the pictures in a figure, dots per inch."""
 _WIDE, _NARROW = (160.0, 66.0), (110.0, 66.0)
 """Width and height of figures, mm."""
 _STYLE = """
@@ -61,20 +62,20 @@ def write_report(
     recordings: Sequence[Recording], path: str | Path, *, unit: TimeUnit = "s", overwrite: bool = False,
     progress: Callable[[str, int], None] | None = None,
 ) -> Path:  # fmt: skip
-    """Write a page of HTML that says what recordings hold and how good their estimates are.
+    """Write a page of HTML about the content of recordings and the quality of their estimates.
 
-    Figures, style and all else are in the one file; it has no scripts and loads nothing. What a recording does not
-    have, or what cannot be read of it, is said in its place. Up to three recordings stand side by side with all their
-    figures; of more there is a table, and for each one figure of the session.
+    Figures, style and all else are in the one file; it has no scripts and loads nothing. Where a recording lacks data,
+    or cannot be read, a sentence says so. Up to three recordings stand side by side with all their figures; for more
+    there is a table, and for each one figure of the session.
 
     Parameters
     ----------
     unit:
-        What time axes count.
+        The unit of time axes.
     overwrite:
         Whether a file of that name may be replaced.
     progress:
-        Is told the name of the recording that is read, and how many of its exposures have been.
+        Called with the name of the recording that is read, and the number of its exposures read so far.
 
     Raises
     ------
@@ -106,7 +107,7 @@ class _Session:
             self.view = overview(recording, progress=lambda done: progress(self.name, done))
         except (AolinkError, ValueError, ArithmeticError) as error:
             self.problem = str(error)
-        self.facts = recording_facts(recording)  # after all of it was read: damage is known then
+        self.facts = recording_facts(recording)  # damage is known after all of it was read
 
     def title(self) -> str:
         return f"<h3>{escape(self.name)}</h3>"
@@ -114,7 +115,7 @@ class _Session:
     def drawn(
         self, size: tuple[float, float], caption: str, draw: Callable[[Overview, Figure], object]
     ) -> str:  # fmt: skip
-        """A figure with its caption; where it cannot be drawn, why."""
+        """A figure with its caption; where it cannot be drawn, the reason."""
         if self.view is None:
             return _note(self.problem)
         try:
@@ -133,7 +134,7 @@ class _Session:
             "size": with_unit(facts["bytes"], "B"),
             **self.recording.facts(),
             "gaps": f"{facts['gaps']['count']}, the longest {facts['gaps']['longest_steps']} fast steps",
-            "steps": _counts(facts["commands"]) or "no account of commanded steps",
+            "steps": _counts(facts["commands"]) or "no counts of commanded steps",
             "losses": _counts(facts["losses"]) or "none counted",
             "damage": facts["damage"],
         }
@@ -142,7 +143,7 @@ class _Session:
         return _facts(rows)
 
     def lacks(self) -> list[str]:
-        """What is not in the recording, in sentences."""
+        """Sentences about the data that the recording lacks."""
         recording, said = self.recording, []
         if self.view is not None and not len(self.view):
             said.append("It holds no exposure: there is nothing to draw.")
@@ -153,7 +154,7 @@ class _Session:
         if topics.COMMAND not in recording.counts:
             said.append("It holds no commands.")
         if topics.APPLIED not in recording.counts:
-            said.append("It holds no reports of what the mirror did; inputs are those commanded, or zero.")
+            said.append("It holds no reports of the mirror; inputs are those commanded, or zero.")
         if recording.rig.scene is not None and topics.RESTORED_SCENE not in recording.counts:
             said.append("Its pictures were not restored; `aolink deblur` does that.")
         if recording.damage:
@@ -167,7 +168,7 @@ class _Session:
         return _score_table(self.view.scores)
 
     def exposures(self) -> str:
-        """The exposures that tell most."""
+        """The most telling exposures."""
         if self.view is None:
             return _note(self.problem)
         parts = []
@@ -198,7 +199,7 @@ class _Session:
 
     def blur(self) -> str:
         return self.drawn(
-            _NARROW, "What the camera saw, and where the spot was.",
+            _NARROW, "The camera's blur, and the positions of the spot.",
             lambda view, figure: plot_blur(view, figure.subplots(), unit=self.unit),
         )  # fmt: skip
 
@@ -269,7 +270,7 @@ def _page(sessions: Sequence[_Session]) -> str:
 
 
 def _sections(sessions: Sequence[_Session]) -> Iterable[str]:
-    """All that there is of a few sessions, each section side by side."""
+    """All sections of a few sessions, each section side by side."""
     one = len(sessions) == 1
 
     def beside(title: str, give: Callable[[_Session], str]) -> str:
@@ -277,7 +278,7 @@ def _sections(sessions: Sequence[_Session]) -> Iterable[str]:
 
     yield beside("The session", lambda each: each.what_it_was() + "".join(map(_note, each.lacks())))
     yield beside("The estimates", _Session.scores)
-    yield beside("Inside the exposures that tell most", _Session.exposures)
+    yield beside("Inside the most telling exposures", _Session.exposures)
     if one:
         figures = [draw(sessions[0]) for draw in _OVER_SESSION.values()]
         yield "<h2>Over the session</h2>" + _row(figures, "row pairs")

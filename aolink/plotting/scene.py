@@ -21,17 +21,17 @@ _PICTURE_IN = (3.0, 3.2)
 def plot_scene(
     recording: Recording, number: int, figure: Figure | SubFigure | None = None
 ) -> Figure | SubFigure:  # fmt: skip
-    """Draw the picture sensor's scene of one exposure: as it came, restored, and at rest, so far as they are there.
+    """Draw the picture sensor's scene of one exposure: as it came, restored, and at rest, as far as these exist.
 
-    All have the same grey: black is dark, white an intensity of one. Pixels that never came are red. In a recording
-    of a rig without a picture sensor whose spots were restored, it is the frame of the spots.
+    All have the same grey: black is dark, white an intensity of one. Pixels that never came are red. For a rig without
+    a picture sensor whose spots were restored, the frame of the spots is drawn.
 
     Parameters
     ----------
     number:
         Number of the exposure in the recording, counted from 0.
     figure:
-        Where to draw; by default a new figure.
+        The figure to draw on; by default a new one.
 
     Raises
     ------
@@ -54,7 +54,7 @@ def plot_scene(
 
 
 def _pictures(recording: Recording, number: int) -> dict[str, FloatArray]:
-    """Pictures of one exposure by what they are, intensity; NaN where a pixel never came."""
+    """Pictures of one exposure by their description, intensity; NaN where a pixel never came."""
     exposure, _ = exposure_with_estimates(recording, number, [])
     restored = next((each for each in recording.restored() if each.frame_id == exposure.frame_id), None)
     sensor, found = recording.rig.scene, {}

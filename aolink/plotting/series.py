@@ -1,4 +1,4 @@
-"""What `Series.plot` draws: blur and paths over the NIS."""
+"""The figure of `Series.plot`: blur and paths over the NIS."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Figures of a whole session, each on axes that are given or made: blur and paths, NIS, errors."""
+"""Figures of a whole session, each on given axes or new ones: blur and paths, NIS, errors."""
 
 from __future__ import annotations
 
@@ -20,23 +20,24 @@ if TYPE_CHECKING:
 _BRIGHTEST = 98.0
 """Percentile of the columns' brightest pixels that is drawn black."""
 _RUNNING = 20
-"""The errors are averaged over this share of the session."""
+"""The errors are averaged over one part in this many of the session."""
 _MOST_POINTS = 3000
-"""Points of a line: a longer one is drawn as the range of its values."""
+"""Most points of a curve: a longer one is drawn as the range of its values."""
 
 
 def plot_blur(
     view: Overview, axes: Axes | None = None, *, names: Sequence[str] | None = None, unit: TimeUnit = "s",
     bar: bool = True,
 ) -> Axes:  # fmt: skip
-    """What the camera saw of one output, exposure by exposure, and where the spot was.
+    """Draw the camera's blur of one output, exposure by exposure, and the positions of the spot.
 
     Parameters
     ----------
     names:
-        Whose paths are drawn: ``truth`` or estimators; by default the truth and the estimator to look at first.
+        Names whose paths are drawn: ``truth`` or estimators; by default the truth and the estimator with the highest
+        rank.
     bar:
-        Whether a colour bar says what the grey is.
+        Whether a colour bar explains the grey.
 
     Raises
     ------
@@ -67,7 +68,7 @@ def plot_blur(
 
 
 def _draw_paths(axes: Axes, view: Overview, name: str, scale: float) -> None:
-    """Paths as one line with gaps between exposures; where they swing too fast for that, their range."""
+    """Draw paths as one line with gaps between exposures; where they swing too fast for that, draw their range."""
     paths = view.paths[name]
     begin, end = view.spans[:, :1], view.spans[:, 1:]
     gap = np.full((len(begin), 1), np.nan)
@@ -90,10 +91,10 @@ def _draw_paths(axes: Axes, view: Overview, name: str, scale: float) -> None:
 def plot_nis(
     view: Overview, axes: Axes | None = None, *, one_axis: bool = False, unit: TimeUnit = "s"
 ) -> Axes:  # fmt: skip
-    """The NIS of each estimator with the interval that holds 95 % of its values if the filter is consistent.
+    """Draw the NIS of each estimator with the interval that holds 95 % of its values if the filter is consistent.
 
     With many axes it is their mean, whose interval is narrower; with ``one_axis`` it is that of the overview's output.
-    What was gated is a cross.
+    Gated exposures are crosses.
 
     Raises
     ------
@@ -128,7 +129,7 @@ def plot_nis(
 
 
 def plot_errors(view: Overview, axes: Axes | None = None, *, unit: TimeUnit = "s") -> Axes:
-    """RMSE of each estimator's path along the session, as a running mean over a twentieth of it.
+    """Draw the RMSE of each estimator's path along the session, as a running mean over a twentieth of it.
 
     Raises
     ------
@@ -155,12 +156,12 @@ def plot_errors(view: Overview, axes: Axes | None = None, *, unit: TimeUnit = "s
 
 
 def time_label(unit: TimeUnit) -> str:
-    """What is written at a time axis."""
+    """The label of a time axis."""
     return "time (s)" if unit == "s" else "fast step"
 
 
 def thinned(times: NDArray[Any], values: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """A line of at most some thousand points that shows the same ranges: of many points the extremes of each run."""
+    """A curve of at most some thousand points that shows the same ranges: it has the extremes of each run of points."""
     if len(times) <= _MOST_POINTS:
         return np.asarray(times, dtype=np.float64), values
     runs = np.array_split(np.arange(len(times)), _MOST_POINTS // 2)

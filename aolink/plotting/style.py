@@ -1,4 +1,4 @@
-"""What all figures share: sizes, colours, the axes and figures that are given or made."""
+"""The common style of all figures: sizes, colours, and the axes and figures that are given or made."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure, SubFigure
 
 TimeUnit = Literal["s", "steps"]
-"""What a time axis counts: seconds, or fast steps."""
+"""The unit of a time axis: seconds, or fast steps."""
 
 BAND = 2.0
 """Standard deviations to each side of an estimate."""
@@ -29,12 +29,12 @@ _PAPER: dict[Any, Any] = {
     "axes.titlesize": 8,
 }  # fmt: skip
 _ENVELOPE_FROM = 0.5
-"""Where a line through some points of a path misses it by this share of its motion (RMS), its range is drawn."""
+"""Where a curve through some points of a path misses it by this share of its motion (RMS), its range is drawn."""
 
 
 @contextmanager
 def paper() -> Iterator[None]:
-    """Small type and thin lines, for figures made in the block. Raises ExportError without matplotlib."""
+    """A context with small type and thin lines for the figures made in it. Raises ExportError without matplotlib."""
     with needed("matplotlib", "plot", "a figure").rc_context(_PAPER):
         yield
 
@@ -61,7 +61,7 @@ def figure_or_new(figure: Figure | SubFigure | None, size_in: tuple[float, float
 
 
 def colour(name: str) -> tuple[float, ...]:
-    """As in the viewer, but for the truth, whose yellow is hard to see on white."""
+    """The colour of a name as in the viewer, except for the truth, whose yellow is hard to see on white."""
     return (0.0, 0.0, 0.0) if name == "truth" else tuple(part / 255 for part in estimator_colour(name))
 
 
@@ -79,18 +79,18 @@ def legend_above(axes: Axes, columns: int = 5) -> None:
 
 
 def colour_bar(mapped: Any, axes: Axes, label: str) -> None:
-    """A colour bar beside the axes, with what it shows and its unit."""
+    """A colour bar beside the axes, with its quantity and unit."""
     axes.figure.colorbar(mapped, ax=axes, label=label, shrink=0.9)
 
 
 def extremes(path: FloatArray, segments: int) -> tuple[FloatArray, FloatArray]:
-    """The least and the largest value of a path in each of so many segments of it, (segments,) each."""
+    """The least and the largest value of a path in each of its segments, (segments,) each."""
     parts = np.array_split(path, min(segments, len(path)))
     return np.array([part.min() for part in parts]), np.array([part.max() for part in parts])
 
 
 def hides_swings(path: FloatArray, count: int) -> bool:
-    """Whether a line through ``count`` points of a path, spread evenly, misses most of its motion."""
+    """Whether a curve through ``count`` points of a path, spread evenly, misses most of its motion."""
     places = np.linspace(0, len(path) - 1, min(count, len(path)))
     drawn = np.interp(np.arange(len(path)), places, path[places.astype(int)])
     return bool(np.std(path - drawn) > _ENVELOPE_FROM * np.std(path))

@@ -1,4 +1,4 @@
-"""What differs between two recordings, message by message and field by field."""
+"""The differences between two recordings, message by message and field by field."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ class TopicComparison:
     fields: dict[str, FieldDifference] = field(default_factory=dict)
 
     def count_alone(self, *, is_first: bool, text: str) -> None:
-        """Count a message that is in one of them only, with what it is called."""
+        """Count a message that is in one of them only, with its name."""
         if is_first:
             self.missing += 1
             self.first_missing = self.first_missing or text
@@ -133,8 +133,8 @@ def compare(
 
 
 class _Waiting:
-    """Messages whose counterpart has not come yet, in a database of SQLite: in memory up to `_BYTES_KEPT`, what comes
-    then in its temporary file. Messages with the same name come out in their order.
+    """Messages whose counterpart has not come yet, in a database of SQLite: in memory up to `_BYTES_KEPT`, and beyond
+    in its temporary file. Messages with the same name come out in their order.
     """
 
     def __init__(self) -> None:
@@ -179,7 +179,7 @@ class _Waiting:
         return topics.SCHEMAS.get(row[1], BytesValue).FromString(row[2])
 
     def left(self) -> Iterator[tuple[str, str, bool]]:
-        """What has no counterpart: topic, name, and whether it is in the first recording."""
+        """The messages without a counterpart: topic, name, and whether the message is in the first recording."""
         yield from self._file.execute("SELECT topic, name, is_first FROM kept ORDER BY number")
 
 
@@ -190,7 +190,7 @@ def _is_wanted(topic: str, only: Sequence[str]) -> bool:
 def _alternating(
     first: Recording, second: Recording, names: Sequence[str], relative_to_start: bool
 ) -> Iterator[tuple[bool, _Key, Message, int | None]]:
-    """The messages of both, a little of each in turn, so that only what has no partner yet is kept."""
+    """The messages of both recordings, a few of each in turn, so that only those without a partner are kept."""
     sides = []
     for is_first, recording in ((True, first), (False, second)):
         found = _messages(recording, names)
@@ -207,7 +207,7 @@ def _alternating(
 
 
 def _messages(recording: Recording, names: Sequence[str]) -> Iterator[tuple[str, Message]]:
-    """Topics and messages; those of kinds that aolink does not know as their bytes."""
+    """Topics and messages; messages of unknown kinds are given as bytes."""
     for raw in recording.raw_messages(*names):
         kind = topics.SCHEMAS.get(raw.schema)
         try:
@@ -224,7 +224,7 @@ def _from_start(messages: Iterator[tuple[str, Message]], recording: Recording) -
     first |= dict.fromkeys(("first_step", "last_step"), start.first_step)
     for topic, message in messages:
         for name, value in first.items():
-            # What is from before the start wraps around, as it would in the other recording.
+            # Numbers from before the start wrap around, as they do in the other recording.
             if isinstance(was := getattr(message, name, None), int) and (was or name != "cause_frame_id"):
                 setattr(message, name, (was - value) % 2**64)
         yield topic, message
@@ -279,7 +279,7 @@ def _compare_messages(
 
 
 def _is_time(field: str) -> bool:
-    """Whether a field is a time on some clock, or says how well that is known."""
+    """Whether a field is a time on some clock, or the uncertainty of one."""
     return (field.endswith("_ns") and field != "exposure_offset_ns") or field == "timestamp"
 
 

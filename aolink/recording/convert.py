@@ -1,4 +1,5 @@
-"""Plain data <-> the messages of a recording. Lossless: what is read back is what was written, bit for bit."""
+"""Conversion between plain data and the messages of a recording. It is lossless: the data that is read back is that
+which was written, bit for bit."""
 
 from __future__ import annotations
 
@@ -29,7 +30,7 @@ _COUNTS = np.dtype("<u2")
 _MOST_STEPS = 1_000_000
 """Fast steps of an exposure; more is damage, not data."""
 
-# What a frame, restored pictures and an estimate have alike with their messages.
+# Fields that a frame, restored pictures and an estimate share with their messages.
 _OF_FRAME = (
     "frame_id", "first_step", "last_step", "device_start_ns", "device_end_ns", "host_start_ns", "clock_sigma_ns",
     "alignment_sigma_ns", "host_first_byte_ns", "host_receive_ns", "chunks_lost", "frames_lost_before",
@@ -43,7 +44,7 @@ _OF_ESTIMATE = ("estimator", "frame_id", "first_step", "n_steps", "reason")
 
 
 def frame_messages(frame: Frame) -> tuple[pb.ExposureInfo, RawImage]:
-    """A frame as it is recorded: its facts, and its picture."""
+    """The messages of a frame: its facts, and its picture."""
     height, width = frame.pixels.shape
     offsets, lengths = _runs(~frame.mask.ravel())
     facts = {name: getattr(frame, name) for name in _OF_FRAME}
@@ -56,7 +57,7 @@ def frame_messages(frame: Frame) -> tuple[pb.ExposureInfo, RawImage]:
 
 
 def control_message(act: Act, controller: str, estimator: str) -> pb.Control:
-    """What a controller made of an exposure, as it is recorded."""
+    """The message of a controller's result for an exposure."""
     fit = act.fit
     return pb.Control(
         controller=controller,
@@ -70,13 +71,13 @@ def control_message(act: Act, controller: str, estimator: str) -> pb.Control:
 
 
 def restoration_message(done: RestoredPictures) -> pb.Restoration:
-    """The facts about an exposure's restored pictures, as they are recorded."""
+    """The message with the facts about an exposure's restored pictures."""
     return pb.Restoration(**{name: getattr(done, name) for name in _OF_RESTORATION})
 
 
 def restored_from_messages(info: pb.Restoration, scene: RawImage | None, spots: RawImage | None) -> RestoredPictures:
     """Inverse of `restoration_message` and `float_image`."""
-    from aolink.restoration import RestoredPictures  # it takes a second that few who read a recording need to spend
+    from aolink.restoration import RestoredPictures  # the import takes a second, and few readers of a recording need it
 
     return RestoredPictures(
         scene=scene and picture_from_float_image(scene), spots=spots and picture_from_float_image(spots),
@@ -85,7 +86,7 @@ def restored_from_messages(info: pb.Restoration, scene: RawImage | None, spots: 
 
 
 def float_image(picture: NDArray[np.float32], time_ns: int) -> RawImage:
-    """A restored picture as it is recorded."""
+    """The message of a restored picture."""
     height, width = picture.shape
     image = RawImage(frame_id="restored", width=width, height=height, encoding="32FC1", step=4 * width)
     image.timestamp.FromNanoseconds(time_ns)
@@ -94,16 +95,16 @@ def float_image(picture: NDArray[np.float32], time_ns: int) -> RawImage:
 
 
 def picture_from_float_image(image: RawImage) -> NDArray[np.float32]:
-    """Inverse of `float_image`. Raises RecordingError for a picture that is not what it says."""
+    """Inverse of `float_image`. Raises RecordingError for a picture whose data contradicts its description."""
     if image.encoding != "32FC1" or len(image.data) != 4 * image.width * image.height:
         raise RecordingError("a restored picture is damaged or not 32FC1: run `aolink info` on the file")
     return np.frombuffer(image.data, dtype="<f4").astype(np.float32).reshape(image.height, image.width)
 
 
 def frame_from_messages(info: pb.ExposureInfo, image: RawImage) -> Frame:
-    """Inverse of `frame_messages`; its arrays are not to be written into, others may have them too.
+    """Inverse of `frame_messages`; its arrays must not be changed, because other frames may share them.
 
-    Raises RecordingError for a picture that is not what it says.
+    Raises RecordingError for a picture whose data contradicts its description.
     """
     shape, data = (image.height, image.width), image.data
     first, last, lost, lengths = info.first_step, info.last_step, info.missing_offset, info.missing_length
@@ -132,7 +133,7 @@ def _whole(shape: tuple[int, int]) -> NDArray[np.bool_]:
 
 
 def estimate_message(estimate: Estimate) -> pb.Estimate:
-    """An estimate as it is recorded: the path as coefficients of the exposure basis."""
+    """The message of an estimate, with the path as coefficients of the exposure basis."""
     axes, n_states = estimate.end_state.shape
     spread = estimate.innovation_covariance.ravel()
     message = pb.Estimate(
@@ -166,14 +167,14 @@ def packed(covariance: NDArray[np.float64]) -> bytes:
     """Symmetric matrices (axes, n, n) of numbers in single precision, as schemas.proto says."""
     numbers = np.ascontiguousarray(covariance[:, _lower(covariance.shape[-1])], dtype="<f4")
     planes = np.ascontiguousarray(numbers.view(np.uint8).reshape(-1, 4).T)
-    # Bytes of exponents and of mantissas are coded apart, for they are distributed differently.
+    # Bytes of exponents and of mantissas are coded separately, because they are distributed differently.
     frame = zstandard.ZstdCompressor(level=1).compressobj(size=planes.nbytes)
     blocks = (frame.compress(each.tobytes()) + frame.flush(zstandard.COMPRESSOBJ_FLUSH_BLOCK) for each in planes)
     return b"".join(blocks) + frame.flush()
 
 
 def is_packed(data: bytes, axes: int, n: int) -> bool:
-    """Whether that is what bytes say that they hold, and memory has room for it."""
+    """Whether bytes declare such a matrix of this size, and memory has room for it."""
     try:
         size = zstandard.get_frame_parameters(data).content_size
     except zstandard.ZstdError:
@@ -195,7 +196,7 @@ def _unpacked(data: bytes, axes: int, n: int) -> NDArray[np.float64]:
 
 @lru_cache(maxsize=8)
 def _lower(n: int) -> NDArray[np.bool_]:
-    """Where the lower triangle of a matrix is."""
+    """The indices of the lower triangle of a matrix."""
     return np.tri(n, dtype=bool)
 
 

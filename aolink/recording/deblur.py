@@ -56,7 +56,7 @@ def write_deblurred(
     """Copy a recording with its pictures restored.
 
     Everything else stays, byte for byte; restored pictures that it has are replaced, and estimates of ``estimator``
-    are added if it has none. ``workers`` processes do it, with one thread each; this process does it if that is 0.
+    are added if it has none. ``workers`` processes do the work, with one thread each; with 0 this process does it.
 
     Raises
     ------
@@ -71,7 +71,7 @@ def write_deblurred(
     find_method(method)
     check_target(path, overwrite=overwrite, sources=recording.files, error=RecordingError)
     made = _deblurred(recording.rig, _estimated(recording, estimator), method, workers)
-    held = next(made, None)  # whether the estimator can work shows before the file is made
+    held = next(made, None)  # an estimator that cannot work shows before the file is made
     notes = {
         "aolink_version": version("aolink"),
         "deblurred_from": recording.path.name,
@@ -97,7 +97,7 @@ def _written(
     summary, log_times = Summary(), dict[int, int]()
     left_out: tuple[str, ...] = (topics.RESTORED,)
     if estimator not in recording.estimators:
-        left_out += (topics.estimation_topic(estimator),)  # the estimates are new, and of all exposures
+        left_out += (topics.estimation_topic(estimator),)  # the estimates are new, and belong to all exposures
     elif skipped := len(recording.skipped(estimator)):
         summary.reasons["the session had no time to estimate it: `aolink estimate -o` does"] = skipped
 
@@ -113,7 +113,7 @@ def _written(
     for raw in recording.raw_messages():
         if raw.topic == topics.EXPOSURE:
             frame_id = schemas_pb2.ExposureInfo.FromString(raw.data).frame_id
-            # What belongs to the exposures before this one has all gone by.
+            # All messages that belong to the exposures before this one have gone by.
             while held is not None and held[0].frame_id < frame_id:
                 emit(*held)
                 held = next(made, None)

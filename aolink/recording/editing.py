@@ -1,4 +1,4 @@
-"""Recordings made from recordings: salvaged, cut, merged, and side files.
+"""Recordings made from recordings: recovered, cut and merged ones, and side files.
 
 Messages are copied as bytes; sources stay untouched.
 """
@@ -33,7 +33,7 @@ _ALIKE_NS = 2_000_000_000
 
 @dataclass(frozen=True)
 class Edited:
-    """The contents of a new recording, and what was lost."""
+    """The contents of a new recording, and the losses."""
 
     path: Path
     messages: int
@@ -43,24 +43,24 @@ class Edited:
 
 
 class RecordingCopy:
-    """A recording that is written message by message, with what the first source has besides its messages.
+    """A recording that is written message by message, with the attachments and metadata of the first source.
 
     Parameters
     ----------
     path:
         An empty file that is there already, as `aolink.files.writing` gives one. It is cut back to its last whole part
-        where a ``with`` block ends before `finish`.
+        if a ``with`` block ends before `finish`.
     notes:
         Facts about the session in the place of those that the source has.
     attachments:
-        What is attached, by name; what the source has by default.
+        Attachments by name; by default those of the source.
     """
 
     def __init__(
         self, source: Recording, path: Path, notes: dict[str, str], attachments: Mapping[str, bytes] | None = None
     ) -> None:
         self.messages = self.exposures = 0
-        """How many have been written."""
+        """Numbers of messages and of exposures that have been written."""
         self._foreign, self._encodings = source.schemas, source.encodings
         self._schemas: dict[str, Schema] = {}
         self._file = McapFile(path, WriteOptions(), descriptor=open_unfinished(path))
@@ -71,7 +71,7 @@ class RecordingCopy:
         return self
 
     def __exit__(self, *error: object) -> None:
-        self._file.cut_back()  # nothing, where it is finished
+        self._file.cut_back()  # this does nothing after `finish`
 
     def add(self, message: RawMessage) -> None:
         schema = self._schemas.get(message.schema) or self._schema(message.schema)
@@ -81,14 +81,14 @@ class RecordingCopy:
         self._file.add(message.topic, schema, message.data, message.log_time_ns, self.messages, encoding)
 
     def _schema(self, name: str) -> Schema:
-        """The schema of a message as this aolink has it, or the source's where this aolink does not know the kind."""
+        """This aolink's schema of a message, or the source's where this aolink does not know the kind."""
         known = topics.SCHEMAS.get(name)
         schema = schema_of(known) if known is not None else self._foreign.get(name)
         self._schemas[name] = schema = schema or Schema(id=0, name=name, encoding="", data=b"")
         return schema
 
     def finish(self, losses: Sequence[Loss] = (), end: Mapping[str, str] | None = None) -> None:
-        """Write the index, and ``end`` as facts from the session's end."""
+        """Write the index, with ``end`` as the facts from the session's end."""
         damage = {"damage": "; ".join(loss.what for loss in losses[:20])} if losses else {}
         if facts := {**(end or {}), **damage}:
             self._file.add_metadata(topics.END_METADATA, facts)
@@ -96,12 +96,12 @@ class RecordingCopy:
 
 
 def side_file(recording: Recording, path: Path, notes: dict[str, str]) -> RecordingCopy:
-    """A side file that is being written: the same estimates give the same bytes, but for the facts from its end.
+    """A side file that is being written: the same estimates give the same bytes, except for the facts from its end.
 
     Parameters
     ----------
     recording:
-        What is estimated, with the rig that it is estimated with.
+        The recording that is estimated, with the rig that it is estimated with.
     path:
         An empty file that is there already, as `aolink.files.writing` gives one.
     notes:
@@ -113,7 +113,7 @@ def side_file(recording: Recording, path: Path, notes: dict[str, str]) -> Record
 
 
 def recorded_estimate(estimate: Estimate, log_time_ns: int) -> RawMessage:
-    """An estimate as the message that it is recorded as."""
+    """The message of an estimate."""
     return RawMessage.of(topics.estimate_topic(estimate.estimator), convert.estimate_message(estimate), log_time_ns)
 
 
@@ -123,7 +123,7 @@ def recover(source: Path, target: Path, *, overwrite: bool = False, progress: Pr
     Raises
     ------
     RecordingError
-        ``source`` is no recording, or nothing of it can be used; ``target`` exists and not ``overwrite``, or
+        ``source`` is not a recording, or no part of it can be used; ``target`` exists and not ``overwrite``, or
         cannot be written.
     """
     recording = Recording(source, check=True)
@@ -137,9 +137,10 @@ def cut(
     source: Path, target: Path, start_s: float, end_s: float, *, overwrite: bool = False,
     progress: Progress = no_progress,
 ) -> Edited:  # fmt: skip
-    """Copy the exposures that were received between two times, s from the recording's start, with all they need.
+    """Copy the exposures that were received between two times, s from the recording's start, with all messages that
+    they need.
 
-    The commands that were given before and reach into the first exposure come along, and the reports on the last one.
+    The copy also has the earlier commands that reach into the first exposure, and the reports on the last one.
 
     Raises
     ------
@@ -199,7 +200,7 @@ def _copied(
     recordings: Sequence[Recording], target: Path, messages: Iterator[RawMessage], notes: dict[str, str],
     overwrite: bool, progress: Progress, *, end: Mapping[str, str] | None = None, nothing: str = "",
 ) -> Edited:  # fmt: skip
-    """Write messages of these recordings; ``nothing`` is what is wrong where there is no exposure among them."""
+    """Write messages of these recordings; ``nothing`` is the error's text where there is no exposure among them."""
     first, sources = recordings[0], [path for each in recordings for path in each.files]
     with (
         writing(target, overwrite=overwrite, sources=sources, error=RecordingError) as partial,
@@ -245,7 +246,7 @@ def _between(recording: Recording, low: int, high: int) -> Iterator[RawMessage]:
             if raw.topic in wanted:
                 yield raw
         elif row.belongs_to == "steps":
-            # Also after the end, until all is known of the last exposure.
+            # Also after the end, until the last exposure is complete.
             if frames and (inside or message.first_step <= last_step):
                 yield raw
         elif row.belongs_to == "exposure":

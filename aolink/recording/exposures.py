@@ -1,4 +1,5 @@
-"""Messages of a recording become exposures, and find what was recorded beside them."""
+"""The assembly of exposures from a recording's messages, with the truth and the scene that were recorded beside
+them."""
 
 from __future__ import annotations
 
@@ -47,7 +48,7 @@ class ExposureAssembly:
 
 
 class Companions:
-    """Exposures that wait for what is recorded beside them: truth and scene."""
+    """Exposures that wait for their truth and scene, which are recorded beside them."""
 
     def __init__(self, counts: Container[str]) -> None:
         self._waiting: deque[Exposure] = deque()
@@ -58,14 +59,14 @@ class Companions:
         self._info: schemas_pb2.ExposureInfo | None = None
 
     def add(self, exposures: list[Exposure]) -> list[Exposure]:
-        """Take the next exposures; gives those that have all that they will get."""
+        """Take the next exposures; gives those that wait for nothing more."""
         if not self._expected:
             return exposures
         self._waiting.extend(exposures)
         return self._ready()
 
     def take(self, topic: str, message: Message) -> list[Exposure]:
-        """Take a message that belongs to an exposure; gives as `add` does."""
+        """Take a message that belongs to an exposure; gives exposures as `add` does."""
         if isinstance(message, wire.Truth):
             self._truths[message.frame_id] = convert.truth_from_message(message)
         elif topic == topics.SCENE_EXPOSURE and isinstance(message, schemas_pb2.ExposureInfo):
@@ -76,11 +77,11 @@ class Companions:
         return self._ready()
 
     def flush(self) -> list[Exposure]:
-        """The exposures that still wait, with what came for them."""
+        """The exposures that still wait, with the messages that came for them."""
         return [self._next() for _ in range(len(self._waiting))]
 
     def _ready(self) -> list[Exposure]:
-        # What is beside an exposure may come after it, but not after the next one.
+        # Truth and scene may come after their exposure, but not after the next one.
         ready, waiting = [], self._waiting
         while len(waiting) > 1 or (waiting and all(waiting[0].frame_id in found for found in self._expected)):
             ready.append(self._next())

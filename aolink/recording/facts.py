@@ -1,4 +1,4 @@
-"""What a recording holds: rates, gaps, losses, estimates, the session's own facts; as plain data."""
+"""The summary of a recording as plain data: rates, gaps, losses, estimates, the session's own facts."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ _LOSSES = (
     "steps_clipped", "steps_parked", "ports_vanished", "control_open_exposures", "control_late_exposures",
     "control_misfit_exposures", "control_fall_back_exposures",
 )  # fmt: skip
-"""What a session counts of what went wrong."""
+"""A session's counts of losses and faults."""
 _ENDS = ("commanded", "applied", "superseded", "late", "refused", "not_reported")
 """Steps that a session commanded, and how they ended: the first is the sum of the others."""
 
 
 def recording_facts(recording: Recording) -> dict[str, Any]:
-    """What a recording holds, as plain data: what `aolink info --json` prints."""
+    """The summary of a recording as plain data, which `aolink info --json` prints."""
     duration_s = (recording.end_ns - recording.start_ns) / 1e9
     gaps, estimates = _gaps_and_estimates(recording)
     return {
@@ -58,7 +58,7 @@ def recording_facts(recording: Recording) -> dict[str, Any]:
 
 
 def _date(time_ns: int) -> str | None:
-    """A time on the host's clock as a date, ISO 8601; None for one that no calendar has."""
+    """A time on the host's clock as a date, ISO 8601; None for one outside the calendar."""
     try:
         return datetime.fromtimestamp(time_ns / 1e9, UTC).isoformat(timespec="seconds")
     except (OverflowError, ValueError, OSError):
@@ -66,9 +66,8 @@ def _date(time_ns: int) -> str | None:
 
 
 def _gaps_and_estimates(recording: Recording) -> tuple[dict[str, float], dict[str, Any]]:
-    """Where the camera's frames are further apart than their period: how often, and the longest, in fast steps.
-
-    And for each estimator how many estimates there are, and why some could not use their exposure.
+    """Number and longest length of the gaps between the camera's frames, in fast steps. Also the number of estimates of
+    each estimator, and the reasons why some could not use their exposure.
     """
     period, last, gaps = recording.rig.timing.frame_period_steps, None, []
     names = recording.estimators
@@ -82,14 +81,14 @@ def _gaps_and_estimates(recording: Recording) -> tuple[dict[str, float], dict[st
         elif isinstance(message, EstimateMessage):
             name = recorded.topic.removeprefix(topics.ESTIMATE)
             counts[name] += 1
-            with contextlib.suppress(ValueError):  # a status that a later aolink has
+            with contextlib.suppress(ValueError):  # a status of a later aolink
                 unused[name].add(Status(message.status), message.reason, message.frame_id)
     estimates = {name: {"count": n, "unused": [asdict(u) for u in unused[name].result()]} for name, n in counts.items()}
     return {"count": len(gaps), "longest_steps": max(gaps, default=0)}, estimates
 
 
 def _losses(recording: Recording) -> dict[str, int]:
-    """What was lost in the session, by cause; and in the file."""
+    """The losses in the session, by cause; and those in the file."""
     counted = {
         name: int(recording.metadata[name])
         for name in _LOSSES
@@ -104,7 +103,7 @@ def _losses(recording: Recording) -> dict[str, int]:
 
 
 def _typed(name: str, value: str) -> Any:
-    """A value of the metadata, which knows text only."""
+    """A value of the metadata, which holds text only, with its type."""
     if name in ("note", "rig", "rig_digest", "camera", "mirror", "controller", "control"):
         return value
     with contextlib.suppress(ValueError):

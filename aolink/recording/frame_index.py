@@ -1,4 +1,4 @@
-"""Where in a file an exposure begins, by the file's own index: what a slice of a recording has to read."""
+"""The place in a file where an exposure begins, by the file's own index: a slice of a recording is read from there."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from aolink.recording.scan import open_recording
 from aolink.recording.search import HEAD
 
 _INDEX_HEAD = struct.Struct("<HI")
-"""Channel and bytes of a message index, ..."""
+"""Channel and bytes of a message index."""
 _ENTRY_BYTES = 16
-"""... each of whose entries has so many."""
+"""Bytes of an entry in a message index."""
 
 StepRun = tuple[str, int]
 """Topic of a command or a report, and the fast step after its last."""
@@ -26,17 +26,17 @@ StepRun = tuple[str, int]
 
 @dataclass(frozen=True, slots=True)
 class FrameIndex:
-    """How many frames there are before each chunk of a file."""
+    """The number of frames before each chunk of a file."""
 
     before: Sequence[int]
-    """(chunks + 1,): the last is the number of all frames."""
+    """Frames before each chunk, (chunks + 1,); the last element is the number of all frames."""
 
     @classmethod
     def of(cls, path: Path, chunks: Sequence[ChunkIndex], frames: Collection[int]) -> FrameIndex | None:
         """Count the messages of the channels ``frames``; None where the file does not index its messages."""
         counts = []
         with open_recording(path) as file:
-            unbuffered = getattr(file, "raw", file)  # a few bytes of each chunk are wanted, and not a page of it
+            unbuffered = getattr(file, "raw", file)  # only a few bytes of each chunk are needed, not a page
             for chunk in chunks:
                 count = 0
                 for channel, offset in chunk.message_index_offsets.items():
@@ -54,20 +54,20 @@ class FrameIndex:
         return cls([0, *accumulate(counts)])
 
     def chunk_of(self, frame: int) -> int:
-        """Number of the chunk that a frame, by its number from 0 on, is in."""
+        """Number of the chunk that holds a frame, which is given by its number from 0 on."""
         return bisect_right(self.before, frame) - 1
 
     def first_chunk(self, frame: int, reach: Mapping[str, int], runs_in: Callable[[int], Iterator[StepRun]]) -> int:
-        """Number of the chunk from which on all commands and reports are that a frame is made with.
+        """Number of the first chunk with commands and reports that a frame needs.
 
         Parameters
         ----------
         frame:
-            Its number.
+            Number of the frame.
         reach:
-            By topic: before a message whose steps end at this step or earlier, there is nothing that the frame needs.
+            A fast step for each topic: nothing before a message whose steps end at this step or earlier is needed.
         runs_in:
-            What of these topics is in a chunk.
+            A function that gives the messages of these topics in a chunk.
         """
         missing, chunk = set(reach), self.chunk_of(frame)
         while missing and chunk > 0:

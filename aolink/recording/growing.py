@@ -18,22 +18,22 @@ from aolink.rig import Rig
 
 
 class GrowingRecording(Recording):
-    """A recording whose exposures come as they are written: what gives them waits for more.
+    """A recording whose exposures come as they are written: the iterator waits for more.
 
-    They end where the file does: with the end of its data or, where it was cut off, when nobody writes it any longer.
+    They end with the file: with the end of its data or, where it was cut off, when no process writes it any longer.
     They can be read once, in order, without truth and scene; numbers, slices and counts need an index.
 
     Parameters
     ----------
     wait:
-        Called where there is nothing new, before the next look at the file.
+        Called where there is nothing new, before the file is read again.
     rig:
-        As of `Recording`.
+        The rig, as for `Recording`.
 
     Raises
     ------
     RecordingError
-        As by `Recording`; the file is behind a URL, or does not begin with its rig file.
+        As for `Recording`; or the file is behind a URL, or does not begin with its rig file.
     """
 
     def __init__(self, path: str | Path | Url, wait: Callable[[], None], *, rig: Rig | None = None) -> None:
@@ -85,13 +85,14 @@ class GrowingRecording(Recording):
                     what = f"it was cut off: it ends at byte {position}, without an index"
                     self._lose(Loss(position, 0, what))
                     return
-                # What was written between the last look and the writer's end is still read.
+                # Records written between the last reading and the writer's end are still read.
                 if written := _is_being_written(path):
                     self._wait()
 
 
 def _is_being_written(path: Path) -> bool:
-    """As `files.is_being_written`; true where that cannot be found out, as of a file that may only be read."""
+    """Whether the file is being written, as by `files.is_being_written`; true where that cannot be found out, as for a
+    read-only file."""
     try:
         return files.is_being_written(path)
     except OSError:

@@ -12,7 +12,7 @@ from aolink.recording import topics
 
 
 class Lead:
-    """Follows the messages of a recording, and keeps those that later exposures are made from."""
+    """Reads the messages of a recording, and keeps those that later exposures need."""
 
     def __init__(self) -> None:
         self._kept: deque[tuple[str, Any, int, int]] = deque()
@@ -29,5 +29,5 @@ class Lead:
             )
 
     def messages(self) -> Iterator[tuple[str, Message, int, int]]:
-        """Topic, message, log time and sequence of what is kept, in order."""
+        """Topic, message, log time and sequence of the messages kept, in order."""
         return iter(self._kept)

@@ -1,4 +1,5 @@
-"""One MCAP file that is being written: channels by topic, chunks cut by time, whole up to a known byte."""
+"""One MCAP file that is being written: it has a channel for each topic and chunks divided by time, and is whole up to a
+known byte."""
 
 from __future__ import annotations
 
@@ -29,24 +30,24 @@ _SEAL = "crc32"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WriteOptions:
-    """How a recording is cut into chunks, and when they reach the disk.
+    """How a recording is divided into chunks, and when they reach the disk.
 
     Defaults as measured by ``tools/bench recording``: LZ4 keeps the longest single write call under a
     millisecond, and a killed process loses no more than twice ``flush_s``.
     """
 
     compression: str = "lz4"
-    """One of `COMPRESSIONS`."""
+    """The compression, one of `COMPRESSIONS`."""
     chunk_bytes: int = 128 << 10
     """A chunk that has grown to this size goes to the file."""
     flush_s: float = 0.1
     """A chunk that is this old goes to the file: a killed process loses no more than twice that."""
     fsync_s: float = 1.0
-    """How often the file goes to the disk: a power cut loses no more than that and twice ``flush_s``."""
+    """Time between two synchronisations with the disk, s: a power cut loses no more than that and twice ``flush_s``."""
     split_bytes: int = 0
     """A file of this size is ended and another begun; 0 for one file."""
     split_s: float = 0.0
-    """The same after this time; 0 for one file."""
+    """A file that is this old is ended and another begun; 0 for one file."""
 
     def __post_init__(self) -> None:
         if self.compression not in COMPRESSIONS:
@@ -63,7 +64,7 @@ class WriteOptions:
 
 
 class _File:
-    """An open file that writes all or raises."""
+    """An open file that writes all bytes or raises an error."""
 
     def __init__(self, descriptor: int) -> None:
         self.descriptor = descriptor
@@ -81,14 +82,14 @@ class _File:
         return self._position
 
     def flush(self) -> None:
-        """Nothing is held back."""
+        """Do nothing: no bytes are held back."""
 
     def close(self) -> None:
         os.close(self.descriptor)
 
 
 class McapFile:
-    """Writes messages that are bytes already. Not thread-safe; what the disk says is raised as OSError.
+    """Writes messages that are bytes already. It is not thread-safe; errors of the disk are raised as OSError.
 
     Parameters
     ----------
@@ -164,7 +165,8 @@ class McapFile:
         if schema.name not in self._schemas:
             self._schemas[schema.name] = self._writer.register_schema(schema.name, schema.encoding, schema.data)
         channel = self._writer.register_channel(topic, encoding, self._schemas[schema.name])
-        # The channel itself is in the chunk. Were that chunk damaged, later ones could not be read: say it twice.
+        # The channel itself is in the chunk. If that chunk were damaged, later ones could not be read, so the channel
+        # is written twice.
         known = {"id": str(channel), "topic": topic, "schema": schema.name}
         self._writer.add_metadata(topics.CHANNEL_METADATA, sealed(topics.CHANNEL_METADATA, known))
         return channel
@@ -176,11 +178,11 @@ class McapFile:
         self._whole = self.size
 
     def sync(self) -> None:
-        """Wait until the disk has what the file has."""
+        """Wait until the file's content is on the disk."""
         os.fsync(self._file.descriptor)
 
     def finish(self, *, sync: bool = False) -> None:
-        """Write the index and close; with ``sync``, when the disk has it."""
+        """Write the index and close; with ``sync``, wait until it is on the disk."""
         self.flush()
         self._writer.finish()
         if sync:
@@ -189,7 +191,7 @@ class McapFile:
         self._file.close()
 
     def cut_back(self) -> None:
-        """Leave a file that ends with its last whole part, and close it. Raises nothing."""
+        """Cut the file back to its last whole part, and close it. Raises nothing."""
         if self._closed:
             return
         self._closed = True
@@ -207,8 +209,8 @@ def sealed(name: str, values: Mapping[str, str]) -> dict[str, str]:
 def unsealed(records: Sequence[Metadata]) -> Iterator[tuple[str, dict[str, str] | None]]:
     """The name and the facts of each metadata without their checksum, or None where that is wrong.
 
-    Where one record of a file has a checksum, all of ours have: damage to a length may hide the key. Metadata of older
-    files and of other writers have none, and are believed.
+    Where one record of a file has a checksum, all of aolink's must have one, because damage to a length may hide the
+    key. Metadata of older files and of other writers have none, and are accepted.
     """
     is_sealed = any(_SEAL in each.metadata for each in records)
     for each in records:
@@ -223,6 +225,6 @@ def _checksum(name: str, values: Mapping[str, str]) -> str:
 
 
 def schema_of(message_class: type[Message]) -> Schema:
-    """The schema record of a message class, with everything that it needs."""
+    """The schema record of a message class, with all types that it needs."""
     data = build_file_descriptor_set(message_class).SerializeToString(deterministic=True)
     return Schema(id=0, name=message_class.DESCRIPTOR.full_name, encoding=SchemaEncoding.Protobuf, data=data)

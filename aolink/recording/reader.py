@@ -1,4 +1,4 @@
-"""Reads a recording back: messages, exposures, estimates."""
+"""The reader of recordings: messages, exposures, estimates."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class RecordedMessage:
 
     topic: str
     log_time_ns: int
-    """Host clock."""
+    """Log time: the host's clock when the message came, ns."""
     sequence: int
     """Order in the file, from 1."""
     message: Message
@@ -68,7 +68,7 @@ class RawMessage(NamedTuple):
 
     @classmethod
     def of(cls, topic: str, message: Message, log_time_ns: int, sequence: int = 0) -> RawMessage:
-        """A message as it is written: the same fields always give the same bytes."""
+        """The bytes of a message as it is written: the same fields always give the same bytes."""
         data = message.SerializeToString(deterministic=True)
         return cls(topic, message.DESCRIPTOR.full_name, log_time_ns, sequence, data)
 
@@ -85,16 +85,16 @@ class Recording(Series):
     Parameters
     ----------
     path:
-        The file, or a URL that fsspec knows: of that only the ranges are read that are needed.
+        The file, or a URL that fsspec knows: of a URL, only the ranges that are needed are read.
     rig:
-        Used instead of the rig that is in the file, so new estimates are made with another model. Estimates that are in
-        the file cannot be read with it.
+        A rig to use instead of the one in the file, so that new estimates are made with another model. Estimates in the
+        file cannot be read with it.
     check:
         Read every byte at once, so that `losses` is known from the start. Without it, damage in the
         middle of a file that has its index is noticed when it is read.
     side:
-        Side files of the recording, which hold estimates of it alone: their estimates stand in the place of those of
-        the same estimators in the file, as in a copy with new estimates, and their rig in the place of the file's.
+        Side files of the recording, which hold estimates of it alone: their estimates replace those of the same
+        estimators in the file, as in a copy with new estimates, and their rig replaces the file's.
 
     Raises
     ------
@@ -124,7 +124,7 @@ class Recording(Series):
         """Log times of the first and of the last message."""
         self._losses: dict[int, Loss] = {}
         self._unusable: dict[tuple[str, str], dict[tuple[int, int], int]] = {}
-        """Messages that are not of their kind, by topic and what is wrong with them: sequence, log time and length."""
+        """Messages that are not of their kind, by topic and kind of error: sequence, log time and length."""
         self._channels: dict[int, tuple[str, str]] = {}
         """Topic and name of the schema, by the channel's id."""
         self.schemas: dict[str, Schema] = {}
@@ -134,7 +134,7 @@ class Recording(Series):
         self._index: list[ChunkIndex] | None = None
         self._index_digest: str | None = None
         self._left_out: frozenset[str] = frozenset()
-        """Topics that side files have instead."""
+        """Topics that are read from side files instead."""
         self._second_rig_text: str | None = None
         rig_text = self._survey(check=check)
         if rig_text is None:
@@ -166,7 +166,7 @@ class Recording(Series):
 
     @property
     def damage(self) -> str:
-        """Why the file cannot be read whole, in words; empty where it can."""
+        """The reason why the file cannot be read whole, in words; empty where it can."""
         losses = self.losses
         more = f" and {len(losses) - 1} more" if len(losses) > 1 else ""
         return f"{losses[0].what}{more}" if losses else ""
@@ -178,7 +178,7 @@ class Recording(Series):
 
     @property
     def files(self) -> list[Path]:
-        """The files of this machine that it is read from: nothing that is made of it may take their place."""
+        """The files of this machine that it is read from: no file made from it may replace them."""
         return only_paths([self.path, *(side.path for side in self._side)])
 
     @cached_property
@@ -188,8 +188,8 @@ class Recording(Series):
 
     @cached_property
     def digest(self) -> str:
-        """What side files know the recording by: SHA-256 of its index, which has the place and the length of all that
-        is in it. Where there is no index, of what a scan found: rig, session, times and counts."""
+        """The name of the recording in side files: SHA-256 of its index, which has the place and the length of all
+        records. Where there is no index, it is that of the results of a scan: rig, session, times and counts."""
         if self._index_digest is None:
             with open_recording(self.path) as file:
                 summary = read_summary(file)
@@ -212,7 +212,7 @@ class Recording(Series):
 
     @property
     def has_truth(self) -> bool:
-        """Whether what really happened is in the file."""
+        """Whether the file has the truth."""
         return topics.TRUTH in self.counts
 
     @property
@@ -228,13 +228,13 @@ class Recording(Series):
 
     @cached_property
     def model(self) -> ExposureModel:
-        """The exposure model that expands the recorded coefficients."""
+        """The exposure model that expands the recorded coefficients into paths."""
         return exposure_model(self.rig.plant, self.rig.timing.exposure_steps)
 
     def messages(self, *wanted: str, start_ns: int = 0, end_ns: int = _END_OF_TIME) -> Iterator[RecordedMessage]:
         """The messages of some topics (of all, if none is named) in the order in which they were recorded.
 
-        With ``start_ns`` (inclusive) and ``end_ns`` (exclusive) those whose log time is between them; with
+        With ``start_ns`` (inclusive) and ``end_ns`` (exclusive) only those whose log time is between them; with
         an index, the rest of the file is not read.
         """
         for raw in self.raw_messages(*wanted, start_ns=start_ns, end_ns=end_ns):
@@ -257,20 +257,22 @@ class Recording(Series):
         return message
 
     def decoded_run(self, raw: RawMessage) -> Run | None:
-        """A command or what the mirror did with it, its inputs as bytes; None if it is neither, or not laid out so."""
+        """A command or a report of the mirror, with its inputs as bytes; None for another message, or one of another
+        layout."""
         if topics.RUNS.get(raw.topic) != raw.schema:
             return None
         try:
             run = Run.FromString(raw.data)
         except DecodeError:
             return None
-        # A writer may have split the row, or put each number by itself: that is for the message's own class.
+        # A writer may have split the row, or written each number by itself: the message's own class decodes those.
         return None if what_is_wrong(run, self.rig) else run
 
     def raw_messages(
         self, *wanted: str, start_ns: int = 0, end_ns: int = _END_OF_TIME, first_chunk: int = 0
     ) -> Iterator[RawMessage]:
-        """As `messages`, as bytes, and those of other software too; with an index, from one of its chunks on."""
+        """The messages as bytes, with those of other software too, selected as by `messages`; with an index, from one
+        of its chunks on."""
         own = self._own_messages(wanted, start_ns, end_ns, slice(first_chunk, None))
         if not self._side:
             return own
@@ -300,7 +302,7 @@ class Recording(Series):
     @overload
     def __getitem__(self, index: slice) -> RecordingSlice: ...
     def __getitem__(self, index: int | slice) -> Exposure | RecordingSlice:
-        """An exposure by its number, or a slice, of which nothing is read before it is used.
+        """An exposure by its number, or a slice, which reads nothing before it is used.
 
         Raises RecordingError for an exposure that is damaged.
         """
@@ -312,13 +314,13 @@ class Recording(Series):
         return exposure
 
     def facts(self) -> dict[str, str]:
-        """What the recording holds, in words."""
+        """The summary of the recording, in words."""
         return super().facts() | ({"damage": self.damage} if self.damage else {})
 
     def exposures(self, start: int = 0, stop: int | None = None) -> Iterator[Exposure]:
         """The exposures in order, with their truth and their scene where the file has them.
 
-        With ``start`` and ``stop`` those with the numbers from the one to below the other, counted from 0 on.
+        With ``start`` and ``stop``, those whose numbers, counted from 0, are from the former to below the latter.
         """
         if stop is not None and stop <= start:
             return iter(())
@@ -327,9 +329,8 @@ class Recording(Series):
         return islice(exposures, start - before, None if stop is None else stop - before)
 
     def timed_exposures(self, first_chunk: int = 0) -> Iterator[tuple[int, Exposure]]:
-        """As `exposures`, each after the log time of the message that it was whole with, ns.
-
-        With ``first_chunk`` those of a file with an index that are whole by what is in that chunk and after it.
+        """The exposures as by `exposures`, each after the log time of the message that completed it, ns. With
+        ``first_chunk``, only those that the messages of that chunk and of later ones complete, in a file with an index.
         """
         now = 0
         assembly, beside = ExposureAssembly(self.rig), Companions(self.counts)
@@ -349,10 +350,11 @@ class Recording(Series):
             yield now, exposure
 
     def _beginning(self, number: int) -> tuple[int, int]:
-        """Where to read from so that an exposure is made as from the file's start: a chunk, and the frames before it.
+        """The chunk to read from so that an exposure is the same as if read from the file's start, and the number of
+        frames before it.
 
-        An exposure's inputs go on where those of the one before it ended. That one is known for certain if the mirror
-        reported all of it; else its inputs may go on from what was before, and so on.
+        An exposure's inputs begin where those of the one before it ended. The latter are certain if the mirror reported
+        all of them; otherwise they may depend on the exposure before, and so on.
         """
         index, back = self._frame_index if number else None, 1
         while index is not None and number - back > 0:
@@ -363,7 +365,7 @@ class Recording(Series):
             if not isinstance(info, schemas_pb2.ExposureInfo):
                 break
             # Reports come in the order of their steps. Commands may be replaced by others of the same steps, but none
-            # is of a step that the mirror's queue did not reach yet.
+            # is for a step beyond the mirror's queue.
             reach = {topics.APPLIED: info.first_step, topics.COMMAND: info.first_step - self.rig.mirror.queue_steps}
             reach = {topic: step for topic, step in reach.items() if self.counts.get(topic)}
             chunk = index.first_chunk(first, reach, self._runs_in)
@@ -377,7 +379,7 @@ class Recording(Series):
 
     @cached_property
     def _frame_index(self) -> FrameIndex | None:
-        """None where the file has no index, or one that cannot say which exposures there are."""
+        """The index of frames; None where the file has no index, or one without the messages' places."""
         if self._index is None or self._losses or self.counts.get(topics.EXPOSURE) != self.n_frames:
             return None
         frames = {channel for channel, (topic, _) in self._channels.items() if topic == topics.EXPOSURE}
@@ -395,7 +397,7 @@ class Recording(Series):
     def true_scene(self) -> NDArray[np.uint16] | None:
         """Counts that the picture sensor would read of the scene at rest, without noise; None where it is not known.
 
-        Raises RecordingError if the file has something else in its place.
+        Raises RecordingError if the attachment is something else.
         """
         data = self.attachments.get(topics.TRUE_SCENE_ATTACHMENT)
         if data is None or self.rig.scene is None:
@@ -423,9 +425,9 @@ class Recording(Series):
             yield _restored(info, pictures)
 
     def iter_estimates(self, name: str, start: int = 0, stop: int | None = None) -> Iterator[Estimate]:
-        """As `estimates`, one by one: the file is read only as far as they are asked for. None is no error here.
-
-        With ``start`` and ``stop`` those of the exposures that `exposures` gives for them.
+        """The estimates as by `estimates`, one by one: the file is read only as far as they are needed. A recording
+        without estimates is no error here. With ``start`` and ``stop``, those of the exposures that `exposures` gives
+        for them.
         """
         if stop is not None and stop <= start:
             return
@@ -434,7 +436,7 @@ class Recording(Series):
         exposures: dict[int, Exposure] = {}
         waiting: deque[schemas_pb2.Estimate] = deque()
         ended, done = False, -1
-        """Whether all of the exposures have come, and the last of them that has had its estimate."""
+        """Whether all of the exposures have come, and the last one whose estimate has come."""
         for received, completed in self._beside_exposures(name, chunk):
             if isinstance(received, schemas_pb2.Estimate):
                 waiting.append(received)
@@ -444,14 +446,14 @@ class Recording(Series):
                 ended = stop is not None and number >= stop - 1
                 if start <= number and (stop is None or number < stop):
                     exposures[exposure.frame_id] = exposure
-            # At the end of the recording, an exposure that has not come will not; nor will one of the part before this.
+            # At the end of the recording, no further exposure will come; nor will one of the part before this.
             first = next(iter(exposures), 0)
             while waiting and (received is None or waiting[0].frame_id in exposures or waiting[0].frame_id < first):
                 message = waiting.popleft()
                 if message.frame_id not in exposures:
                     continue
                 yield convert.estimate_from_message(message, self.model, exposures[message.frame_id])
-                # Estimates come in the order of their exposures: what is before this one has had its own.
+                # Estimates come in the order of their exposures: earlier exposures have had theirs.
                 for frame_id in list(exposures)[: list(exposures).index(message.frame_id)]:
                     del exposures[frame_id]
                 done = message.frame_id
@@ -485,7 +487,7 @@ class Recording(Series):
         other_rig = self._side[0].rig.toml != self._rig_text
         own = {topic for topic in self.counts if topic.startswith(topics.ESTIMATE)}
         gone = own if other_rig else own & replaced
-        # Pictures were restored with some of these estimates; which, only reading all of them would say.
+        # Pictures were restored with some of these estimates; only reading all of them would show which.
         self._left_out = frozenset(
             {*gone, *(topics.estimation_topic(topic.removeprefix(topics.ESTIMATE)) for topic in gone)}
             | {topic for topic in self.counts if gone and topic.startswith(topics.RESTORED)}
@@ -539,7 +541,7 @@ class Recording(Series):
         return self._second_rig_text if attached is None else attached.decode(errors="replace")
 
     def _summarised(self, summary: Summary) -> Iterator[tuple[McapRecord, bool]]:
-        """What the index of the file names besides its chunks, and that it is what was written."""
+        """Read the attachments and metadata that the index names, and check that they are undamaged."""
         for record in (*summary.schemas.values(), *summary.channels.values()):
             yield record, True
         others = sorted(summary.others, key=lambda each: each.offset)
@@ -554,7 +556,7 @@ class Recording(Series):
             raise exceeded(f"{self.path} holds attachments of {held} bytes", "attachment_bytes")
 
     def _note(self, records: Sequence[Metadata]) -> None:
-        """Keep what the metadata of the file say."""
+        """Keep the facts in the file's metadata."""
         for name, values in unsealed(records):
             if values is None:
                 self._losses[-1 - len(self._losses)] = Loss(0, 0, f"the metadata {name!r} is damaged")
@@ -597,7 +599,7 @@ class Recording(Series):
 
 @lru_cache(maxsize=8)
 def _parsed_rig(text: str) -> Rig:
-    """The rig of a file; thousands of recordings have the same, and the exposure model is made once for each."""
+    """The rig of a file. Thousands of recordings may have the same rig, whose exposure model is then made only once."""
     return parse_rig(text)
 
 

@@ -20,9 +20,9 @@ from aolink.recording.exposures import ExposureAssembly
 from aolink.recording.reader import RawMessage, Recording, check_stands_alone
 
 _AT_ONCE = 512
-"""Exposures that are estimated together, ..."""
+"""The most exposures that are estimated together."""
 _BYTES_AT_ONCE = 4 << 20
-"""... and bytes of messages that wait for them."""
+"""The most bytes of messages that wait for them."""
 
 
 def reestimate(
@@ -57,7 +57,7 @@ def reestimated(
     *,
     as_recorded: bool = False,
 ) -> Iterator[tuple[Exposure, list[Estimate]]]:
-    """`reestimate`, exposure by exposure, with estimates in the order of ``names``; nothing stays in memory."""
+    """The estimates of `reestimate`, exposure by exposure, in the order of ``names``; nothing stays in memory."""
     driver = Driver(recording.rig, names, engine, skipped_by(recording, names) if as_recorded else None)
     for number, done in enumerate(driver.steps(recording.exposures()), 1):
         yield done
@@ -84,7 +84,7 @@ def scored_and_compared(
 ) -> tuple[dict[str, Score], dict[str, str | None]]:
     """Scores by name, and where estimates first differ from those in the recording, for the names that it has.
 
-    With another rig than the recording's own there is nothing to compare them with.
+    With another rig than the recording's own there are no estimates to compare with.
     """
     scorers = {name: Scorer() for name in names}
     skipped = skipped_by(recording, names)
@@ -136,9 +136,9 @@ def write_reestimated(
     """Copy a recording with new estimates.
 
     Estimates by other names, and pictures restored with them, stay in the copy, unless ``only``; those that were made
-    with another rig than ``recording.rig`` could not be read in it and are left out. Messages of other software come
-    along as they are. The same recording and the same version of aolink give the same bytes. With ``as_recorded``
-    estimators skip what they had no time for in the session.
+    with another rig than ``recording.rig`` could not be read in it and are left out. Messages of other software are
+    copied unchanged. The same recording and the same version of aolink give the same bytes. With ``as_recorded``
+    estimators skip the exposures that they had no time for in the session.
 
     Raises
     ------
@@ -162,7 +162,8 @@ def fill_reestimated(
     engine: Engine = "aolink",
     as_recorded: bool = False,
 ) -> None:
-    """What `write_reestimated` writes, into an empty file that is there already. Raises OSError as the disk does."""
+    """Write the content of `write_reestimated` into an empty file that is there already. Raises OSError for errors of
+    the disk."""
     kept = kept_estimators(recording, names, only=only)
     notes = recording.metadata | {
         "aolink_version": version("aolink"),
@@ -173,26 +174,27 @@ def fill_reestimated(
     if engine != "aolink":
         notes["engine"] = engine
     skipped = skipped_by(recording, names) if as_recorded else None
-    # What a session had no time for is told in the copy where that is so of its estimates as well.
-    told = [*kept, *(names if as_recorded else ())]
+    # The copy says which exposures a session had no time for, if its estimates skip them as well.
+    with_skips = [*kept, *(names if as_recorded else ())]
     with RecordingCopy(recording, path, notes) as copy:
-        for some in _with_estimates(recording, Driver(recording.rig, names, engine, skipped), kept, told):
+        for some in _with_estimates(recording, Driver(recording.rig, names, engine, skipped), kept, with_skips):
             copy.add(some)
             progress(copy.exposures)
         copy.finish(recording.losses)
 
 
 def kept_estimators(recording: Recording, names: Sequence[str], *, only: bool) -> list[str]:
-    """Whose estimates stay in a copy of a recording with new estimates by ``names``."""
+    """The estimators whose estimates stay in a copy of a recording with new estimates by ``names``."""
     if only or not recording.rig_is_recorded:
         return []
     return [name for name in recording.estimators if name not in names]
 
 
-def _without_old_estimates(recording: Recording, kept: Sequence[str], told: Sequence[str]) -> Iterator[RawMessage]:
-    """The messages of a recording; of its estimates and of the pictures restored with them, those of ``kept``.
-
-    Only the estimators ``told`` keep their accounts of what they had time for.
+def _without_old_estimates(
+    recording: Recording, kept: Sequence[str], with_skips: Sequence[str]
+) -> Iterator[RawMessage]:
+    """The messages of a recording, with the estimates and restored pictures of the estimators ``kept`` only. Only the
+    estimators ``with_skips`` keep their messages about skipped exposures.
     """
     restored_with = ""
     for raw in recording.raw_messages():
@@ -203,22 +205,22 @@ def _without_old_estimates(recording: Recording, kept: Sequence[str], told: Sequ
             continue
         if raw.topic.startswith(topics.ESTIMATE) and raw.topic.removeprefix(topics.ESTIMATE) not in kept:
             continue
-        if raw.topic.startswith(topics.ESTIMATION) and raw.topic.removeprefix(topics.ESTIMATION) not in told:
+        if raw.topic.startswith(topics.ESTIMATION) and raw.topic.removeprefix(topics.ESTIMATION) not in with_skips:
             continue
         yield raw
 
 
 def _with_estimates(
-    recording: Recording, driver: Driver, kept: Sequence[str], told: Sequence[str]
+    recording: Recording, driver: Driver, kept: Sequence[str], with_skips: Sequence[str]
 ) -> Iterator[RawMessage]:
-    """The messages of a recording with new estimates after their exposures; of the old ones, those of ``kept``."""
+    """The messages of a recording with new estimates after their exposures, and the old estimates of ``kept``."""
     assembly = ExposureAssembly(recording.rig)
     waiting: list[tuple[RawMessage, list[Exposure]]] = []
     exposures = size = 0
-    for raw in _without_old_estimates(recording, kept, told):
+    for raw in _without_old_estimates(recording, kept, with_skips):
         message = recording.decoded_run(raw) or recording.decoded(raw)
         if message is None and raw.schema in topics.SCHEMAS:
-            continue  # it is among the losses
+            continue  # it is one of the losses
         completed = assembly.take(raw.topic, message) if message is not None else []
         waiting.append((raw, completed))
         exposures, size = exposures + len(completed), size + len(raw.data)
@@ -231,7 +233,7 @@ def _with_estimates(
 
 
 def _estimated(driver: Driver, messages: Sequence[tuple[RawMessage, list[Exposure]]]) -> Iterator[RawMessage]:
-    """Messages, and estimates of the exposures that each completes; none of these is made before the one before it."""
+    """Messages, each with the estimates of the exposures that it completes, which are made in order."""
     made = driver.steps(exposure for _, completed in messages for exposure in completed)
     for raw, completed in messages:
         yield raw

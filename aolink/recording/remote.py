@@ -1,4 +1,4 @@
-"""Recordings by URL: object storage and web servers, through fsspec, by the ranges that are needed."""
+"""Recordings behind URLs, in object storage and on web servers, read through fsspec by the ranges that are needed."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ if TYPE_CHECKING:
     from _typeshed import WriteableBuffer
 
 AHEAD = 64 << 10
-"""Bytes that are asked for where nobody has said what comes next, ..."""
+"""Bytes of a request where the reader has not announced what comes next."""
 MOST_AHEAD = 1 << 20
-"""... and the most that are asked for at once where somebody has, if no single record is larger."""
+"""The most bytes of a request where the reader has announced it, if no single record is larger."""
 _GAP = 16 << 10
 """Bytes between two ranges that are read with them: another request would take longer."""
 _KEPT = 3
@@ -29,7 +29,8 @@ _URL = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+://")
 
 
 def location(path: str | Path | Url) -> Path | Url:
-    """A path, or a URL where it is one: ``s3://bucket/session.mcap``, ``https://...``, ``memory://...``."""
+    """A place as a path, or as a URL where it is one: ``s3://bucket/session.mcap``, ``https://...``,
+    ``memory://...``."""
     return Url(path) if isinstance(path, str) and _URL.match(path) else path if isinstance(path, Url) else Path(path)
 
 
@@ -39,17 +40,17 @@ def only_paths(places: Iterable[Path | Url]) -> list[Path]:
 
 
 class Url:
-    """Where a recording is that is no file of this machine.
+    """The place of a recording that is not a file of this machine.
 
-    It keeps the first and the last bytes that were read, so that a recording that is opened again asks for nothing
+    It keeps the first and the last bytes that were read, so that a recording that is opened again requests no bytes
     twice. Between processes only the URL itself travels.
     """
 
     def __init__(self, text: str) -> None:
         self.text = text
-        """The whole of it. What is shown is without a password and without a query, which may hold a signature."""
+        """The whole URL. Messages show it without password and query, which may hold a signature."""
         self.ends: dict[int, bytes] = {}
-        """The first and the last bytes, as far as they were read, by where they begin."""
+        """The first and the last bytes, as far as they were read, by their position."""
 
     def __str__(self) -> str:
         parts = urlsplit(self.text)
@@ -92,13 +93,13 @@ class Url:
         Parameters
         ----------
         expected:
-            First byte and length of the ranges that will be read, in ascending order: these are asked for together as
-            far as they are neighbours, and nothing between them.
+            First byte and length of the ranges that will be read, in ascending order: neighbouring ranges are requested
+            together, and no bytes between others.
 
         Raises
         ------
         RecordingError
-            There is nothing, nobody may read it, no server answers, or the extra ``remote`` is not installed.
+            There is no such file, it may not be read, no server answers, or the extra ``remote`` is not installed.
         """
         return RangeFile(self, expected)
 
@@ -133,19 +134,19 @@ class Url:
 
     @contextmanager
     def _asked(self) -> Iterator[None]:
-        """What a file system of fsspec raises, as one error: each has its own."""
+        """Turn the exceptions of a file system of fsspec into one error: each file system has its own."""
         try:
             yield
         except RecordingError:
             raise
         except Exception as error:
-            cause = error.__cause__ or error  # some file systems say that nothing is there, whatever is the matter
+            cause = error.__cause__ or error  # some file systems report a missing file for any error
             denied = isinstance(error, PermissionError) or getattr(cause, "status", 0) in (401, 403)
             if denied or type(error).__name__ in ("NoCredentialsError", "PartialCredentialsError"):
                 why = "no right to read it; give the credentials that its server wants, as AWS_PROFILE for s3"
             elif isinstance(error, FileNotFoundError):
                 what = "" if cause is error else f" ({_first_line(cause)})"
-                why = f"there is no such file, or nobody may know of it{what}"
+                why = f"there is no such file, or it may not be listed{what}"
             else:
                 why = _first_line(error)
             raise RecordingError(f"cannot read {self}: {why}") from None
@@ -156,7 +157,7 @@ def _first_line(error: BaseException) -> str:
 
 
 class RangeFile(io.RawIOBase):
-    """A file behind a URL, which is asked for in ranges."""
+    """A file behind a URL, which is requested in ranges."""
 
     def __init__(self, url: Url, expected: Sequence[tuple[int, int]] = ()) -> None:
         self._url, self._size, self._at = url, url.size, 0
@@ -189,7 +190,7 @@ class RangeFile(io.RawIOBase):
         return done
 
     def _around(self, position: int, end: int) -> tuple[int, bytes]:
-        """A range that has the byte at a position, and where it begins; ``end`` is how far it will be read."""
+        """The bytes of a range that contains a position, and where it begins; the file will be read up to ``end``."""
         for start, data in (*self._url.ends.items(), *self._kept):
             if start <= position < start + len(data):
                 return start, data
@@ -211,7 +212,7 @@ class RangeFile(io.RawIOBase):
 
 
 def _joined(ranges: Sequence[tuple[int, int]]) -> Iterator[tuple[int, int]]:
-    """First byte and end of ranges, those together that are neighbours."""
+    """First byte and end of ranges, with neighbouring ones joined."""
     start = end = -1
     for first, length in ranges:
         if start >= 0 and first - end <= _GAP:

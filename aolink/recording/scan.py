@@ -2,8 +2,8 @@
 
 A recording is a sequence of records, [opcode u8 | length u64 | content]; messages are in chunks, which
 have a checksum each. Damage costs the chunk that it is in: where a length is damaged, the scan goes on where
-`aolink.recording.search` finds the next record. Nothing in the file is believed about sizes, so a hostile file
-costs no memory, and no more time than a few readings of it.
+`aolink.recording.search` finds the next record. Sizes in the file are never trusted, so a hostile file costs no memory,
+and no more time than a few readings of it.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ from aolink.recording.remote import Url
 from aolink.recording.search import HEAD, MESSAGE_HEAD, Search, begins_a_record, is_plausible
 
 _MOST_READINGS = 4
-"""How many times the file's size is read, at most, of records that turn out to be none."""
+"""The most bytes that are read from invalid records, in units of the file's size."""
 _READ_BYTES = 1 << 20
 MAGIC = b"\x89MCAP0\r\n"
 _FOOTER_BYTES = HEAD.size + 20 + len(MAGIC)
@@ -78,9 +78,9 @@ class Loss:
     offset: int
     """Byte at which it begins."""
     length: int
-    """Bytes."""
+    """Number of bytes."""
     what: str
-    """In words."""
+    """The lost part in words."""
     start_ns: int = 0
     """Log times of the messages that were in it, as far as is known; 0 where it is not."""
     end_ns: int = 0
@@ -105,7 +105,7 @@ class Summary:
 
     @property
     def is_index(self) -> bool:
-        """Whether everything in the file can be found by it: writers may leave out what they like."""
+        """Whether everything in the file can be found by it: writers may leave parts of it out."""
         known = self.statistics
         if known is None or (known.message_count and not known.chunk_count):
             return False
@@ -146,7 +146,7 @@ def open_recording(path: Path | Url, expected: Sequence[tuple[int, int]] = ()) -
     if len(head) < len(MAGIC):
         file.close()
         raise RecordingError(f"{path} is empty or too short to be a recording")
-    # A bit of the first bytes may be damaged: then the record after them tells.
+    # A bit of the first bytes may be damaged: then the record after them decides.
     if not head.startswith(MAGIC) and head[len(MAGIC) :][:1] != bytes([Opcode.HEADER]):
         file.close()
         raise RecordingError(f"{path} is not a recording: it is not an MCAP file")
@@ -154,9 +154,8 @@ def open_recording(path: Path | Url, expected: Sequence[tuple[int, int]] = ()) -
 
 
 def read_summary(file: IO[bytes]) -> Summary | None:
-    """The summary at a file's end; None if the file was cut off, or what it says fails its checksum.
-
-    Empty where the writer has left it out.
+    """The summary at a file's end; None if the file was cut off, or the summary fails its checksum. It is empty where
+    the writer has left it out.
     """
     size = file.seek(0, os.SEEK_END)
     if size < len(MAGIC) + _FOOTER_BYTES:
@@ -209,7 +208,7 @@ def _parse_summary(data: bytes) -> Summary | None:
 
 
 def _chunk_index(data: bytes) -> ChunkIndex:
-    """What `ChunkIndex.read` gives, in a fifth of the time: an hour has 18,000 of them."""
+    """The result of `ChunkIndex.read`, in a fifth of the time: a recording of an hour has 18,000 of them."""
     start, end, offset, length, held = _CHUNK_INDEX_HEAD.unpack_from(data)
     at = _CHUNK_INDEX_HEAD.size + held
     index_length, letters = struct.unpack_from("<QI", data, at)
@@ -223,9 +222,8 @@ def _chunk_index(data: bytes) -> ChunkIndex:
 
 
 def scan(file: IO[bytes], on_loss: Callable[[Loss], None]) -> Iterator[tuple[McapRecord, bool]]:
-    """Every whole record of a file from its start to its index, those in chunks too; losses go to ``on_loss``.
-
-    With each record, whether a checksum says that it is what was written.
+    """Every whole record of a file from its start to its index, those in chunks too, each with whether a checksum
+    confirms it; losses go to ``on_loss``.
     """
     whole = True
 
@@ -259,8 +257,8 @@ def scan(file: IO[bytes], on_loss: Callable[[Loss], None]) -> Iterator[tuple[Mca
         lost: list[Loss] = []
         record = _record_at(file, position, lost.append)
         if lost:
-            # Its length may be wrong, and what it covers may hold whole chunks. To look for them costs another
-            # reading: a file that was made to waste time gets a few.
+            # Its length may be wrong, and the bytes that it covers may hold whole chunks. Searching for them costs
+            # another reading: a file that was made to waste time gets a few.
             readings -= length
             end = (search.next(position + 1, before=end) if readings > 0 else None) or end
             lose(replace(lost[0], length=end - position))
@@ -275,7 +273,7 @@ def scan(file: IO[bytes], on_loss: Callable[[Loss], None]) -> Iterator[tuple[Mca
                 if whole:
                     _check_data(file, position, on_loss)
                 return
-            found = search.next(end)  # it may have been no end
+            found = search.next(end)  # it may not have been the end
             lose(Loss(end, (found or size) - end, "its index is damaged or was cut off"))
             if found is None:
                 return
@@ -285,17 +283,14 @@ def scan(file: IO[bytes], on_loss: Callable[[Loss], None]) -> Iterator[tuple[Mca
 
 
 def grown(file: IO[bytes], position: int, on_loss: Callable[[Loss], None]) -> tuple[int, list[McapRecord], bool]:
-    """The record at a position of a file that may still be written; of a chunk, those in it.
-
-    Returns
-    -------
-    Where the next record begins, which is ``position`` while this one is not whole; what it holds, as far as it is of
-    interest; whether it is the end of the data.
+    """The record at a position of a file that may still be written, or for a chunk the records in it. Returns -------
+    The position of the next record, which is ``position`` while this one is not whole; the records that are of
+    interest; whether this is the end of the data.
 
     Raises
     ------
     RecordingError
-        What is there makes no sense, or is no longer there.
+        The bytes there are not a valid record, or are no longer there.
     """
     size, name = file.seek(0, os.SEEK_END), str(getattr(file, "name", "the file"))
     if size < position:
@@ -328,7 +323,7 @@ def _check_data(file: IO[bytes], end: int, on_loss: Callable[[Loss], None]) -> N
 def chunk_at(
     file: IO[bytes], index: ChunkIndex, on_loss: Callable[[Loss], None], budget: Budget
 ) -> Iterator[McapRecord]:
-    """What is in a chunk that the summary names; nothing if it is damaged."""
+    """The records in a chunk that the summary names; none if it is damaged."""
     file.seek(index.chunk_start_offset)
     head = file.read(HEAD.size)
     if len(head) < HEAD.size or head[0] != Opcode.CHUNK or HEAD.unpack(head)[1] > limits().record_bytes:
@@ -353,7 +348,7 @@ def record_at(
 
 
 def broken_up(chunk: Chunk, offset: int, on_loss: Callable[[Loss], None], budget: Budget) -> Iterator[McapRecord]:
-    """The records in a chunk, one by one; nothing if it is damaged."""
+    """The records in a chunk, one by one; none if it is damaged."""
     try:
         data, count = _decompressed(chunk, budget), 0
         if chunk.uncompressed_crc and zlib.crc32(data) != chunk.uncompressed_crc:
@@ -425,7 +420,7 @@ def _record_at(file: IO[bytes], position: int, on_loss: Callable[[Loss], None]) 
 
 
 def _decompressed(chunk: Chunk, budget: Budget) -> bytes:
-    """What a chunk holds. It may say one size and hold another: neither may fill the memory."""
+    """The content of a chunk. Its stated and its real size may differ: neither may fill the memory."""
     if chunk.uncompressed_size > limits().chunk_bytes:
         raise ValueError(f"a chunk of {chunk.uncompressed_size} bytes")
     budget.take_bytes(chunk.uncompressed_size)

@@ -1,4 +1,5 @@
-"""Search for the next record of a damaged MCAP file: bytes that can only be a chunk, our metadata or the end."""
+"""The search for the next record of a damaged MCAP file: bytes that can only be a chunk, aolink's metadata or the
+end."""
 
 from __future__ import annotations
 
@@ -24,12 +25,12 @@ _COMPRESSIONS = (b"lz4", b"zstd", b"")
 _CANDIDATE = re.compile(rb"[\x06\x0f].{4}\x00{4}|\x0c.{4}\x00{4}.\x00{3}aolink", re.DOTALL)
 """A chunk (6), the end of the data (15) or metadata of ours (12), with a length below 4 GiB."""
 _LENGTHS: dict[int, int] = {Opcode.FOOTER: 20, Opcode.SUMMARY_OFFSET: 17, Opcode.DATA_END: 4}
-"""Content that is of one length always."""
+"""Lengths of the records whose content always has the same length."""
 _KINDS = {*map(int, Opcode)}
 
 
 def is_plausible(opcode: int, length: int, file: IO[bytes], before: int) -> bool:
-    """Whether a record can be what it says, behind one of the kind ``before`` (0: not known).
+    """Whether a record is plausible behind one of the kind ``before`` (0: not known).
 
     One flipped bit makes a chunk another kind, which would be skipped, or an index of messages a message.
     """
@@ -43,23 +44,23 @@ def is_plausible(opcode: int, length: int, file: IO[bytes], before: int) -> bool
 
 
 def begins_a_record(file: IO[bytes], position: int, size: int) -> bool:
-    """Whether what stands at a position can be the next record: only its kind is damaged then, not its length."""
+    """Whether the bytes at a position can be the next record: then only the kind of the record before it is damaged,
+    not its length."""
     file.seek(min(position, size))
     head = file.read(HEAD.size)
     return len(head) == HEAD.size and is_plausible(head[0], HEAD.unpack(head)[1], file, 0)
 
 
 class Search:
-    """Looks through a file from its start to its end for what can be a record, once."""
+    """Searches a file once, from its start to its end, for bytes that can be a record."""
 
     def __init__(self, file: IO[bytes], size: int) -> None:
         self._file, self._size = file, size
         self._start, self._data = 0, b""
 
     def next(self, position: int, before: int | None = None) -> int | None:
-        """Where the next whole chunk, metadata or the end of the data begins; None if not ``before`` a byte.
-
-        Positions are asked for in ascending order.
+        """The position of the next whole chunk, metadata or end of the data; None if there is none ``before`` a byte.
+        Calls must come with ascending positions.
         """
         before = self._size if before is None else before
         while position < before:
@@ -69,7 +70,7 @@ class Search:
             match = _CANDIDATE.search(self._data, position - self._start)
             at = self._start + (match.start() if match else len(self._data))
             if match is None or at + _LOOK_BYTES > self._start + len(self._data) < self._size:
-                # Not here, or too near the edge to be looked at.
+                # No candidate here, or one too near the edge to be checked.
                 position = max(position + 1, min(at, self._start + len(self._data) - _LOOK_BYTES))
                 if self._start + len(self._data) >= self._size:
                     return None
@@ -82,7 +83,7 @@ class Search:
         return None
 
     def _is_record(self, position: int) -> bool:
-        """Whether the bytes there can be what they say."""
+        """Whether the bytes there can be a valid record."""
         data = self._data[position - self._start :][:_LOOK_BYTES]
         opcode, length = HEAD.unpack_from(data)
         if position + HEAD.size + length > self._size or length > limits().record_bytes:

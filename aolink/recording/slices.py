@@ -1,4 +1,4 @@
-"""Some of a recording's exposures, read when they are asked for."""
+"""Some of a recording's exposures, read when they are used."""
 
 from __future__ import annotations
 
@@ -14,9 +14,8 @@ if TYPE_CHECKING:
 
 
 class RecordingSlice(Series):
-    """What ``recording[10:20]`` is: these exposures and their estimates, as in the whole recording, bit for bit.
-
-    Little more of a file with an index is read than they are in. Estimators that are run on a slice begin anew there.
+    """The result of ``recording[10:20]``: these exposures and their estimates, as in the whole recording, bit for bit.
+    From a file with an index little more is read than they need. Estimators that are run on a slice begin anew there.
     """
 
     def __init__(self, recording: Recording, numbers: range) -> None:
@@ -42,7 +41,7 @@ class RecordingSlice(Series):
             yield from self.recording.iter_estimates(name, start, stop)
 
     def _runs(self) -> Iterator[tuple[int, int]]:
-        """First number and end of what follows each other."""
+        """First number and end of each run of consecutive numbers."""
         if self.numbers.step == 1:
             yield self.numbers.start, self.numbers.stop
         else:

@@ -1,4 +1,4 @@
-"""Whether a decoded message can be what it says, before anything is computed with it."""
+"""The check that a decoded message is possible, before anything is computed with it."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from aolink.wire.runs_pb2 import Run
 _LAST_NS = 1 << 62
 """Times and fast steps up to this, in ns, can be added and subtracted in 64 bits: 146 years."""
 _MOST_INPUT = 1e100
-"""No mirror takes more, whatever its unit; from here to the largest double, sums and quotients overflow."""
+"""No mirror takes a larger input, whatever its unit; beyond it, sums and quotients may overflow."""
 _WITHOUT_INPUTS = (wire.Applied.AWAITED, wire.Applied.NOT_REPORTED)
 
 
@@ -34,12 +34,13 @@ def _of_run(run: wire.Applied | wire.CommandBlock | Run, rig: Rig) -> str:
         return "first_step is beyond all times"
     if isinstance(run, wire.Applied) and run.source in _WITHOUT_INPUTS:
         return ""
-    # Inputs as bytes have 8 of them a number. A report without the inputs of its steps would stand for all of these.
+    # Inputs in bytes take 8 bytes a number. A report without the inputs of its steps would be expanded to all of these
+    # steps.
     told = run.u
     if (len(told) / 8 if isinstance(told, bytes) else len(told)) != run.n_steps * rig.n_inputs:
         return "u has not the inputs of its steps"
     u = np.frombuffer(told, "<f8") if isinstance(told, bytes) else np.array(told)
-    # The sum of squares is found in no time, and is NaN or infinite where one of them is no number.
+    # The sum of squares is fast, and is NaN or infinite where one of them is.
     fine = np.vdot(u, u) <= _MOST_INPUT**2 or np.abs(u).max(initial=0.0) <= _MOST_INPUT
     return "" if fine else "u has an input that is no number, or beyond all"
 
@@ -58,7 +59,7 @@ def _of_exposure(info: pb.ExposureInfo, rig: Rig) -> str:
     )  # fmt: skip
     if not all(-_LAST_NS <= each <= _LAST_NS for each in times):
         return "a time is beyond the calendar"
-    sigmas = (info.clock_sigma_ns, info.alignment_sigma_ns)  # NaN: it is not known
+    sigmas = (info.clock_sigma_ns, info.alignment_sigma_ns)  # NaN where it is not known
     return "" if not any(each < 0 or each > _LAST_NS for each in sigmas) else "a standard deviation is impossible"
 
 

@@ -1,4 +1,4 @@
-"""The topics of a recording: one table of what each holds, and the names of what a recording has besides."""
+"""The topics of a recording in one table, and the names of a recording's attachments and metadata."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ TRUTH = "/truth"
 ESTIMATE = "/estimate/"
 ESTIMATION = "/estimation/"
 RESTORED = "/restored/"
-"""What the topics of restored pictures begin with."""
+"""Prefix of the topics of restored pictures."""
 RESTORATION = RESTORED + "exposure"
 RESTORED_SCENE = RESTORED + "image"
 RESTORED_SPOTS = RESTORED + "spot"
@@ -39,15 +39,16 @@ class Topic:
     """One row of the table."""
 
     name: str
-    """One that ends with "/" is a prefix: an estimator's name follows."""
+    """The topic's name; one that ends with "/" is a prefix, which an estimator's name follows."""
     message: type[Message]
     belongs_to: Literal["exposure", "steps", "time"] = "time"
-    """What a message belongs to: an exposure (by its ``frame_id``), fast steps (from its ``first_step`` on), or only
-    its time. `cut` copies it with that, and `compare` finds its counterpart by it."""
+    """The kind of thing that a message belongs to: an exposure (by its ``frame_id``), fast steps (from its
+    ``first_step`` on), or only its time. `cut` selects messages by it, and `compare` finds their counterparts by it."""
     after: str = ""
-    """Topic of the message that comes before a picture and says which exposure it is of: a picture does not say it."""
+    """Topic of the message that comes before a picture and names its exposure, which the picture itself does not."""
     repeatable: bool = False
-    """Whether a rig that is given the same commands again gives the same: `aolink replay` to a rig compares these."""
+    """Whether a rig that gets the same commands again gives the same messages: `aolink replay` to a rig compares
+    these."""
     shown_by: str = ""
     """The function of `aolink.viewing.devices` that shows its messages; '' for none, and for what is shown as the
     exposures and estimates that it is read as."""
@@ -76,14 +77,14 @@ TOPICS = (
 SCHEMAS = {row.message.DESCRIPTOR.full_name: row.message for row in TOPICS}
 """Message class by the full name of its schema."""
 PICTURES = {row.after: tuple(each.name for each in TOPICS if each.after == row.after) for row in TOPICS if row.after}
-"""What is known about the pictures of an exposure, and which pictures follow it."""
+"""The topics with facts about an exposure's pictures, and the topics of the pictures that follow them."""
 RUNS = {row.name: row.message.DESCRIPTOR.full_name for row in TOPICS if row.belongs_to == "steps"}
-"""Where runs of fast steps are, and the schema that they have there."""
+"""The topics with runs of steps, and their schemas."""
 _UNKNOWN = Topic(name="", message=Message)
 
 
 def find(name: str, message: Message | None) -> Topic:
-    """The row of a message; where the topic does not hold such messages, one that belongs to nothing but its time."""
+    """The row of a message; where the topic does not hold such messages, a row that belongs to its time only."""
     row = named(name)
     return row if isinstance(message, row.message) else _UNKNOWN
 
@@ -103,7 +104,7 @@ def estimate_topic(estimator: str) -> str:
 
 
 def estimation_topic(estimator: str) -> str:
-    """Topic of the messages that say which exposures an estimator had time for."""
+    """Topic of the messages about the exposures that an estimator had time for."""
     return ESTIMATION + estimator
 
 
@@ -111,18 +112,18 @@ RIG_ATTACHMENT = "rig.toml"
 BASIS_ATTACHMENT = "exposure_basis.npy"
 OUTPUTS_ATTACHMENT = "exposure_outputs.npy"
 OF_EACH_FILE = (RIG_ATTACHMENT, BASIS_ATTACHMENT, OUTPUTS_ATTACHMENT)
-"""Attachments that every recording is begun with."""
+"""Attachments at the beginning of every recording."""
 TRUE_SCENE_ATTACHMENT = "true_scene.npy"
-"""Simulated rigs: what the picture sensor would read out of the scene at rest, without noise and blur."""
+"""With simulated rigs, the counts that the picture sensor would have of the scene at rest, without noise and blur."""
 SESSION_METADATA = "aolink"
-"""Written at the start: versions, rig, devices, note."""
+"""Metadata written at the start: versions, rig, devices, note."""
 RIG_METADATA = "aolink/rig"
-"""The rig file a second time, in case that the attachment is damaged."""
+"""Metadata with the rig file a second time, in case the attachment is damaged."""
 CHANNEL_METADATA = "aolink/channel"
-"""One for each topic: its id, name and schema a second time, in case that their chunk is damaged."""
+"""Metadata for each topic: its id, name and schema a second time, in case their chunk is damaged."""
 SIDE_OF = "side_of"
 """Key in the metadata of a side file: the digest of the recording that its estimates are of."""
 CALIBRATION = "calibration"
-"""Key in the metadata of a session that recorded frames for a calibration: what they show."""
+"""Key in the metadata of a session that recorded frames for a calibration: the kind of light."""
 END_METADATA = "aolink/end"
-"""Written at the end: how the session ended, and its counts."""
+"""Metadata written at the end: how the session ended, and its counts."""

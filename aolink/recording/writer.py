@@ -1,7 +1,7 @@
-"""Writes a recording: one or several MCAP files that need nothing but themselves.
+"""The writer of recordings: one or several MCAP files that need no other file.
 
-The file work is done in a thread of its own, so that a slow disk does not reach the loop. The queue to
-it is bounded; when it is full, or when the disk is, the session gets an error: nothing is lost silently.
+The file work is done in a thread of its own, so that a slow disk does not reach the loop. The queue to it is bounded;
+when the queue or the disk is full, the session gets an error: nothing is lost silently.
 """
 
 from __future__ import annotations
@@ -31,11 +31,12 @@ from aolink.rig import Rig
 _QUEUE_BYTES = 256 << 20
 """Most bytes that may wait for the disk."""
 _POLL_S = 0.005
-"""How often the thread looks for what is queued: woken for each message, it would cost more than the writing."""
+"""Time between two checks of the queue, s: waking the thread for each message would cost more than the writing."""
 _STALL_S = 5.0
 """A disk that takes longer over one write stops the session."""
 _LOOK_BYTES = 16 << 10
-"""Bytes that go to the file between two looks at the clock: it tells of a stalled disk, and when to synchronise."""
+"""Bytes that go to the file between two readings of the clock, by which a stalled disk and the next synchronisation are
+noticed."""
 _MESSAGE_BYTES = 64
 """Least bytes of a message in the queue besides its data."""
 _LARGEST_BASIS = 32 << 20
@@ -49,9 +50,8 @@ _Item = tuple[str, Message, bytes, int]
 def begin_recording(
     file: McapFile, rig: Rig, metadata: dict[str, str], start_ns: int, attachments: Mapping[str, bytes]
 ) -> None:
-    """Write what a recording begins with: the rig file, twice, the exposure basis, and facts about the session.
-
-    Of ``attachments``, by name, those are added that are not of its own.
+    """Write the beginning of a recording: the rig file, twice, the exposure basis, and facts about the session. Those
+    of ``attachments``, by name, are added that are not among them.
     """
     file.start()
     model = exposure_model(rig.plant, rig.timing.exposure_steps)
@@ -68,7 +68,7 @@ def begin_recording(
         if name not in topics.OF_EACH_FILE:
             file.add_attachment(name, "application/octet-stream", value, start_ns)
     file.add_metadata(topics.SESSION_METADATA, metadata)
-    file.add_metadata(topics.RIG_METADATA, {"toml": rig.toml})  # nothing can be read without it
+    file.add_metadata(topics.RIG_METADATA, {"toml": rig.toml})  # without it nothing can be read
 
 
 class RecordingWriter:
@@ -88,8 +88,8 @@ class RecordingWriter:
     attachments:
         Further attachments that go into the file at its start, by name.
     deterministic:
-        Cut the file by the messages' own times only, not by the wall clock as well: the same messages
-        give the same bytes. For sessions on virtual time and for re-estimation.
+        Whether to divide the file by the messages' own times only, not by the wall clock as well, so that the same
+        messages give the same bytes. It is for sessions on virtual time and for re-estimation.
 
     Raises
     ------
@@ -126,7 +126,7 @@ class RecordingWriter:
         self._ending = threading.Event()
         self._put_bytes = self._taken_bytes = 0
         self._busy_since: float | None = None
-        """When the thread began what it is doing with the file."""
+        """The time at which the thread began its present work on the file."""
         if self._lead is not None:
             self._clear_parts()
         try:
@@ -153,7 +153,7 @@ class RecordingWriter:
         while self._is_stalled() or self._is_full():
             if self._error:
                 raise self._error
-            if self._is_stalled() or not self._deterministic:  # who has time to wait, waits
+            if self._is_stalled() or not self._deterministic:  # a caller that has time to wait, waits
                 raise RecordingError(f"the disk of {self.path} is too slow for this session: record to a faster one")
             time.sleep(0.01)
 
@@ -165,7 +165,7 @@ class RecordingWriter:
         return since is not None and time.monotonic() - since > _STALL_S
 
     def close(self, end_metadata: dict[str, str] | None = None) -> None:
-        """Write what is queued, the index and ``end_metadata``. Raises RecordingError as `write` does."""
+        """Write the queued messages, the index and ``end_metadata``. Raises RecordingError as `write` does."""
         if self._closed:
             return
         self._closed = True
@@ -189,7 +189,7 @@ class RecordingWriter:
                 self.close({"ended": f"error: {error}"})
 
     def _clear_parts(self) -> None:
-        """Parts of another session with the same name would be taken for some of this one."""
+        """Remove parts of another session with the same name, which would seem to belong to this one."""
         name = re.compile(re.escape(self.path.stem) + r"-\d{3,}" + re.escape(self.path.suffix))
         folder = self.path.parent
         try:
@@ -226,7 +226,7 @@ class RecordingWriter:
         options = self._options
         last_sync = last_write = time.monotonic()
         while True:
-            ending = self._ending.is_set()  # what is queued after this is written too, or not there
+            ending = self._ending.is_set()  # read first: nothing is queued after it is set
             self._busy_since = now = time.monotonic()
             try:
                 while self._queue:
@@ -245,7 +245,7 @@ class RecordingWriter:
                     if now - last_sync > options.fsync_s:
                         self._file.sync()
                         last_sync = time.monotonic()
-            except Exception as error:  # whatever it is, the session must hear of it
+            except Exception as error:  # the session must learn of any error
                 self._give_up(error)
                 return
             finally:
@@ -253,7 +253,7 @@ class RecordingWriter:
             self._ending.wait(_POLL_S)
 
     def _write_some(self) -> None:
-        """Add what is queued to the file, up to where the clock is to be looked at."""
+        """Add queued messages to the file, until the clock is to be read."""
         queue, schemas, taken = self._queue, self._schemas, 0
         while queue and taken < _LOOK_BYTES:
             topic, message, data, log_time_ns = queue.popleft()
@@ -267,7 +267,8 @@ class RecordingWriter:
             self._taken_bytes += len(data)
 
     def _lead_in(self, lead: Lead, topic: str, message: Message, log_time_ns: int) -> None:
-        """Begin the next part if this one is full, with what it needs of this; keep what the one after may need."""
+        """Begin the next part if this one is full, with the messages that it needs from this one; keep those that the
+        part after it may need."""
         if topic == topics.EXPOSURE and self._part_is_full(log_time_ns):
             self._finish({"ended": "goes on in the next part"})
             self._begin(log_time_ns)
@@ -291,7 +292,7 @@ class RecordingWriter:
         self._file.finish(sync=not self._deterministic)
 
     def _give_up(self, error: Exception) -> None:
-        """The disk is full or gone: leave a file that ends with its last whole part."""
+        """Cut the file back to its last whole part, because the disk is full or gone."""
         self._file.cut_back()
         if isinstance(error, RecordingError):
             self._error = error

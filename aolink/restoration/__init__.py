@@ -1,4 +1,5 @@
-"""Restoration: from the estimated path to a picture without its blur. Pure: no time, no files, no ports."""
+"""Restoration: the estimated path gives a picture without its blur. The subpackage is pure: no time, no files, no
+ports."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -14,10 +15,10 @@ from aolink.restoration.scanner import Scanner, first_order, from_correlation, m
 
 if TYPE_CHECKING:
     METHODS: tuple[str, ...]
-else:  # the type checker would believe in any name
+else:  # the type checker would accept any name
 
     def __getattr__(name: str) -> Any:
-        """METHODS, the names of all methods; installed packages are searched only when somebody asks for it."""
+        """METHODS, the names of all methods; installed packages are searched only when it is used."""
         if name == "METHODS":
             return method_names()
         raise AttributeError(f"module 'aolink.restoration' has no attribute {name!r}")

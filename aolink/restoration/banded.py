@@ -8,7 +8,7 @@ from scipy import linalg
 from aolink.numerics.arrays import BoolArray, FloatArray
 from aolink.restoration.psf import line_matrix
 
-# From this many lines on, products of blocks are faster than solving line by line.
+# From this number of lines on, products of blocks are faster than solving line by line.
 MANY_LINES = 64
 # Smallest block, pixels; and multiplications in one product of blocks: linear algebra's own threads would wait for
 # each other longer than a smaller one takes.
@@ -107,7 +107,7 @@ def dense(bands: FloatArray) -> FloatArray:
 
 
 def _blur_transposed(lines: FloatArray, taps: FloatArray) -> FloatArray:
-    """C' applied to lines, (lines, columns + m)."""
+    """C' multiplied by each line, (lines, columns + m)."""
     columns, m = taps.shape[0], taps.shape[1] - 1
     C, width = line_matrix(taps, columns), max(m, _BLOCK)
     out = np.empty((len(lines), columns + m))

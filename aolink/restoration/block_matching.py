@@ -1,4 +1,4 @@
-"""A denoiser: patches that look alike are put together, and their common spectrum is shrunk.
+"""A denoiser: similar patches are grouped, and the spectrum of each group is shrunk.
 
 References
 ----------
@@ -21,9 +21,9 @@ Singles = NDArray[np.float32]
 
 _SIDE = 8
 _STEP = 3
-"""Pixels from one patch that a group is made for to the next."""
+"""Distance between the patches for which groups are made, pixels."""
 _REACH = 8
-"""Pixels along rows and columns within which a patch is looked for that looks alike."""
+"""Pixels along rows and columns within which similar patches are searched for."""
 _GROUP = 16
 """Patches in a group, at most."""
 _THRESHOLD = 2.7
@@ -36,8 +36,8 @@ _BAND = 32
 def block_matching(image: FloatArray, noise_sd: float, *, band: int = _BAND) -> FloatArray:
     """A picture without its white noise of this standard deviation.
 
-    In the first pass the small coefficients of each group are left out. What comes of it says in the second pass which
-    patches look alike, and how large each coefficient is without noise (Wiener's filter).
+    In the first pass the small coefficients of each group are left out. Its result shows in the second pass which
+    patches are similar, and how large each coefficient is without noise (Wiener's filter).
 
     Parameters
     ----------
@@ -78,7 +78,7 @@ class _Patches:
     def of(cls, rows: int, columns: int) -> _Patches:
         sides = min(_SIDE, rows), min(_SIDE, columns)
         places = rows - sides[0] + 1, columns - sides[1] + 1
-        # As many as the patch in a corner finds.
+        # The number of patches that the patch in a corner finds.
         group = 2 ** int(math.log2(min(_GROUP, math.prod(min(n, _REACH + 1) for n in places))))
         each = [fft.dct(np.eye(n), axis=0, norm="ortho") for n in sides]
         return cls(
@@ -88,7 +88,7 @@ class _Patches:
         )  # fmt: skip
 
     def filtered(self, noisy: Singles, guide: Singles | None, noise_sd: float, band: int) -> FloatArray:
-        """One pass: by a guide, or by a threshold without one."""
+        """One pass: by a guide picture, or without one by a threshold."""
         total, weight = np.zeros(noisy.shape), np.zeros(noisy.shape)
         starts = _every(self.places[0])
         for first in range(0, len(starts), band):
@@ -137,7 +137,8 @@ class _Patches:
         return np.asarray(windows.reshape(-1, math.prod(self.sides)) @ self.transform.T)
 
     def _alike(self, image: Singles, starts: NDArray[np.intp]) -> NDArray[np.intp]:
-        """Places of the patches that look most like those of some rows, themselves first, (groups, group)."""
+        """Places of the patches that are most similar to those of some rows, each patch itself first, (groups,
+        group)."""
         rows, columns = image.shape
         high, wide = rows - self.sides[0] + 1, self.places[1]
         across = _every(wide)

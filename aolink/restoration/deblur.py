@@ -33,14 +33,14 @@ class RestoredPictures:
 
     frame_id: int
     estimator: str
-    """Whose path they were restored with."""
+    """The estimator whose path they were restored with."""
     method: str
     scene_noise_sd: float
-    """Standard deviation of the scene's noise, as found in it; NaN where there is no scene."""
+    """Standard deviation of the scene's noise, estimated from the scene; NaN where there is no scene."""
     path_noise_sd: float
-    """Standard deviation of what the path's uncertainty adds to that noise."""
+    """Standard deviation of the additional noise from the path's uncertainty."""
     reason: str
-    """Why pictures are missing; empty where none is."""
+    """The reason why pictures are missing; empty where none is."""
     scene: NDArray[np.float32] | None
     """Intensity, (rows, columns)."""
     spots: NDArray[np.float32] | None

@@ -18,7 +18,8 @@ _ON_CIRCLE = 1e-6
 
 
 def largest_zero(values: FloatArray) -> float:
-    """Largest magnitude of the zeros of c_0 z^m + .. + c_m, over all pixels where each has its own PSF.
+    """Largest magnitude of the zeros of c_0 z^m + .. + c_m; where each pixel has its own PSF, the largest over all
+    pixels.
 
     An error of the initial state is multiplied by it from pixel to pixel: below one, the inverse is stable.
     """
@@ -31,12 +32,13 @@ def largest_zero(values: FloatArray) -> float:
 
 
 def stable_direction(values: FloatArray, wanted: Direction | None = None) -> Direction:
-    """The direction in which lines can be inverted exactly, or the one that is wanted; backwards the PSF is reversed.
+    """The direction in which lines can be inverted exactly, or the requested one; backwards the PSF is reversed.
 
     Raises
     ------
     RestorationError
-        It is unstable in the direction that is wanted; or in both: the PSF has zeros on both sides of the unit circle.
+        The inverse is unstable in the requested direction; or in both: the PSF has zeros on both sides of the unit
+        circle.
     """
     zeros: dict[Direction, float] = {"forward": largest_zero(values), "backward": largest_zero(values[..., ::-1])}
     best: Direction = "forward" if zeros["forward"] <= zeros["backward"] else "backward"

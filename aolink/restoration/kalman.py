@@ -20,17 +20,17 @@ class LineModel:
     """The augmented model, Shahin (12), with the prior of its state at the first pixel."""
 
     A: FloatArray
-    """(states, states); B gamma and alpha in it."""
+    """The transition matrix, with B gamma and alpha in it, (states, states)."""
     Q: FloatArray
-    """B-bar K B-bar', (states, states)."""
+    """Process noise B-bar K B-bar', (states, states)."""
     rows: FloatArray
     """C-bar = (c_1 .. c_m, c_0 gamma) for each pixel, (columns, states)."""
     output: FloatArray
-    """The scene at k from W(k), (states,)."""
+    """Row that gives the scene at k from W(k), (states,)."""
     start_mean: FloatArray
-    """W(0), (lines or 1, states)."""
+    """Mean of W(0), (lines or 1, states)."""
     start_covariance: FloatArray
-    """P(0), (states, states)."""
+    """Covariance P(0), (states, states)."""
 
 
 def line_model(values: FloatArray, columns: int, scanner: Scanner, known: FloatArray | None = None) -> LineModel:
@@ -87,7 +87,7 @@ def _stationary(scanner: Scanner, m: int) -> FloatArray:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Filtered:
-    """States along the lines. Covariances are shared by all lines (first axis 1), or each line's own."""
+    """States along the lines. Covariances are shared by all lines (first axis 1), or each line has its own."""
 
     predicted: FloatArray
     """W(k) given the pixels before k, (columns, lines, states)."""
@@ -108,7 +108,7 @@ def kalman(
     seen:
         False where a pixel was not measured, (lines, columns).
     keep:
-        Keep the covariances, which the smoother needs.
+        Whether to keep the covariances, which the smoother needs.
 
     References
     ----------

@@ -21,7 +21,7 @@ from aolink.restoration.rotation import to_lines
 from aolink.restoration.scanner import Scanner, first_order
 from aolink.restoration.uncertainty import line_variance
 
-# States of all lines kept at once, numbers.
+# The most numbers in the states of all lines that are kept at once.
 _MOST_KEPT = 20_000_000
 _Boundary = float | ArrayLike | None
 
@@ -35,7 +35,7 @@ def inverse(
     lines = _Lines.of(picture, values, origin, boundary, way)
     columns = lines.rows.shape[1]
     out = invert_lines(lines.rows, lines.values, lines.known)
-    # Pixels that the PSF never brings into the frame take the value of the last one that it does.
+    # Pixels that the PSF never brings into the frame take the value of the last pixel that it does bring in.
     place = np.arange(columns) + lines.values.shape[-1] - 1 - lines.origin
     scene = lines.picture(out[:, np.clip(place, 0, out.shape[1] - 1)], picture.planes.shape)
     return Restored(image=scene, scanner=scanner, direction=way)
@@ -126,7 +126,7 @@ class _Lines:
 
 
 def _without_delay(values: FloatArray, origin: int) -> tuple[FloatArray, int]:
-    """The PSF and its origin without end taps that are zero for every pixel: the inverse divides by the first one."""
+    """The PSF and its origin without end taps that are zero for every pixel: the inverse divides by the first tap."""
     lit = np.flatnonzero(values.reshape(-1, values.shape[-1]).any(axis=0))
     first, last = int(lit[0]), int(lit[-1])
     kept = values[..., first : last + 1]
@@ -138,7 +138,7 @@ def _without_delay(values: FloatArray, origin: int) -> tuple[FloatArray, int]:
 
 
 def _known(boundary: float | ArrayLike | None, rows: int, m: int) -> FloatArray | None:
-    """Pixels before the line, (rows or 1, m)."""
+    """The known pixels before the line, (rows or 1, m)."""
     if boundary is None:
         return None
     given = np.asarray(boundary, dtype=np.float64)
@@ -162,7 +162,7 @@ def _estimated(scanned: _Lines, which: str, scanner: Scanner, variance: float) -
     lines = lines - mean * light
     if known is not None:
         known = known - mean
-        # The first state lies before the frame: begin with as many pixels that are not measured.
+        # The first state lies before the frame: begin with the same number of pixels that are not measured.
         lines = np.pad(lines, ((0, 0), (origin, 0)))
         seen = np.pad(np.ones((n_lines, columns), bool) if seen is None else seen, ((0, 0), (origin, 0)))
         if values.ndim == 2:

@@ -2,7 +2,7 @@
 
 A solver holds (H'WH + kappa L) for one PSF: H blurs a scene that goes beyond the frame into the frame, W masks pixels
 that were not measured, L = Dx'Dx + Dy'Dy, and kappa is lambda times the noise's variance. Nothing is periodic, and
-nothing is assumed of what lies outside. Scenes are (batch, rows, columns), larger than the frame by the PSF's reach.
+nothing is assumed about the scene outside. Scenes are (batch, rows, columns), larger than the frame by the PSF's reach.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _SMALL_SCENE, _SMALL_FFT = 1200, 40_000
 
 
 def single_is_enough(kappa: float, sum_of_taps: float) -> bool:
-    """Whether single precision is wrong by far less than the noise; its error grows with one over kappa."""
+    """Whether the error of single precision is far below the noise; this error grows with one over kappa."""
     return kappa >= _SINGLE * sum_of_taps**2
 
 
@@ -54,7 +54,8 @@ class Solver(Protocol):
         ...
 
     def guess(self, images: FloatingArray) -> FloatingArray | None:
-        """A scene to start from, if that helps; ``images`` hold likely values where nothing was measured."""
+        """A scene to start from, or None if the solver needs none; ``images`` hold likely values where nothing was
+        measured."""
         ...
 
 
@@ -65,7 +66,8 @@ def difference_spectrum(n: int) -> NDArray[np.float64]:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class LineSolver:
-    """Blur along the rows, all pixels measured: exact. Cosines down the columns, one eigenbasis along the rows."""
+    """An exact solver for blur along the rows with all pixels measured: cosines down the columns, one eigenbasis along
+    the rows."""
 
     C: FloatingArray
     """Matrix that blurs a line, (columns, columns + m)."""
@@ -84,10 +86,10 @@ class LineSolver:
         return np.asarray(images.astype(self.C.dtype, copy=False) @ self.C)
 
     def guess(self, images: FloatingArray) -> None:
-        """It needs none."""
+        """No scene: this solver needs none."""
 
     def solve(self, right: FloatingArray, start: FloatingArray | None = None, tolerance: float = 0.0) -> FloatingArray:
-        # A second thread for the cosines would cost more than it saves: that of the products is still awake.
+        # A second thread for the cosines would cost more than it saves: the thread of the products is still awake.
         z = fft.dct(right, axis=-2, norm="ortho") @ self.vectors
         z *= self.inverse
         return np.asarray(fft.idct(z @ self.vectors.T, axis=-2, norm="ortho", overwrite_x=True))
@@ -106,7 +108,8 @@ def line_solver(psf: Psf, shape: tuple[int, int], kappa: float, single: bool = F
     bands[0, 0] -= kappa
     bands[0, -1] -= kappa
     bands[1, :-1] -= kappa
-    # NumPy's, not SciPy's: each of them has threads of its own, and those would be in the way of the products'.
+    # NumPy's function, not SciPy's: each library has threads of its own, and SciPy's would be in the way of the
+    # products'.
     values, vectors = np.linalg.eigh(dense(bands))
     return LineSolver(
         C=line_matrix(taps, shape[1]).astype(dtype), vectors=vectors.astype(dtype),
@@ -117,7 +120,8 @@ def line_solver(psf: Psf, shape: tuple[int, int], kappa: float, single: bool = F
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class DenseSolver:
-    """Any blur on the plane and any mask of a small frame: exact, by the Cholesky factor of the whole matrix."""
+    """An exact solver for any blur on the plane and any mask of a small frame, by the Cholesky factor of the whole
+    matrix."""
 
     H: FloatingArray
     """Matrix that blurs a scene, zero where nothing was measured, (pixels, scene's pixels)."""
@@ -131,7 +135,7 @@ class DenseSolver:
         return np.asarray(images.reshape(len(images), -1) @ self.H).reshape(-1, *self.shape)
 
     def guess(self, images: FloatingArray) -> None:
-        """It needs none."""
+        """No scene: this solver needs none."""
 
     def solve(self, right: FloatingArray, start: FloatingArray | None = None, tolerance: float = 0.0) -> FloatingArray:
         flat = right.reshape(len(right), -1).T
@@ -165,7 +169,7 @@ def _differences_squared(n: int) -> NDArray[np.float64]:
 
 
 def _on_plane(psf: Psf, shape: tuple[int, int]) -> tuple[NDArray[np.float64], tuple[slice, slice]]:
-    """Taps on the plane, and where a frame lies in its scene."""
+    """Taps on the plane, and the place of a frame in its scene."""
     taps, origin = np.atleast_2d(psf.values), (0, *psf.origin)[-2:]
     top, left = (n - 1 - o for n, o in zip(taps.shape, origin, strict=True))
     return taps, (slice(top, top + shape[0]), slice(left, left + shape[1]))
@@ -173,7 +177,7 @@ def _on_plane(psf: Psf, shape: tuple[int, int]) -> tuple[NDArray[np.float64], tu
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class IterativeSolver:
-    """Any blur on the plane and any mask, by preconditioned conjugate gradients."""
+    """A solver for any blur on the plane and any mask, by preconditioned conjugate gradients."""
 
     kappa: float
     blur: Callable[[FloatingArray], FloatingArray]
@@ -184,7 +188,7 @@ class IterativeSolver:
     seen: BoolArray | None
     frame: tuple[slice, slice]
     white: bool = False
-    """I in the place of L: the scene's pixels are white, not its differences."""
+    """Whether I takes the place of L: the scene's pixels are white, not its differences."""
 
     def project(self, images: FloatingArray) -> FloatingArray:
         return self.blur_transposed(images if self.seen is None else np.where(self.seen, images, 0.0))
@@ -197,7 +201,7 @@ class IterativeSolver:
         r = right - self._apply(x)
         z = self.nearly(r)
         p, rz = z, _dot(r, z)
-        # The second limit is rounding, for a picture that is the same everywhere.
+        # The second limit is that of rounding, for a picture that is constant.
         goal = np.maximum(tolerance**2 * prior, 1e-28 * _dot(right, self.nearly(right)))
         for _ in range(_MOST_STEPS):
             if (rz <= goal).all():
@@ -237,7 +241,8 @@ def differences_transposed(along: FloatingArray, down: FloatingArray) -> Floatin
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Plane:
-    """A blur on a plane that goes round, as large as the scene or a little larger, where transforms are fast."""
+    """A blur on a periodic plane, as large as the scene or slightly larger, with a size for which transforms are
+    fast."""
 
     taps: NDArray[np.float64]
     frame: tuple[slice, slice]
@@ -247,7 +252,7 @@ class Plane:
     shape: tuple[int, int]
     """Rows and columns of the plane."""
     transfer: NDArray[np.complexfloating[Any]]
-    """Transfer function of the blur, by `forward`."""
+    """Transfer function of the blur, as computed by `forward`."""
     rough: FloatingArray
     """Spectrum of L."""
 
@@ -264,7 +269,7 @@ class Plane:
 
     @property
     def blurred(self) -> tuple[slice, slice]:
-        """Where the frame lies in the blurred plane: only there does nothing that went round arrive."""
+        """The place of the frame in the blurred plane: only there no light arrives from across the periodic border."""
         return slice(self.taps.shape[0] - 1, self.scene[0]), slice(self.taps.shape[1] - 1, self.scene[1])
 
     @property
@@ -278,19 +283,19 @@ class Plane:
     def backward(
         self, spectrum: NDArray[np.complexfloating[Any]], shape: tuple[int, int] | None = None
     ) -> FloatingArray:
-        """The whole plane with a spectrum, which is overwritten."""
+        """The whole plane that has a spectrum, which is overwritten."""
         return np.asarray(fft.irfft2(spectrum, shape or self.shape, workers=self._threads, overwrite_x=True))
 
     def through(
         self, images: FloatingArray, factor: NDArray[np.inexact[Any]], shape: tuple[int, int] | None = None
     ) -> FloatingArray:
-        """The scene's pixels of images whose spectrum is multiplied by a factor."""
+        """The scene's pixels after the images' spectrum is multiplied by a factor."""
         spectrum = self.forward(images, shape)
         spectrum *= factor
         return self.backward(spectrum, shape)[..., : self.scene[0], : self.scene[1]]
 
     def placed(self, images: FloatingArray) -> FloatingArray:
-        """Images where the frame lies in the blurred plane, cut to the scene's size; zero around it."""
+        """Images at the frame's place in the blurred plane, cut to the scene's size, with zeros around the frame."""
         padded = np.zeros((*images.shape[:-2], *self.scene))
         padded[..., *self.blurred] = images
         return padded
@@ -319,8 +324,9 @@ def inverse_spectrum(
     share: float = 1.0,
     white: bool = False,
 ) -> FloatingArray:
-    """One over that of (H'H + kappa L), or with I in the place of L; of the plane's pixels a share is measured."""
-    # A floor for the mean, which the differences do not hold.
+    """One over the spectrum of (H'H + kappa L), or with I instead of L; a given share of the plane's pixels is
+    measured."""
+    # A floor for the mean, which the differences do not determine.
     prior = 1.0 if white else np.maximum(rough, rough[rough > 0].min() / 4)
     return np.asarray(1 / (share * np.abs(transfer) ** 2 + kappa * prior))
 
@@ -346,7 +352,8 @@ def plane_solver(
 
 
 def masked_line_solver(psf: Psf, seen: BoolArray, kappa: float) -> IterativeSolver:
-    """Blur along the rows, pixels missing: conjugate gradients preconditioned by the whole frame's exact solver."""
+    """A solver for blur along the rows with pixels missing: conjugate gradients, preconditioned by the whole frame's
+    exact solver."""
     exact = line_solver(psf, (seen.shape[0], seen.shape[1]), kappa)
     return IterativeSolver(
         kappa=kappa, blur=lambda x: np.asarray(x @ exact.C.T), blur_transposed=lambda y: np.asarray(y @ exact.C),

@@ -33,7 +33,8 @@ class Blurred:
 
     @cached_property
     def whole(self) -> FloatArray:
-        """The planes with each missing pixel as its nearest neighbour: good enough to find weights with."""
+        """The planes with each missing pixel replaced by its nearest neighbour, which is accurate enough to find
+        weights."""
         if self.seen is None:
             return self.planes
         nearest = ndimage.distance_transform_edt(~self.seen, return_distances=False, return_indices=True)
@@ -46,7 +47,7 @@ class Blurred:
 
     @cached_property
     def noise_variance(self) -> float:
-        """Variance of the noise, as given or as estimated from the picture; at least that of rounding."""
+        """Variance of the noise, given or estimated from the picture; at least that of rounding."""
         if self.given_noise_sd is not None:
             return self.given_noise_sd**2
         planes = self.whole
@@ -55,17 +56,17 @@ class Blurred:
 
     @cached_property
     def line(self) -> Line:
-        """The straight line that a PSF on the plane is nearest to."""
+        """The straight line that is nearest to a PSF on the plane."""
         return along_line(self.psf)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Restored:
-    """A picture without its blur, and what it was restored with."""
+    """A picture without its blur, and the values with which it was restored."""
 
     image: NDArray[Any]
-    """Aligned with the scene at no displacement; shape and dtype of the blurred picture. A method gives it as
-    (colours, rows, columns)."""
+    """The picture, aligned with the scene at zero displacement, with shape and dtype of the blurred picture. A method
+    gives it as (colours, rows, columns)."""
     method: str = ""
     noise_sd: float = math.nan
     """Standard deviation of the picture's white noise, as given or as estimated; NaN for a method that needs none."""
@@ -85,10 +86,11 @@ class Method:
 
     name: str
     summary: str
-    """What it is, in a few words."""
+    """The method in a few words."""
     restore: Callable[..., Restored]
-    """Takes a `Blurred`, and those of `parameters` that the caller gives, by name."""
+    """The function: it takes a `Blurred`, and by name those of `parameters` that the caller gives."""
     why_not: Callable[[Blurred], str | None] = lambda blurred: None
-    """Why it cannot restore this picture with this PSF, and what to use instead; None where it can."""
+    """A function that gives the reason why it cannot restore this picture with this PSF, and what to use instead; None
+    where it can."""
     parameters: tuple[str, ...] = ()
     """Further keyword arguments of `aolink.restoration.restore` that it takes; it has a default for each."""

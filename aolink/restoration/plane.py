@@ -19,7 +19,7 @@ from aolink.restoration.tv import plane_total_variation, total_variation
 from aolink.restoration.uncertainty import plane_variance
 
 # Least ratio of the variances of the noise and of the scene's differences for conjugate gradients: below it they need
-# more steps, as one over the ratio's root, and the picture gets no sharper.
+# more steps, in proportion to one over the ratio's root, and the picture gets no sharper.
 _SMALLEST_RATIO = 3e-4
 
 
@@ -84,12 +84,12 @@ def why_not_pnp(picture: Blurred) -> str | None:
 
 
 def _with_edges(picture: Blurred, weights: _Weights) -> tuple[FloatArray, tuple[slice, slice]]:
-    """The scene by total variation, beyond the frame as well, and where the frame lies in it."""
+    """The scene by total variation, beyond the frame as well, and the frame's place in it."""
     psf, shape = picture.psf, _shape(picture)
     level = picture.whole.mean()
     images = picture.whole - level
     if psf.varies or (psf.on_line and picture.seen is None):
-        # Total variation does not need the last digits; half of them take half of the time.
+        # Total variation does not need the last digits: single precision takes half of the time.
         scene, solver = total_variation(
             lambda kappa: make_solver(psf, shape, kappa, picture.seen, single=True),
             images, weights.total, weights.difference,

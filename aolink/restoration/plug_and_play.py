@@ -1,4 +1,4 @@
-"""Plug and play: steps of any denoiser and of the data term in turn. And a denoiser, non-local means.
+"""Plug and play: steps of any denoiser and of the data term in turn. The module also has a denoiser, non-local means.
 
 References
 ----------
@@ -19,7 +19,8 @@ from aolink.numerics.arrays import FloatArray
 from aolink.restoration.markov import IterativeSolver
 
 Denoiser = Callable[[FloatArray, float], FloatArray]
-"""From a picture (rows, columns) and the standard deviation of its noise to the picture without noise."""
+"""A function of a picture (rows, columns) and the standard deviation of its noise that gives the picture without
+noise."""
 
 # Coupling of scene and denoised picture, and the denoiser's first sd as a share of the picture's range.
 _COUPLING = 0.23
@@ -36,12 +37,13 @@ def plug_and_play(
     start: NDArray[np.floating[Any]],
     denoise: Denoiser,
 ) -> FloatArray:
-    """Half-quadratic splitting: the scene x of least |image - H x|^2 / s^2 + rho |x - z|^2, z from it, in turn.
+    """Half-quadratic splitting: in turn, the scene x that minimises |image - H x|^2 / s^2 + rho |x - z|^2, and the
+    denoised z of x.
 
     Parameters
     ----------
     make_solver:
-        Gives the solver of (H'WH + kappa I) for a kappa.
+        A function that gives the solver of (H'WH + kappa I) for a kappa.
     images:
         (batch, rows, columns)
     start:
@@ -65,9 +67,8 @@ def plug_and_play(
 
 
 def non_local_means(image: FloatArray, noise_sd: float) -> FloatArray:
-    """Mean of the pixels within 7 whose 5 x 5 neighbourhoods look alike, weighted by exp(-distance^2 / h^2).
-
-    The distance is the mean squared difference less 2 sd^2 that noise alone makes; h = 0.8 sd.
+    """Mean of the pixels within 7 pixels whose 5 x 5 neighbourhoods are similar, weighted by exp(-distance^2 / h^2).
+    The squared distance is the mean squared difference less the 2 sd^2 of noise alone; h = 0.8 sd.
     """
     reach, patch, h = 7, 5, 0.8 * noise_sd
     rows, columns = image.shape

@@ -5,7 +5,7 @@ for a displacement of j - origin, so that
 
     image[k] = sum_j values[j] scene[k + origin - j]
 
-and what is restored with it lies where the scene lies when the displacement is zero.
+and a picture that is restored with it lies where the scene lies when the displacement is zero.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _NEGLIGIBLE = 1e-5
 # number, and a second one times its ratio to the uncorrelated part.
 _UNCORRELATED = 1e-3
 _POINTS, _MORE_POINTS, _MOST_POINTS = 6, 8, 256
-# Modes of the PSF's error that together hold less than this share of its variance are left out.
+# PSF modes (patterns of the PSF's error) that together hold less than this share of its variance are left out.
 _MODES_LEFT_OUT = 1e-4
 # A path is straight for the line methods if its light strays from the line by less than this, rms, pixels.
 STRAIGHT_PX = 0.35
@@ -45,7 +45,8 @@ class Psf:
     origin: tuple[int, ...]
     """Tap that stands for no displacement: (column,) along the rows, (row, column) on the plane."""
     modes: FloatArray = field(default_factory=lambda: np.zeros((0,)))
-    """Error of the values as independent modes, each at one standard deviation, (modes, *values.shape)."""
+    """PSF modes: the error of the values as independent patterns, each at one standard deviation, (modes,
+    *values.shape)."""
 
     def __post_init__(self) -> None:
         values = np.asarray(self.values, dtype=np.float64)
@@ -67,7 +68,7 @@ class Psf:
 
     @property
     def on_line(self) -> bool:
-        """Whether it moves along the rows only."""
+        """Whether the motion is along the rows only."""
         return len(self.origin) == 1
 
     @property
@@ -123,8 +124,8 @@ def motion_psf(
     Parameters
     ----------
     path:
-        Displacement at each fast step, slope units, (n_steps,) along the rows of the picture, or (2, n_steps): x along
-        its columns' numbers, y along its rows' numbers.
+        Displacement at each fast step, slope units, (n_steps,) along the rows of the picture, or (2, n_steps): x in the
+        direction of growing column numbers, y in that of growing row numbers.
     path_covariance:
         Covariance of the path, slope units squared, (n_steps, n_steps), or (2 n_steps, 2 n_steps) with all of x first;
         None where the path is known exactly.
@@ -156,7 +157,8 @@ def motion_psf(
 def motion_psf_by_root(
     path: ArrayLike, root: FloatArray | None, kernel: Kernel, pixel_scale: float, shares: ArrayLike | None = None
 ) -> Psf:
-    """`motion_psf` with R of the path's covariance R R', (n_steps or 2 n_steps, any), where that is known."""
+    """The PSF as by `motion_psf`, where the path's covariance R R' is given by its root R, (n_steps or 2 n_steps,
+    any)."""
     steps = np.asarray(path, dtype=np.float64)
     on_line = steps.ndim == 1 or (steps.ndim == 2 and len(steps) == 1)
     steps = np.atleast_2d(steps)
@@ -199,7 +201,7 @@ def _checked_shares(shares: ArrayLike | None, n: int) -> FloatArray:
 
 
 def _correlated_part(spread: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Covariances (n_steps, axes, axes) as c c' and a rest in which x and y are independent.
+    """Covariances (n_steps, axes, axes) as the sum of c c' and a remainder in which x and y are independent.
 
     Returns
     -------
@@ -312,6 +314,6 @@ def along_line(psf: Psf) -> Line:
     return Line(
         angle_rad=math.atan2(direction[1], direction[0]),
         psf=_trimmed(project(values), modes if len(modes) else np.zeros((1, size)), (-low,)),
-        # A line that is drawn on pixels strays by what a pixel's own width is, 1/12 of its square.
+        # A line that is drawn on pixels strays by the variance of a pixel's own width, 1/12 of its square.
         deviation_px=math.sqrt(max(float(sizes[0]) - 1 / 12, 0.0)),
     )

@@ -1,4 +1,4 @@
-"""`restore`: from a blurred picture and its PSF to the picture without the blur."""
+"""The function `restore`: it gives the picture without the blur from a blurred picture and its PSF."""
 
 from __future__ import annotations
 
@@ -54,7 +54,8 @@ def restore(
 
         ``scanner``: model of the scene, see `first_order`, `from_correlation`; None fits a first-order one.
 
-        ``direction``: in which lines are scanned. None: the stable one for the inverse, forwards for the others.
+        ``direction``: the direction in which lines are scanned. None: the stable one for the inverse, forwards for the
+        others.
 
         ``pnp`` takes ``denoise``: a function of a picture (rows, columns) and its noise's standard deviation.
 

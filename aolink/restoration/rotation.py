@@ -27,7 +27,8 @@ def to_lines(
 
     Returns
     -------
-    The turned pictures, in a frame that holds all of them; where they are measured; and a function that turns back.
+    The turned pictures, in a frame that holds all of them; the mask of the measured pixels; and a function that turns
+    back.
     """
     rows, columns = planes.shape[1:]
     c, s = math.cos(angle_rad), math.sin(angle_rad)

@@ -39,7 +39,7 @@ class Scanner:
 
 
 def first_order(correlation: float, variance: float) -> Scanner:
-    """A first-order Gauss-Markov line: neighbours correlate by ``correlation``; 0 is the delay of Shahin, V.
+    """A first-order Gauss-Markov line: neighbours have this ``correlation``; 0 is the delay of Shahin, V.
 
     Raises
     ------

@@ -15,7 +15,7 @@ from scipy import fft, optimize
 from aolink.errors import RestorationError
 from aolink.numerics.arrays import BoolArray, FloatArray
 
-# Share of the frequencies, those where the blurred scene is weakest, that are taken to hold noise only.
+# Share of the frequencies that are assumed to hold noise only: those where the blurred scene is weakest.
 _DARK_SHARE = 0.02
 # Frequencies below this many periods an image are left out, since the taper dominates them.
 _LOWEST = 2.5
@@ -28,7 +28,7 @@ class Spectrum:
     """A picture's periodogram, and the spectra of blur and differences at the same frequencies."""
 
     power: FloatArray
-    """Squared magnitude per pixel; all colours' mean, (frequencies,)."""
+    """Squared magnitude per pixel, the mean of all colours, (frequencies,)."""
     transfer: FloatArray
     """Squared magnitude of the PSF's transfer function, (frequencies,)."""
     roughness: FloatArray
@@ -75,10 +75,11 @@ def line_spectrum(images: FloatArray, psf: FloatArray) -> Spectrum:
 
 
 def noise_variance(spectrum: Spectrum) -> float:
-    """Variance of white noise, from the frequencies where least of the scene is left: too small only by chance."""
+    """Variance of white noise, from the frequencies where least of the scene is left; it is too small only by
+    chance."""
     left = spectrum.transfer / np.maximum(spectrum.roughness, 1e-12)
     count = min(max(8, math.ceil(_DARK_SHARE * left.size)), left.size)
-    # All that are alike are in: a mirrored picture has the same noise.
+    # All equal frequencies are included, so that a mirrored picture has the same noise.
     dark = left <= np.partition(left, count - 1)[count - 1] * (1 + 1e-9)
     return float(spectrum.power[dark].mean())
 

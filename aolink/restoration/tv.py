@@ -1,7 +1,7 @@
 """Total variation by ADMM (alternating direction method of multipliers).
 
-Along lines its linear step is the exact Gauss-Markov one. On the plane that would take conjugate gradients in each
-iteration, so there the blurred plane is split off as well and the linear step is a division of spectra.
+Along lines its linear step is the exact Gauss-Markov one. On the plane this step would take conjugate gradients in each
+iteration, so there the blurred plane is split off as well, and the linear step is a division of spectra.
 
 References
 ----------
@@ -45,7 +45,7 @@ def total_variation(
     Parameters
     ----------
     make_solver:
-        Gives the solver for a kappa.
+        A function that gives the solver for a kappa.
     images:
         (batch, rows, columns)
     noise_variance, difference_weight:
@@ -80,12 +80,12 @@ def total_variation(
 
 
 def _shrinkage(along: FloatingArray, down: FloatingArray, threshold: float) -> tuple[FloatingArray, FloatingArray]:
-    """What differences along rows (..., rows, columns - 1) and down columns (..., rows - 1, columns) keep.
+    """The share that differences along rows (..., rows, columns - 1) and down columns (..., rows - 1, columns) keep.
 
     A pixel has four gradients, of a difference to its left or right and one above or below, and keeps
     max(1 - threshold / |gradient|, 0) of each. A difference keeps the mean of the four that it is part of. This is the
-    proximal operator of the proximal average of the four total variations, so what is minimised is convex and treats
-    all four diagonal directions alike.
+    proximal operator of the proximal average of the four total variations, so the minimised function is convex and
+    treats all four diagonal directions alike.
     """
     *batch, rows, columns = (*along.shape[:-1], down.shape[-1])
     across = np.zeros((*batch, rows, columns + 1), along.dtype)
@@ -95,7 +95,7 @@ def _shrinkage(along: FloatingArray, down: FloatingArray, threshold: float) -> t
     left, right, above, below = across[..., :-1], across[..., 1:], upright[..., :-1, :], upright[..., 1:, :]
 
     def lost(one: FloatingArray, other: FloatingArray) -> FloatingArray:
-        """A quarter of what a gradient of these squares loses."""
+        """A quarter of the share that a gradient with these squares loses."""
         size = one + other
         np.maximum(size, threshold * threshold, out=size)
         np.sqrt(size, out=size)
@@ -124,8 +124,8 @@ def plane_weight(noise_variance: float, difference_weight: float) -> float:
     """Weight of total variation on the plane: 0.32 lambda^0.2 / s^0.6.
 
     A fit to the best weights of six pictures, two measured camera-shake kernels and three noises: it is off by a factor
-    of 1.2 (root mean square), 1.6 at worst. 1.2 times the root of lambda, which the largest edges decide, is off by 1.7
-    and 3.3.
+    of 1.2 (root mean square), 1.6 at worst. A weight of 1.2 times the root of lambda, which depends mostly on the
+    largest edges, is off by 1.7 and 3.3.
     """
     return float(0.32 * difference_weight**0.2 * noise_variance**-0.3)
 
@@ -140,8 +140,8 @@ def plane_total_variation(
 ) -> FloatingArray:
     """Minimise |W (image - H scene)|^2 / (2 s^2) + w sum |gradient of scene|, with w of `plane_weight`.
 
-    The splits are u = H scene, on a plane that goes round, of which the data weigh the pixels of the frame that were
-    measured, and the scene's differences, of which those that go round weigh nothing.
+    The splits are u = H scene, on a periodic plane, in which the data weight the measured pixels of the frame, and the
+    scene's differences, of which those across the periodic border have weight zero.
 
     Parameters
     ----------
@@ -198,7 +198,7 @@ def plane_total_variation(
 
 
 def _next(x: FloatingArray, axis: int) -> FloatingArray:
-    """Each pixel's next one less itself, round the plane."""
+    """The next pixel less this one, for each pixel, periodically."""
     out = np.roll(x, -1, axis)
     out -= x
     return out

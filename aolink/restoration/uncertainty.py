@@ -16,7 +16,8 @@ _GRID = 256
 
 
 def line_variance(modes: FloatArray, scanner: Scanner) -> float:
-    """Added variance for lines of a scanner, a mean over pixels where each has its own PSF; modes (modes, .., taps)."""
+    """Added variance for lines of a scanner, the mean over pixels where each has its own PSF; PSF modes (modes, ..,
+    taps)."""
     if not len(modes):
         return 0.0
     R = linalg.toeplitz(scanner.correlation(modes.shape[-1] - 1))
@@ -24,9 +25,8 @@ def line_variance(modes: FloatArray, scanner: Scanner) -> float:
 
 
 def plane_variance(modes: FloatArray, difference_weight: float) -> float:
-    """Added variance for a scene of white differences; modes (modes, taps) or (modes, rows, columns), each of zero sum.
-
-    The mean over all frequencies of |m|^2 / (lambda roughness).
+    """Added variance for a scene of white differences; PSF modes (modes, taps) or (modes, rows, columns), each of zero
+    sum. It is the mean over all frequencies of |m|^2 / (lambda roughness).
     """
     if not len(modes):
         return 0.0

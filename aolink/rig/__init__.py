@@ -1,4 +1,4 @@
-"""What a rig is: a TOML file, and the frozen dataclasses that it becomes."""
+"""The description of a rig: a TOML file, and the frozen dataclasses that it becomes."""
 
 from aolink.optics.sensor import Kernel, Sensor, SpotSensor
 from aolink.rig.file import Rig, builtin_rigs, load_rig, parse_rig

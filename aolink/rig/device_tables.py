@@ -10,15 +10,14 @@ from aolink.rig.toml_table import Table
 
 @dataclass(frozen=True, kw_only=True)
 class Delay:
-    """A delay that no clock shows.
-
-    For a mirror it is the time from an input's fast step to the mirror's following it; for a camera that tells no time,
-    the time from the end of an exposure to its frame's arrival.
+    """A delay that no clock measures. For a mirror it is the time from the beginning of an input's fast step until the
+    mirror follows that input; for a camera that reports no time, the time from the end of an exposure to its frame's
+    arrival.
     """
 
     mean_s: float = 0.0
     sd_s: float = 0.0
-    """Standard deviation of what is known of the mean, s: an error that all exposures of a session have in common."""
+    """Standard deviation of the mean, s: an error that all exposures of a session have in common."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,7 +33,7 @@ class DeviceTable:
 
 
 def read_devices(table: Table) -> dict[str, DeviceTable]:
-    """The table ``[devices]``: by the names ``camera`` and ``mirror``, where it has them. Raises `RigError`."""
+    """Read the table ``[devices]``; its devices are given by the names ``camera`` and ``mirror``. Raises `RigError`."""
     devices = {}
     for kind in ("camera", "mirror"):
         if table.has(kind):

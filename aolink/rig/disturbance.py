@@ -23,22 +23,22 @@ class Vibration:
 
     frequency_hz: float
     amplitude: tuple[float, float]
-    """Along x and y, slope units; a line of pixels sees x."""
+    """Amplitude along x and y, slope units; a line sensor sees x."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class DisturbanceModel:
     """Slopes as a linear system driven by noise, x(k+1) = A x(k) + B_w w(k), that add C x(k) to the plant's outputs.
 
-    It is of one copy of the plant; each copy has its own. Nothing that the mirror does reaches its states.
+    It belongs to one copy of the plant; each copy has its own. The mirror's inputs do not reach its states.
     """
 
     A: FloatArray
     """State transition over one fast step, (n_states, n_states)."""
     B_w: FloatArray
-    """(n_states, n_noises)"""
+    """Noise input matrix, (n_states, n_noises)."""
     C: FloatArray
-    """(n_outputs, n_states)"""
+    """Output matrix, (n_outputs, n_states)."""
     process_noise: FloatArray
     """Covariance of w(k) per fast step, (n_noises, n_noises)."""
     initial_covariance: FloatArray
@@ -51,7 +51,7 @@ class Disturbance:
 
     plant_noise: bool
     """Whether the simulated plant and ``model`` make their own noise as well. If not, ``plant.process_noise`` and
-    ``model`` are only what estimators and controllers expect the disturbance to be."""
+    ``model`` are only the model that estimators and controllers use."""
     layers: tuple[Layer, ...]
     """Layers of turbulence."""
     pupil_m: float
@@ -62,11 +62,12 @@ class Disturbance:
     recorded: str
     """A file with slopes at each fast step, slope units, (steps, outputs), played in a loop; empty for none."""
     model: DisturbanceModel | None
-    """What the slopes are expected to be; the rig's plant has it beside the mirror's states. None for nothing."""
+    """The model of the disturbance; the rig's plant has its states beside the mirror's. None where there is no
+    model."""
 
 
 def read_disturbance(table: Table, n_outputs: int, fast_step_s: float) -> Disturbance:
-    """The table ``[disturbance]`` of a rig whose plant has ``n_outputs`` outputs a copy. Raises `RigError`."""
+    """Read the table ``[disturbance]`` of a rig whose plant has ``n_outputs`` outputs a copy. Raises `RigError`."""
     pupil, layers = table.read_any("turbulence", _turbulence) or (0.0, ())
     zernike = table.matrix("zernike_m", (None, 2), "Noll's index and metres") if table.has("zernike_m") else None
     if zernike is not None and not all(index >= 2 and index == round(index) for index in zernike[:, 0]):
@@ -95,7 +96,8 @@ def _sum(parts: Sequence[DisturbanceModel]) -> DisturbanceModel | None:
 
 
 def _model(table: Table, n_outputs: int, fast_step_s: float) -> DisturbanceModel:
-    """One part of ``disturbance.model``: a system by its name for each of its modes, or by its matrices."""
+    """One part of ``disturbance.model``: a system given by its kind, for each of its mode shapes, or by its
+    matrices."""
     kinds = ("resonance", "ornstein-uhlenbeck", "random-walk", "ar", "matrices")
     kind = table.choice("kind", kinds)
     if kind == "matrices":
@@ -117,7 +119,7 @@ def _model(table: Table, n_outputs: int, fast_step_s: float) -> DisturbanceModel
         A, B_w = _autoregressive(table)
     if kind == "random-walk":
         noise = table.vector("step_sd", modes.shape[1], "modes") ** 2
-        # It may have walked for a second before the first exposure.
+        # The random walk may have lasted for a second before the first exposure.
         one = np.eye(1) / fast_step_s
     else:
         one = stationary_covariance(A, B_w @ B_w.T)
@@ -131,7 +133,7 @@ def _model(table: Table, n_outputs: int, fast_step_s: float) -> DisturbanceModel
 
 
 def _autoregressive(table: Table) -> tuple[FloatArray, FloatArray]:
-    """x(k) = a_1 x(k-1) + ... + a_p x(k-p) + w(k), whose state is the last p values, the newest first."""
+    """The process x(k) = a_1 x(k-1) + ... + a_p x(k-p) + w(k), whose state is the last p values, the newest first."""
     coefficients = table.numbers("coefficients", "a_1 to a_p", most=4)
     A = np.vstack([coefficients, np.eye(len(coefficients) - 1, len(coefficients))])
     _check_dies_out(table, "coefficients", A)
@@ -158,7 +160,7 @@ def _check_dies_out(table: Table, name: str, A: FloatArray) -> None:
     radius = float(np.abs(np.linalg.eigvals(A)).max())
     if radius > 1 - 1e-9:
         raise RigError(
-            f"{table.key(name)} makes a disturbance that does not die out (an eigenvalue has modulus {radius:.6g}, it"
+            f"{table.key(name)} makes a disturbance that does not decay (an eigenvalue has modulus {radius:.6g}, it"
             " must be below 1): for one that wanders off use kind = 'random-walk'"
         )
 

@@ -1,4 +1,4 @@
-"""Edit values in the text of a rig file; every other character, comments and layout, stays."""
+"""Changes of values in the text of a rig file; every other character, comments and layout, stays."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def with_value(text: str, key: str, value: Any, *, may_be_new: bool = False) -> 
     Parameters
     ----------
     value:
-        Anything that TOML has, or a `tomlkit.value`, which keeps its digits.
+        Any value that TOML can hold, or a `tomlkit.value`, which keeps its digits.
     may_be_new:
         Whether the key may be missing; it is added behind the last value of its table.
 
@@ -63,7 +63,8 @@ def with_table(text: str, name: str, values: Mapping[str, Any], comment: str) ->
 
 
 def with_tables(text: str, name: str, tables: Sequence[Mapping[str, Any]], comment: str) -> str:
-    """The text with these tables, at least one, as those of a key such as ``disturbance.model``; old ones go."""
+    """The text with these tables, at least one, as those of a key such as ``disturbance.model``, in place of old
+    ones."""
     top, key = name.split(".")
 
     def edit(document: tomlkit.TOMLDocument) -> None:
@@ -84,7 +85,7 @@ def with_tables(text: str, name: str, tables: Sequence[Mapping[str, Any]], comme
 
 
 def _edited(text: str, edit: Callable[[tomlkit.TOMLDocument], None]) -> str:
-    # What is new has the line ends that the file has.
+    # New lines have the file's own line ends.
     crlf = "\r\n" in text and text.count("\r\n") == text.count("\n")
     try:
         document = tomlkit.parse(text.replace("\r\n", "\n") if crlf else text)

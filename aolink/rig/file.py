@@ -1,8 +1,6 @@
-"""What a rig is: a TOML file, and the frozen dataclasses that it becomes.
-
-`load_rig` reads and validates the whole file; what is wrong is one `RigError` that names the key.
-Quantities are SI (seconds) where the key ends in a unit, and otherwise in the rig's own slope unit:
-the unit of ``sensor.field``, of the plant's output and of the kernel's width.
+"""The description of a rig: a TOML file, and the frozen dataclasses that it becomes. `load_rig` reads and validates the
+whole file; an error is one `RigError` that names the key. Quantities are SI (seconds) where the key ends in a unit, and
+otherwise in the rig's own slope unit: the unit of ``sensor.field``, of the plant's output and of the kernel's width.
 """
 
 from __future__ import annotations
@@ -41,7 +39,8 @@ _TABLES = (
 """The top-level keys of a rig file."""
 _LONGEST = 16 << 20
 _DEEPEST = 200
-"""Characters of a rig file, and parts of a key: what a key takes of the memory grows with the square of its parts."""
+"""The most characters of a rig file, and the most parts of a key: the memory for a key grows with the square of its
+parts."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -58,7 +57,7 @@ class Rig:
     control: Control
     simulation: Simulation
     calibration: CalibrationTable | None
-    """None where the sensor's values were not measured."""
+    """The calibration of the sensor; None where its values were not measured."""
     optics: Optics | None
     """The lenslets, where the file describes them."""
     disturbance: Disturbance | None
@@ -67,8 +66,8 @@ class Rig:
     devices: dict[str, DeviceTable]
     """Drivers of the devices, by the names ``camera`` and ``mirror``, where the file names them."""
     folder: Path | None
-    """Folder of the rig file, which paths in the file are relative to. None where the file came out of a recording:
-    such a one names no file, since nobody on this machine has chosen it."""
+    """Folder of the rig file, which paths in the file are relative to. None where the file came out of a recording: it
+    may not name files, because no user of this machine has chosen it."""
     toml: str
     """The file's text, as read."""
 
@@ -109,7 +108,7 @@ def load_rig(path_or_name: str | Path) -> Rig:
     Raises
     ------
     RigError
-        The file cannot be read, or what it says cannot work; the message names the key.
+        The file cannot be read, or its values cannot work; the message names the key.
     """
     path = Path(path_or_name)
     if path.suffix != ".toml" and str(path_or_name) in builtin_rigs():
@@ -182,5 +181,5 @@ def parse_rig(text: str, folder: Path | None = None) -> Rig:
 
 
 def _deepest_key(text: str) -> int:
-    """More than the parts of any key in a text, as far as one can tell without parsing it."""
+    """An upper bound of the parts of any key in a text, found without parsing it."""
     return max(part.count(".") for part in re.split(r"[,=\[\]\n]", text.replace(" ", "").replace("\t", "")))

@@ -29,7 +29,7 @@ class Optics:
 
     @cached_property
     def lit(self) -> NDArray[np.bool_]:
-        """Which lenslets have a spot, along the rows of their grid, (lenslets,)."""
+        """Mask of the lenslets that have a spot, along the rows of their grid, (lenslets,)."""
         return np.asarray(self.lenslets.light >= self.least_light)
 
     @property
@@ -46,20 +46,21 @@ class Optics:
         return -half, half
 
     def seen(self, width_m: float) -> Lenslets:
-        """The lenslets imaged onto a surface, of which all columns together cover ``width_m``."""
+        """The lenslets as imaged onto a surface, where all columns together cover ``width_m``."""
         ours = self.lenslets
         pitch = width_m / ours.grid[1]
         pupil = ours.pupil_diameter_m and ours.pupil_diameter_m * pitch / ours.pitch_m
         return replace(ours, pitch_m=pitch, focal_length_m=1.0, pupil_diameter_m=pupil)
 
     def slopes(self, surface_slopes: FloatArray, width_m: float) -> FloatArray:
-        """Slopes behind the lenslets, slope units, for gradients of the path over a surface imaged onto them."""
+        """Slopes behind the lenslets, slope units, for gradients of the optical path over a surface that is imaged onto
+        them."""
         shrink = width_m / (self.lenslets.grid[1] * self.lenslets.pitch_m)
         return surface_slopes * (shrink / self.slope_unit_rad)
 
 
 def read_optics(table: Table, grid: tuple[int, ...]) -> Optics:
-    """The table ``[lenslets]``. Raises `RigError`."""
+    """Read the table ``[lenslets]``. Raises `RigError`."""
     rows, columns = grid
     lenslets = Lenslets(
         grid=(rows, columns),
@@ -96,7 +97,7 @@ def _least_light(table: Table) -> float:
 
 
 def read_tip_tilt(table: Table, n_spots: int, fast_step_s: float) -> MirrorPlant:
-    """A plant of kind ``tip-tilt``: two inputs that turn a flat mirror, and with it all spots alike."""
+    """Read a plant of kind ``tip-tilt``: two inputs that turn a flat mirror, and with it all spots alike."""
     gain = np.diag(table.vector("gain", 2, "slope units per input, along x and y"))
     coupling = table.number("coupling", 0.0)
     if abs(coupling) >= 1:
@@ -106,7 +107,8 @@ def read_tip_tilt(table: Table, n_spots: int, fast_step_s: float) -> MirrorPlant
 
 
 def read_membrane(table: Table, optics: Optics, fast_step_s: float) -> MirrorPlant:
-    """A plant of kind ``membrane``: inputs in Pa, states the pressures as the membrane follows them."""
+    """Read a plant of kind ``membrane``: its inputs are in Pa, its states the pressures as the membrane follows
+    them."""
     rows, columns = table.integers("actuators", 2, "rows and columns", low=1, high=32)
     try:
         membrane = Membrane(
@@ -147,7 +149,7 @@ def _dynamics(table: Table, fast_step_s: float) -> tuple[tuple[FloatArray, Float
 
 
 def read_voltage(table: Table) -> VoltageLaw:
-    """The table ``[mirror.voltage]``. Raises `RigError`."""
+    """Read the table ``[mirror.voltage]``. Raises `RigError`."""
     law = VoltageLaw(
         gamma=table.number("gamma", above=0.0),
         bias_v=table.number("bias_v", above=0.0),

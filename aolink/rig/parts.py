@@ -1,4 +1,4 @@
-"""The parts of a rig as frozen dataclasses: plant, timing, mirror driver, drive, and what only a simulated one has."""
+"""The parts of a rig as frozen dataclasses: plant, timing, mirror driver, drive, and the parts of a simulated rig."""
 
 from __future__ import annotations
 
@@ -14,16 +14,15 @@ from aolink.optics.mirror import VoltageLaw
 
 @dataclass(frozen=True, kw_only=True)
 class UnmodelledSlopes:
-    """Slopes that the camera sees and the plant's model does not make, as estimators expect them.
-
-    Such are the fitting error of a deformable mirror, which its actuators cannot make, and turbulence that no state
-    follows. They add to the outputs, theta(k) = C x(k) + v(k), with v Gaussian, independent of the state and from
-    output to output, and
+    """The estimators' model of slopes that the camera sees and the plant's model does not make. Examples are the
+    fitting error of a deformable mirror, which its actuators cannot make, and turbulence that no state follows. They
+    add to the outputs, theta(k) = C x(k) + v(k), with v Gaussian, independent of the state and from output to output,
+    and
 
         Cov(v(i), v(j)) = sd^2 exp(-((i - j) / correlation_steps)^2)  within an exposure,  0 between exposures.
 
     The mean of v over an exposure is one coefficient of each output in the exposure's model. Estimators that model the
-    noise inside an exposure estimate it from that exposure alone: between exposures this model remembers nothing of v.
+    noise inside an exposure estimate it from that exposure alone: this model has no memory of v between exposures.
     The variation of v about its mean widens the spot.
     """
 
@@ -41,19 +40,19 @@ class UnmodelledSlopes:
 
 
 Wanders = Literal["frequency", "gain", "process_noise", "kernel_width", "sensor_noise"]
-"""What may drift: all frequencies of the plant, its response to inputs, the standard deviation of its noise, the width
-of the kernel, the standard deviation of the camera's read-out noise."""
+"""Quantities that may drift: all frequencies of the plant, its response to inputs, the standard deviation of its noise,
+the width of the kernel, the standard deviation of the camera's read-out noise."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Wandering:
-    """Which quantity drifts from what the rig file says, by one factor, how far and how fast."""
+    """The drift of one quantity from the rig file's value by a factor: which quantity, how far and how fast."""
 
     parameter: Wanders
     largest: float
-    """Largest relative change up; down it is the same factor."""
+    """Largest relative increase; the largest decrease is by the same factor."""
     rate_per_minute: float
-    """Standard deviation of the relative change in a minute; it goes on as a random walk."""
+    """Standard deviation of the relative change in a minute; the drift is a random walk."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -80,11 +79,11 @@ class Plant:
     axes: int
     """Number of independent copies."""
     unmodelled: UnmodelledSlopes | None = None
-    """What estimators expect of the outputs beside C x(k); None for nothing."""
+    """The estimators' model of slopes beside C x(k); None for no such slopes."""
     wandering: Wandering | None = None
-    """Which drift estimators follow; None for none."""
+    """The drift that estimators follow; None for none."""
     disturbance_states: int = 0
-    """How many states, the last ones, are those of the disturbance's model, which no input reaches."""
+    """Number of the last states, which are those of the disturbance's model and which no input reaches."""
 
     @property
     def n_states(self) -> int:
@@ -103,7 +102,8 @@ class Plant:
 
 @dataclass(frozen=True, kw_only=True)
 class Timing:
-    """Fast steps and exposures. Exposure j covers ``exposure_steps`` steps from j * ``frame_period_steps`` on."""
+    """The timing of fast steps and exposures. Exposure j covers ``exposure_steps`` steps from j *
+    ``frame_period_steps`` on."""
 
     fast_step_s: float
     """T_f, s."""
@@ -112,7 +112,7 @@ class Timing:
     frame_period_steps: int
     """Fast steps from the start of one exposure to the start of the next; at least N."""
     exposure_offset: float = 0.0
-    """How far into its first fast step an exposure starts, in fast steps, below one; it ends equally far into one."""
+    """Part of its first fast step that passes before an exposure starts, below one; it ends equally far into a step."""
 
     @cached_property
     def fast_step_ns(self) -> int:
@@ -128,9 +128,10 @@ class MirrorDriver:
     """The mirror driver: limits, resolution, queue."""
 
     input_min: FloatArray
-    """(axes * n_inputs,)"""
+    """Least inputs, (axes * n_inputs,)."""
+
     input_max: FloatArray
-    """(axes * n_inputs,)"""
+    """Largest inputs, (axes * n_inputs,)."""
     park: FloatArray
     """Declared safe input, (axes * n_inputs,)."""
     dac_bits: int
@@ -182,21 +183,21 @@ class Control:
     """How the loop is closed, where a session closes it."""
 
     delay_s: float = 0.01
-    """From the end of an exposure to the beginning of the first fast step that its estimate can change, at least, s:
+    """Least time from the end of an exposure to the beginning of the first fast step that its estimate can change, s:
     read-out, link and estimator. On virtual time it is exactly this, rounded up to whole fast steps."""
     when_lost: Literal["hold", "park"] = "hold"
-    """What the mirror does while nothing reliable is known of the spot: it holds its input, or goes to the safe one."""
+    """The mirror's action while the spot's position is not known reliably: it holds its input, or goes to the safe
+    one."""
     gain: float = 0.5
     """Gain of the integrator."""
     leak: float = 0.01
     """Share of itself that the integrator loses with each exposure."""
     least_singular_value: float = 0.03
-    """Modes of the mirror that move the slopes less than this share of the strongest one are left alone by the
-    integrator."""
+    """Mirror modes that move the slopes by less than this share of the strongest one are left out by the integrator."""
     effort: float = 1e-3
     """Weight of the inputs in the cost of ``lqg``, relative to the slopes that they make at rest."""
     fall_back: bool = True
-    """Whether the integrator, or a mirror that holds still, acts in the place of ``lqg`` while that does not pay."""
+    """Whether the integrator, or a mirror that holds still, acts in place of ``lqg`` while ``lqg`` is worse."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -204,7 +205,7 @@ class Faults:
     """Faults that the simulated rig injects, by rate and by seed; all zero means a perfect link.
 
     Rates are probabilities. Those of bits and bytes hold in both directions, from the byte after Identify on,
-    delimiters included. What the host sees of a fault is what a real line would show it: nothing is marked.
+    delimiters included. The host sees a fault as on a real line: nothing is marked.
     """
 
     bit_error_rate: float = 0.0
@@ -232,13 +233,13 @@ class Faults:
     jitter_s: float = 0.0
     """Mean of a random, exponentially distributed delay of each packet, s; packets keep their order."""
     delay_to_device_s: float = 0.0
-    """Constant delay of what the host sends, s."""
+    """Constant delay of the host's packets, s."""
     delay_to_host_s: float = 0.0
-    """Constant delay of what the device sends, s."""
+    """Constant delay of the device's packets, s."""
     clock_step_s: float = 0.0
-    """By how much the device's clock is set forward, s; negative: back. Its fast steps go on."""
+    """Step by which the device's clock is set forward, s; negative: back. Its fast steps go on."""
     clock_step_at_s: float = 1.0
-    """When, s after the rig has begun."""
+    """Time of that step, s after the rig has begun."""
     vanish_rate: float = 0.0
     """The port vanishes with a packet, one way or the other, and returns after ``vanish_s``; in real time only."""
     vanish_s: float = 1.0
@@ -250,7 +251,7 @@ class Faults:
     saturation_rate: float = 0.0
     """A pixel is at full scale."""
     dark_rate: float = 0.0
-    """A frame without light: black level and noise of reading alone."""
+    """A frame has no light: it has black level and read-out noise alone."""
 
 
 FAULT_NAMES = {
@@ -271,21 +272,22 @@ FAULT_NAMES = {
 
 @dataclass(frozen=True, kw_only=True)
 class Light:
-    """What the simulated camera looks at, from one start of it to the next."""
+    """The light that the simulated camera sees, from one start of it to the next."""
 
     kind: Literal["dark", "flat", "still", "moving"]
-    """Nothing; the same density everywhere; the spot held where it is when the camera starts; the spot."""
+    """The kind of light: none; the same density everywhere; the spot held where it is when the camera starts; the
+    moving spot."""
     level: float | None = None
     """Density of a flat, one over slope units; None: halfway from the black level to the full scale."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Simulation:
-    """What only the simulated rig needs to know."""
+    """The parameters of the simulated rig alone."""
 
     seed: int = 1
     light: tuple[Light, ...] = (Light(kind="moving"),)
-    """Each start of the camera takes the next one; the last one stays."""
+    """The lights: each start of the camera takes the next one; the last one stays."""
     clock_offset_s: float = 0.0
     """Device clock minus host clock at the start, s."""
     clock_drift_ppm: float = 0.0

@@ -20,7 +20,7 @@ _LUMINANCE = (0.2126, 0.7152, 0.0722)
 
 
 def read_scene(table: Table) -> SceneSensor:
-    """The table ``[scene]``; the picture itself is not opened. Raises `RigError`."""
+    """Read the table ``[scene]``; the picture itself is not opened. Raises `RigError`."""
     rows, columns = table.integers("pixels", 2, "rows and columns", low=2, high=8192)
     sensor = SceneSensor(
         shape=(rows, columns),
@@ -44,13 +44,13 @@ def read_scene_picture(sensor: SceneSensor, folder: Path | None) -> FloatArray:
     Parameters
     ----------
     folder:
-        Folder of the rig file; a picture that is not there may be one that comes with aolink. None, for a rig file
-        that comes out of a recording, allows for nothing else.
+        Folder of the rig file; a picture that is not there may be one that comes with aolink. None is for a rig file
+        that comes out of a recording: it may name only pictures that come with aolink.
 
     Raises
     ------
     RigError
-        The rig names no picture, it cannot be read, or it is smaller than the sensor's frame.
+        The rig names no picture, or the picture cannot be read or is smaller than the sensor's frame.
     """
     if not sensor.picture:
         raise RigError("scene.picture is missing: a simulated rig needs a picture to show")

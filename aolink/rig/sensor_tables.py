@@ -15,7 +15,8 @@ from aolink.rig.toml_table import Table
 
 @dataclass(frozen=True, kw_only=True)
 class CalibrationTable:
-    """Standard deviations of the sensor's values, as `aolink calibrate` wrote them, and what they were measured from.
+    """Standard deviations of the sensor's values, as `aolink calibrate` wrote them, and the recordings that they were
+    measured from.
 
     A standard deviation is None where its value was not measured.
     """
@@ -36,7 +37,7 @@ def read_sensor(
     table: Table, axes: int, n_outputs: int, field: tuple[float, float] | None = None,
     light: tuple[float, ...] | None = None,
 ) -> BaseSensor:  # fmt: skip
-    """The table ``[sensor]``, for a plant of ``axes`` copies with ``n_outputs`` each. Raises `RigError`.
+    """Read the table ``[sensor]``, for a plant of ``axes`` copies with ``n_outputs`` each. Raises `RigError`.
 
     ``field`` and ``light`` follow from the lenslets where the rig file describes them.
     """
@@ -52,7 +53,7 @@ def read_sensor(
 
 
 def read_grid(table: Table) -> tuple[int, ...]:
-    """``sensor.grid``, rows and columns of windows."""
+    """Read ``sensor.grid``, rows and columns of windows."""
     return table.integers("grid", 2, "rows and columns of windows", low=1, high=256)
 
 
@@ -92,7 +93,7 @@ def _spots(table: Table, axes: int, n_outputs: int, read_out: dict[str, Any]) ->
 
 
 def _read_out(table: Table, known_field: tuple[float, float] | None) -> dict[str, Any]:
-    """The fields of `BaseSensor`."""
+    """Read the fields of `BaseSensor`."""
     if known_field and table.has("field"):
         raise RigError("sensor.field follows from [lenslets]: leave it out")
     field = known_field or table.vector("field", 2, "lower and upper edge")
@@ -110,7 +111,7 @@ def _read_out(table: Table, known_field: tuple[float, float] | None) -> dict[str
 
 
 def read_kernel(table: Table) -> Kernel:
-    """A table ``kernel``. Raises `RigError`."""
+    """Read a table ``kernel``. Raises `RigError`."""
     shape = table.choice("shape", ("gaussian",))
     if not isinstance(table.get("sigma"), list):
         return Kernel(shape=shape, sigma=table.number("sigma", above=0.0))
@@ -123,7 +124,7 @@ def read_kernel(table: Table) -> Kernel:
 
 
 def read_calibration(table: Table) -> CalibrationTable:
-    """The table ``[calibration]``. Raises `RigError`."""
+    """Read the table ``[calibration]``. Raises `RigError`."""
     names = [each.name for each in fields(CalibrationTable)]
     deviations: dict[str, Any] = {name: table.optional_number(name, low=0.0) for name in names if name.endswith("_sd")}
     frames = {name: table.integer(name, 0, low=0) for name in names if name.endswith("_frames")}

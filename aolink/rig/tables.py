@@ -1,4 +1,4 @@
-"""The tables of a rig file, read and validated; what is wrong is one `RigError` that names the key."""
+"""The tables of a rig file, read and validated; an error is one `RigError` that names the key."""
 
 from __future__ import annotations
 
@@ -37,14 +37,14 @@ _MOST_INPUTS = 10_000
 # of all coefficients: for 512 it is 2 MB an exposure.
 _MOST_UNMODELLED = 512
 _MOST_FAULT_S = 60.0
-# Largest relative changes that are followed: a plant that is more unlike its matrices wants to be identified.
+# Largest relative changes that estimators follow: a plant that differs more from its matrices should be identified.
 _WANDERING: dict[Wanders, float] = {
     "frequency": 0.2, "gain": 0.5, "process_noise": 3.0, "kernel_width": 0.5, "sensor_noise": 3.0,
 }  # fmt: skip
 
 
 def read_plant(table: Table, root: Table, optics: Optics | None, timing: Timing) -> Plant:
-    """The table ``[plant]``, of matrices or of a mirror that is described. Raises `RigError`."""
+    """Read the table ``[plant]``, with matrices or with the description of a mirror. Raises `RigError`."""
     kind = table.choice("kind", ("matrices", "membrane", "tip-tilt"), "matrices")
     if kind == "membrane":
         if optics is None:
@@ -69,7 +69,7 @@ def read_plant(table: Table, root: Table, optics: Optics | None, timing: Timing)
 
 
 def _read_unmodelled(table: Table, n_outputs: int, timing: Timing) -> UnmodelledSlopes | None:
-    """The table ``[plant.unmodelled]``; None where the file has none."""
+    """Read the table ``[plant.unmodelled]``; None where the file has none."""
     if not table.has("unmodelled"):
         return None
     if n_outputs > _MOST_UNMODELLED:
@@ -164,7 +164,7 @@ def _covariance(table: Table, name: str, size: int, why: str) -> FloatArray:
 
 
 def read_timing(table: Table) -> Timing:
-    """The table ``[timing]``. Raises `RigError`."""
+    """Read the table ``[timing]``. Raises `RigError`."""
     fast_step_s = table.number("fast_step_s", above=0.0)
     steps = table.integer("exposure_steps", low=1, high=1_000_000)
     period = table.integer("frame_period_steps", steps, low=1, high=10_000_000)
@@ -184,7 +184,7 @@ def read_timing(table: Table) -> Timing:
 
 
 def read_mirror(table: Table, n_inputs: int) -> MirrorDriver:
-    """The table ``[mirror]``. Raises `RigError`."""
+    """Read the table ``[mirror]``. Raises `RigError`."""
     law = table.read_any("voltage", read_voltage)
     if law and (table.has("input_min") or table.has("input_max")):
         raise RigError("mirror.input_min and mirror.input_max follow from [mirror.voltage]: leave them out")
@@ -223,7 +223,7 @@ def read_mirror(table: Table, n_inputs: int) -> MirrorDriver:
 
 
 def read_drive(table: Table, n_inputs: int, mirror: MirrorDriver) -> Drive:
-    """The table ``[drive]``. Raises `RigError`."""
+    """Read the table ``[drive]``. Raises `RigError`."""
     kind = table.choice("kind", ("none", "sine"), "none")
     offset = table.vector("offset", n_inputs, "inputs", 0.0)
     amplitude = table.vector("amplitude", n_inputs, "inputs", None if kind == "sine" else 0.0)
@@ -241,7 +241,7 @@ def read_drive(table: Table, n_inputs: int, mirror: MirrorDriver) -> Drive:
 
 
 def read_control(table: Table, timing: Timing) -> Control:
-    """The table ``[control]``. Raises `RigError`."""
+    """Read the table ``[control]``. Raises `RigError`."""
     default, frame_s = Control(), timing.frame_period_steps * timing.fast_step_s
     control = Control(
         delay_s=table.number("delay_s", min(default.delay_s, frame_s / 4), low=0.0),
@@ -261,7 +261,7 @@ def read_control(table: Table, timing: Timing) -> Control:
 
 
 def read_simulation(table: Table) -> Simulation:
-    """The table ``[simulation]``. Raises `RigError`."""
+    """Read the table ``[simulation]``. Raises `RigError`."""
     return Simulation(
         seed=table.integer("seed", 1, low=0),
         light=parse_light(table.text("light", "moving"), table.key("light")),
@@ -302,7 +302,7 @@ def with_faults(faults: Faults, texts: Iterable[str]) -> Faults:
 
 
 def parse_light(text: str, name: str) -> tuple[Light, ...]:
-    """Lights in a row, ``dark,flat:4,still``; ``name`` is what an error calls them. Raises RigError."""
+    """A sequence of lights from a text such as ``dark,flat:4,still``; errors call it ``name``. Raises RigError."""
     lights = []
     for word in text.split(","):
         kind, colon, level = word.strip().partition(":")

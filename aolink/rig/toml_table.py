@@ -1,4 +1,4 @@
-"""One TOML table while it is read: a missing or unknown key, or one of the wrong kind, is an error that names it."""
+"""The reading of TOML tables: a missing or unknown key, or one of the wrong kind, is an error that names it."""
 
 from __future__ import annotations
 
@@ -36,9 +36,8 @@ late_rate packet_loss_rate saturation_rate stall_rate stall_s vanish_rate vanish
 """
 KEYS = frozenset(_KEYS.split() + _FAULTS.split())
 """Every key of every table of a rig file, kept by hand; a test compares it with the keys that the readers ask for.
-
-Where a key is missing, a key of the file that is not among these is taken for a misspelling of it if the two look
-alike. What the readers have asked for cannot tell: they have not asked yet for the keys after the missing one.
+Where a key is missing, a similar key of the file that is not among these counts as a misspelling of it. The keys that
+the readers have asked for so far would not do: they have not asked yet for the keys after the missing one.
 """
 
 
@@ -52,8 +51,8 @@ def named_file(folder: Path | None, name: str | Path, key: str) -> Path:
     """
     if folder is None:
         raise RigError(
-            f"{key}: the rig file comes out of a recording, and such a one may not name files ({name}): save it as a"
-            " file of your own, look at it, and give that"
+            f"{key}: the rig file comes out of a recording, and may not name files then ({name}): save it as a file of"
+            " your own, check it, and give that"
         )
     return folder / name
 
@@ -99,18 +98,18 @@ class Table:
         return Table(self.get(name, {} if optional else None), self.key(name))
 
     def read(self, name: str, reader: Callable[..., _Read], *others: Any, optional: bool = False) -> _Read:
-        """What a reader makes of a table and of ``others``; it has to ask for all keys that the table has."""
+        """The result of a reader for a table and ``others``; the reader has to ask for all keys that the table has."""
         table = self.table(name, optional=optional)
         value = reader(table, *others)
         table.finish()
         return value
 
     def read_any(self, name: str, reader: Callable[..., _Read], *others: Any) -> _Read | None:
-        """As `read`; None where there is no such table."""
+        """The result of `read`; None where there is no such table."""
         return self.read(name, reader, *others) if self.has(name) else None
 
     def read_all(self, name: str, reader: Callable[..., _Read], *others: Any) -> tuple[_Read, ...]:
-        """As `read`, of each table in a list; none where it is missing."""
+        """The results of `read` for each table in a list; none where the list is missing."""
         values, found = self.get(name, []), []
         self._expect(name, values, isinstance(values, list), "a list of tables")
         for k, value in enumerate(values):
@@ -235,7 +234,7 @@ class Table:
         """Raise RigError if the table has a key that no reader asked for and that is not one of ``optional``."""
         self._asked.update(optional)
         unknown = [name for name in self._values if name not in self._asked]
-        # Misspelt keys first: another key may only have no use because of them.
+        # Misspelt keys first: another key may be unused only because of them.
         for name in sorted(unknown, key=lambda each: each in KEYS):
             hint = did_you_mean([name], self._asked)
             more = f": {hint}" if hint else f"; known here: {', '.join(sorted(self._asked))}"
@@ -243,11 +242,11 @@ class Table:
 
 
 def shape_text(array: FloatArray) -> str:
-    """Sizes as an error says them."""
+    """Sizes in the form for an error."""
     return " x ".join(map(str, array.shape)) or "number"
 
 
 def shown(value: Any) -> str:
-    """A value as an error shows it: not too long."""
+    """A value in the form for an error, not too long."""
     text = repr(value)
     return text if len(text) <= 60 else text[:57] + "..."

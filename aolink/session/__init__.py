@@ -37,20 +37,20 @@ Watch = Callable[[Exposure, Sequence[Estimate]], None]
 """Called with each exposure and the estimates that have come since the exposure before it."""
 
 _PROGRESS_S = 0.1
-"""In real time: how often the progress is reported."""
+"""In real time: time between two reports of the progress, s."""
 _ASIDE_S = 2.0
-"""In real time: how long the end of a session waits for the function that watches it."""
+"""In real time: how long the end of a session waits for the function that watches it, s."""
 
 
 def controller(rig: Rig, control: str, estimators: Sequence[str], *, force: bool) -> tuple[Controlling, dict[str, str]]:
-    """The controller of a session, and what its recording says of it. Raises ControlError, as `record`."""
+    """The controller of a session, and the metadata about it for the recording. Raises ControlError, as `record`."""
     controlling = Controlling(rig, control, estimators)
     found = stability(rig, control) if force else check_stable(rig, control)
     return controlling, facts(rig, controlling, found.text())
 
 
 def at_rest(rig: Rig) -> Rig:
-    """A rig whose drive holds the safe input."""
+    """The same rig with a drive that holds the safe input."""
     rest = Drive(kind="none", amplitude=np.zeros(rig.n_inputs), period_s=1.0, offset=rig.mirror.park)
     return replace(rig, drive=rest)
 
@@ -65,7 +65,7 @@ def _true_scene(rig: Rig, camera: Camera) -> dict[str, bytes]:
 
 
 def _saved(report: Report, paths: Sequence[Path]) -> str:
-    """What a session has saved that an error ended, in words."""
+    """The part of a session that was saved before an error ended it, in words."""
     where = str(paths[-1]) if len(paths) == 1 else f"{len(paths)} files, the last of them {paths[-1]}"
     exposures = max(report.exposures, report.frames_received)  # also those whose inputs were not reported any more
     if not exposures:
@@ -103,7 +103,7 @@ def record(
     Parameters
     ----------
     rig:
-        The rig file's description of the devices; compared with the identity that they report.
+        The rig file's description of the devices, which is compared with the identities that they report.
     camera_port, mirror_port:
         Anything that pyserial opens: a device path, or an address such as socket://host:port. Where None, the rig
         file's table ``[devices]`` names the device's driver. Where that names no mirror either, the camera alone is
@@ -115,7 +115,7 @@ def record(
     exposures:
         Number of exposures; 0 means until ``stop()``.
     calibration:
-        What the camera is shown, one of `aolink.calibration.KINDS`, if the frames are for `aolink calibrate`: the
+        The light that the camera sees, one of `aolink.calibration.KINDS`, if the frames are for `aolink calibrate`: the
         mirror then holds its parked input, whatever the rig's drive.
     inputs:
         Function that gives the inputs to command, instead of the rig's drive. The loop calls it, and sends the next
@@ -124,15 +124,15 @@ def record(
     control:
         Name of the controller that closes the loop, one of `aolink.control.controller_names`: it gives the inputs,
         instead of the rig's drive. The first of the estimators serves it. On virtual time an exposure changes the
-        inputs ``control.delay_s`` after its end; in real time as soon after that as it can.
+        inputs ``control.delay_s`` after its end; in real time as soon after that as possible.
     force:
-        Close a loop that is unstable by the model all the same.
+        Whether to close a loop even if it is unstable by the model.
     watch:
         Called with each exposure and its estimates. An estimate that is not there when the next exposure comes is given
         with that one or a later one. In real time it is called on a thread of its own and may take its time:
-        exposures that come meanwhile are left out and counted, and what it raises becomes a warning.
+        exposures that come meanwhile are left out and counted, and an exception that it raises becomes a warning.
     options:
-        How the recording is cut into chunks and files.
+        How the recording is divided into chunks and files.
     reconnect_s:
         How long to wait for the port of a native device that vanishes, s. The session goes on with the device that
         returns if it is the same one and has not been restarted; exposures and inputs that are missing are counted.
@@ -147,7 +147,7 @@ def record(
     ------
     AolinkError
         A device, a port, the disk or an estimator failed, by the error's class. The mirror is parked if it can be
-        reached, and the recording is closed with what there is.
+        reached, and the recording is closed with the data so far.
     """
     estimators = list(dict.fromkeys(estimators))
     driver = Driver(rig, estimators)
@@ -230,7 +230,7 @@ def _shown(rig: Rig, watch: Watch | None) -> Show | None:
 
 @contextlib.contextmanager
 def _shown_aside(show: Show, rig: Rig, report: Report) -> Iterator[Show]:
-    """The same on a thread of its own, which leaves out what it has no time for."""
+    """A function that shows exposures on a thread of its own, which leaves out those that it has no time for."""
     watching = Aside[tuple[Exposure, Sequence[Outcome]]](lambda item: show(*item), most_waiting(rig.timing))
     try:
         yield lambda exposure, outcomes: watching.give((exposure, outcomes))

@@ -1,4 +1,4 @@
-"""The account of a session's commands: each commanded step ends exactly once."""
+"""The account of a session's commands: it records how each commanded step ends, exactly once."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from aolink.wire import messages_pb2 as wire
 _OPEN, _PASSED, _UNKNOWN, _ENDED = range(4)
 """State of a commanded step: not reported yet; reported without the command; held input unknown; counted."""
 REFUSALS = (wire.OUT_OF_RANGE, wire.WRONG_SHAPE, wire.NOT_SUPPORTED, wire.LATCHED)
-"""Answers to a block of which the mirror takes no step."""
+"""Answers by which the mirror refuses a whole block."""
 
 
 @dataclass(slots=True)
@@ -33,10 +33,10 @@ class _Block:
 class Account:
     """Counts, in a `Report`, how each commanded step of a session ended.
 
-    A step is *applied* where the mirror reports it with the command's block. Where it reports something else, or
-    no report comes, the mirror's answer to the block decides. The step was *refused*; or *late*, if it had gone by when
+    A step is *applied* where the mirror reports it with the command's block. Where it reports another input, or no
+    report comes, the mirror's answer to the block decides. The step was *refused*; or *late*, if it had gone by when
     the block came, or if the block was never answered; otherwise it was queued, and is *superseded* (by a later
-    command, or by parking, which empties the queue) if something else is reported, and *not reported* if nothing is.
+    command, or by parking, which empties the queue) if another input is reported, and *not reported* if none is.
     """
 
     def __init__(self, report: Report) -> None:
@@ -46,20 +46,21 @@ class Account:
         """First step for which no report has come."""
 
     def commanded(self, block: wire.CommandBlock) -> None:
-        """A block is sent for the first time."""
+        """Note that a block is sent for the first time."""
         steps = np.full(block.n_steps, _OPEN, dtype=np.int8)
         steps[: max(self._reported_until - block.first_step, 0)] = _PASSED
         self._blocks[block.block_id] = _Block(block.first_step, steps)
         self._report.steps_commanded += block.n_steps
 
     def answered(self, ack: wire.CommandAck) -> None:
-        """The mirror has acknowledged or refused a block."""
+        """Note that the mirror has acknowledged or refused a block."""
         if block := self._blocks.get(ack.block_id):
             block.ack = ack
             self._settle(ack.block_id, block)
 
     def reported(self, applied: wire.Applied) -> None:
-        """Take a report of what the mirror held in some steps, or that there is none; must come once for each step."""
+        """Take a report of the inputs that the mirror held in some steps, or that there is none; each step must be
+        reported once."""
         first, end = applied.first_step, applied.first_step + applied.n_steps
         self._reported_until = max(self._reported_until, end)
         for block_id, block in list(self._blocks.items()):
@@ -75,14 +76,14 @@ class Account:
             self._settle(block_id, block)
 
     def parked_from(self, step: int) -> None:
-        """The mirror was sent a request to park: what was queued for ``step`` and later is dropped."""
+        """Note that the mirror was asked to park: the inputs queued for ``step`` and later are dropped."""
         for block_id, block in list(self._blocks.items()):
             part = block.steps[max(step - block.first, 0) :]
             self._count("steps_superseded", part, part == _OPEN)
             self._settle(block_id, block)
 
     def close(self) -> None:
-        """No more answers or reports will come: every step that is still open ends now."""
+        """End every step that is still open: no more answers or reports will come."""
         for block_id, block in list(self._blocks.items()):
             block.steps[block.steps == _OPEN] = _UNKNOWN
             self._settle(block_id, block)

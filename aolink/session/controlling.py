@@ -1,4 +1,5 @@
-"""The closed loop in a session: which steps an exposure may still change, and what is recorded and reported of it."""
+"""The closed loop in a session: the steps that an exposure may still change, and the recording and reporting of the
+loop."""
 
 from __future__ import annotations
 
@@ -23,13 +24,13 @@ MARGIN_S = 0.003
 
 @dataclass(frozen=True, kw_only=True)
 class Change:
-    """What came of an exposure for the session."""
+    """The effect of an exposure on the session."""
 
     message: pb.Control
     first_step: int
     """Commands from this fast step on are to be sent anew."""
     warning: str
-    """What a person should know now; empty while nothing has changed."""
+    """A warning for the user; empty while nothing has changed."""
 
 
 class Controlling:
@@ -48,7 +49,7 @@ class Controlling:
             raise ControlError(f"the controller {self.loop.name} needs an estimator's state: give one, such as moments")
         self.report = ControlReport(controller=self.loop.name, estimator=self.estimator)
         self.cause_frame = 0
-        """The newest exposure that the inputs know."""
+        """The newest exposure that the inputs depend on."""
         self._step_s, self._period = rig.timing.fast_step_s, rig.timing.frame_period_steps
         self._steps, self._n_inputs = rig.timing.exposure_steps, rig.n_inputs
         self._first_step = 0
@@ -56,12 +57,12 @@ class Controlling:
         self._acting = self.loop.acting
 
     def begin(self, first_step: int) -> None:
-        """The session begins with this fast step."""
+        """Begin the session with this fast step."""
         self._first_step = first_step
         self.loop.begin(first_step)
 
     def horizon(self, device_step: int) -> int:
-        """Virtual time: the first fast step whose input the next exposure to end may still change.
+        """On virtual time, the first fast step whose input the next exposure to end may still change.
 
         Commands go no further: the rig runs to their end at once.
         """
@@ -73,7 +74,7 @@ class Controlling:
         self.loop.commanded(block.first_step, np.array(block.u).reshape(block.n_steps, self._n_inputs))
 
     def applied(self, applied: wire.Applied) -> None:
-        """Take a report of what the mirror held."""
+        """Take a report of the inputs that the mirror held."""
         if applied.u:
             self.loop.applied(applied.first_step, np.array(applied.u).reshape(applied.n_steps, self._n_inputs))
 
@@ -86,7 +87,7 @@ class Controlling:
         return Change(message=message, first_step=act.first_step, warning=self._news(act))
 
     def _news(self, act: Act) -> str:
-        """What has changed with an exposure, in words."""
+        """The changes of the loop's state with an exposure, in words."""
         news, frame = [], act.frame_id
         if act.state is not self._state:
             held = "the mirror holds its input" if act.state is State.HELD else "the mirror goes to its safe input"
@@ -94,7 +95,7 @@ class Controlling:
             news.append(f"the loop is closed again from frame {frame} on" if act.state is State.CLOSED else lost)
         if act.fit is not None and act.fit.fits != self._fits:
             self._fits = act.fit.fits
-            fits = "fits again" if act.fit.fits else "no longer fits what is seen"
+            fits = "fits again" if act.fit.fits else "no longer fits the measurements"
             news.append(f"the rig file's model {fits} (frame {frame}): {act.fit.text()}")
         if act.acting != self._acting:
             pays = f"{act.acting} would have left {100 * act.gained:.0f} % less of the slopes (rms) than {self._acting}"
@@ -104,7 +105,7 @@ class Controlling:
 
 
 def facts(rig: Rig, controlling: Controlling, stability: str) -> dict[str, str]:
-    """What a recording says of its controller, for its metadata."""
+    """Facts about the controller, for the recording's metadata."""
     control = rig.control
     numbers = {
         "delay_s": control.delay_s, "when_lost": control.when_lost, "gain": control.gain, "leak": control.leak,

@@ -22,12 +22,12 @@ from aolink.session.excitation import Excitation, check_inputs
 from aolink.session.loop import ANSWER_NS, Inputs
 
 _RECORD_BYTES = 3000
-"""What an exposure takes in a recording beside its picture and inputs, at most."""
+"""The most bytes that an exposure takes in a recording beside its picture and inputs."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class DryRun:
-    """What was found, each in words, by what it is about; and warnings."""
+    """The findings of a dry run, in words, by their subject; and warnings."""
 
     facts: dict[str, str]
     warnings: list[str]
@@ -48,16 +48,16 @@ def dry_run(
     overwrite: bool = False,
     stop: Callable[[], bool] = lambda: False,
 ) -> DryRun:
-    """Check a session as far as that goes without moving the mirror; parameters as for `aolink.session.record`.
+    """Check a session as far as possible without moving the mirror; parameters as for `aolink.session.record`.
 
-    The devices are opened, asked who they are and what time it is, and closed. Being asked who it is parks a native
-    mirror, and a mirror without a queue is opened at its safe input; nothing else is sent. No file is made.
+    The devices are opened, asked for their identity and their time, and closed. The request for its identity parks a
+    native mirror, and a mirror without a queue is opened at its safe input; nothing else is sent. No file is made.
 
     Raises
     ------
     AolinkError
-        What the session would fail with at its beginning, by the error's class; the inputs, too, are compared with the
-        mirror's limits, over the first million fast steps.
+        The error with which the session would fail at its beginning; the inputs, too, are compared with the mirror's
+        limits, over the first million fast steps.
     """
     path, names = Path(path), list(dict.fromkeys(estimators))
     check_target(path, overwrite=overwrite, suffix=".mcap", error=RecordingError)
@@ -102,13 +102,13 @@ def _ask_clocks(devices: Sequence[Device], time: Time, stop: Callable[[], bool])
 
 
 def _check_played(rig: Rig, inputs: Inputs | None, exposures: int) -> str:
-    """Compare what the session would play with the limits; gives what it is in words."""
+    """Compare the inputs that the session would play with the limits; gives their description in words."""
     step_s, period = rig.timing.fast_step_s, rig.timing.frame_period_steps
     mirror = rig.mirror
     limits = f"limits {_shown(mirror.input_min)} to {_shown(mirror.input_max)}"
     if mirror.slew_max_per_s:
         limits += f", at most {mirror.slew_max_per_s:g} in a second"
-    if isinstance(inputs, Excitation):  # its maker has compared it
+    if isinstance(inputs, Excitation):  # `excitation` has compared it
         return f"{inputs.text}, within {limits}"
     if inputs is None:
         once = round(rig.drive.period_s / step_s) if rig.drive.kind == "sine" else period
@@ -118,7 +118,8 @@ def _check_played(rig: Rig, inputs: Inputs | None, exposures: int) -> str:
 
 
 def _check_disk(rig: Rig, path: Path, exposures: int) -> str:
-    """Where the recording goes, and whether there is room; raises RecordingError where there is not."""
+    """The target of the recording and the room on its disk, in words; raises RecordingError where there is too
+    little."""
     shapes = [rig.sensor.shape, *([rig.scene.shape] if rig.scene else [])]
     numbers = rig.timing.frame_period_steps * (2 * rig.n_inputs + rig.n_outputs)
     each = sum(2 * rows * columns for rows, columns in shapes) + 8 * numbers + _RECORD_BYTES

@@ -1,6 +1,6 @@
 """Estimators in a session: within its loop on virtual time, in processes beside it in real time.
 
-In real time nothing may stand between the wire and the file. Each estimator runs in a process of its own and gets
+In real time nothing may delay the recording. Each estimator runs in a process of its own and gets
 exposures from a bounded queue (`aolink.session.waiting.Waiting`); those that it has no time for it skips, each
 estimator by itself. It predicts over skipped exposures with the inputs that the mirror applied, so
 `aolink.estimation.Driver` gives the same bits if it skips the same exposures.
@@ -38,21 +38,21 @@ _READ_BYTES = 1 << 20
 _END_S = 1.0
 """Longest wait for a process that was asked to end."""
 _REAP_S = 0.01
-"""Longest wait for one whose end of the socket is closed: the loop stands still meanwhile."""
+"""Longest wait for a process whose end of the socket is closed, s: the loop stands still meanwhile."""
 NO_TIME = "no time: the estimator was busy with earlier exposures"
 _OVER = "no time: the session was over before its estimate was there"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Outcome:
-    """The result of one estimator for one exposure: an estimate, or why it was skipped."""
+    """The result of one estimator for one exposure: an estimate, or the reason why the exposure was skipped."""
 
     estimator: str
     exposure: Exposure
     message: pb.Estimate | None
     """The estimate as it is recorded; None if the exposure was skipped."""
     reason: str = ""
-    """Why it was skipped."""
+    """The reason why it was skipped."""
     took_ns: int = 0
     """How long the estimate took, ns; 0 on virtual time."""
 
@@ -85,7 +85,7 @@ class Estimating(Protocol):
         """Why an estimator has failed and skips all exposures from now on, by its name."""
 
     def get_ready(self, stop: Callable[[], bool]) -> None:
-        """Load, compile and compute beforehand all that a session must not wait for, until done or ``stop()``.
+        """Load, compile and compute in advance all that a session must not wait for, until done or ``stop()``.
 
         Raises EstimatorError if an estimator does not start.
         """
@@ -101,7 +101,7 @@ class Estimating(Protocol):
 
 
 class InTheLoop:
-    """Estimates each exposure when it is offered: for virtual time, which stands still meanwhile."""
+    """Estimates each exposure when it is offered. It is for virtual time, which stands still meanwhile."""
 
     def __init__(self, driver: Driver) -> None:
         self._driver = driver
@@ -127,7 +127,7 @@ class InTheLoop:
 class BesideTheLoop:
     """One process for each estimator. Processes start and get ready while the session is prepared.
 
-    The one that ``controls`` has the priority of the loop, which waits for its estimates.
+    The estimator that ``controls`` has the loop's priority, because its estimates should be early.
     """
 
     def __init__(self, rig: Rig, names: Sequence[str], controls: str = "") -> None:
@@ -180,7 +180,7 @@ class BesideTheLoop:
             each.wait()
 
     def serve(self, timeout_s: float) -> None:
-        """Wait up to ``timeout_s`` for something to send or to receive, and do that."""
+        """Wait up to ``timeout_s`` until data can be sent or received, and do so."""
         alive = [each for each in self.processes if each.alive]
         select.select(alive, [each for each in alive if each.has_to_send], [], timeout_s)
         for each in alive:
@@ -193,9 +193,9 @@ class EstimatorProcess:
     def __init__(self, rig: Rig, name: str, niceness: int) -> None:
         self.name = name
         self.ready = False
-        """Whether it has computed and loaded what it needs."""
+        """Whether it has computed and loaded all that it needs."""
         self.failed = ""
-        """Why it will estimate no more; empty while it works."""
+        """The reason why it will estimate no more; empty while it works."""
         self._exposure: Exposure | None = None
         """The exposure that the process has."""
         self._waiting = Waiting[Exposure](most_waiting(rig.timing))
@@ -204,13 +204,13 @@ class EstimatorProcess:
         self._to_send: deque[memoryview] = deque()
         self._received = bytearray()
         self._connection, theirs = socket.socketpair()
-        # It imports what this process has imported, wherever that was found. Its linear algebra has one thread, as
+        # It imports modules from where this process has found them. Its linear algebra has one thread, as
         # in all processes of a pool: the cores are for the loop as well.
         environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
         environment |= dict.fromkeys(THREAD_VARIABLES, "1")
         main = f"from aolink.session.estimator_process import main; main({theirs.fileno()}, {os.getpid()}, {niceness})"
         with theirs:
-            # A group of its own: Ctrl-C is for the session, which waits for what is under way.
+            # It has a process group of its own: Ctrl-C goes to the session, which waits for estimates under way.
             self._process = subprocess.Popen(
                 [sys.executable, "-P", "-c", main], pass_fds=[theirs.fileno()], stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL, start_new_session=True, env=environment,
@@ -316,7 +316,7 @@ class EstimatorProcess:
                     self._to_send.popleft()
         except BlockingIOError:
             pass
-        except OSError:  # the process is gone; `serve` reads what it has said until then, and the end
+        except OSError:  # the process is gone; `serve` reads what it has sent until then, and the end
             self._to_send.clear()
 
     def _fail(self, why: str) -> None:

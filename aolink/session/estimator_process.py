@@ -1,4 +1,4 @@
-"""The process of one estimator of a session in real time: exposures in, estimates out, over a socket.
+"""The process of one estimator of a session in real time: it gets exposures and sends estimates over a socket.
 
 It is a process because estimators hold the interpreter's lock, and a loop that shares the lock with them waits for
 them. There is one for each estimator because a slow one must not hold up a fast one. `aolink.session.estimating` starts
@@ -37,11 +37,11 @@ _PARENT_DEATH_SIGNAL = 1
 
 READY = None
 """The first message; then, for each exposure, the bytes of its estimate's message and the time that it took, ns. A text
-in their place says why there will be no more."""
+instead gives the reason why there will be no more."""
 
 
 def packed(message: object) -> bytes:
-    """A message as it goes over the socket."""
+    """The bytes of a message on the socket."""
     data = pickle.dumps(message, protocol=pickle.HIGHEST_PROTOCOL)
     return LENGTH.pack(len(data)) + data
 
@@ -49,7 +49,7 @@ def packed(message: object) -> bytes:
 def main(fileno: int, parent: int, niceness: int) -> None:
     """Estimate the exposures that come over the socket until it is closed."""
     _end_with(parent)
-    if sys.platform == "linux":  # a session that runs at real-time priority is one for its loop's sake
+    if sys.platform == "linux":  # a session runs at real-time priority for its loop's sake only
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
     os.nice(niceness)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -65,7 +65,7 @@ def main(fileno: int, parent: int, niceness: int) -> None:
 
 def _serve(connection: socket.socket, stream: Any) -> None:
     rig, name = _received(stream)
-    # A session must not wait for what an estimator of this rig computes or loads once.
+    # An estimator computes or loads some things once for a rig; a session must not wait for them.
     make_estimator(rig, name).step(_dark(rig))
     estimator = make_estimator(rig, name)
     connection.sendall(packed(READY))
@@ -99,7 +99,8 @@ def _dark(rig: Rig) -> Exposure:
 
 
 def _end_with(parent: int) -> None:
-    """End with the parent, however that ends. Elsewhere than on Linux it ends when its exposure is done."""
+    """Make this process end with its parent, however that ends. On systems other than Linux it ends when its exposure
+    is done."""
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(_PARENT_DEATH_SIGNAL, signal.SIGKILL)
     if os.getppid() != parent:  # it ended before this

@@ -1,4 +1,4 @@
-"""Inputs that a session plays in the place of the rig file's drive: made by a rule, or taken from a file."""
+"""Inputs that a session plays in place of the rig file's drive: made by a rule, or taken from a file."""
 
 from __future__ import annotations
 
@@ -21,32 +21,33 @@ from aolink.session.replay import RecordedCommands
 _BITS = 16
 """Bits of the shift register whose sequence ``prbs`` plays: it repeats after 65,535 values."""
 _MOST_CHECKED = 1 << 20
-"""Fast steps that are compared with the limits before the session; each is again when it is sent."""
+"""Fast steps that are compared with the limits before the session; each is compared again when it is sent."""
 _CHECKED = 4096
-"""How many of them at once."""
+"""Fast steps that are compared at once."""
 _NUMBERS = {
     "sine": {"frequency": math.nan},
     "chirp": {"from": math.nan, "to": math.nan, "period": 10.0},
     "prbs": {"to": math.nan, "seed": 1.0},
     "step": {"at": 0.5},
 }
-"""What each kind takes beside ``amplitude`` and ``column``; not a number where it must be given."""
+"""The parameters of each kind beside ``amplitude`` and ``column``, with their defaults; NaN where the parameter must be
+given."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Excitation:
-    """Inputs for `aolink.session.record`, and what a recording says of them.
+    """Inputs for `aolink.session.record`, and their description for the recording.
 
     Called with a fast step since the session's start and a number of steps, it gives the inputs, (n_steps, n_inputs).
-    Steps are asked for in order.
+    Steps must be requested in order.
     """
 
     text: str
     exposures: int
-    """How many exposures they last; 0 for ever."""
+    """Number of exposures that the inputs last for; 0 for ever."""
     play: Callable[[int, int], FloatArray]
     repeat_steps: int
-    """Fast steps after which there is nothing new."""
+    """Number of fast steps after which the inputs repeat."""
 
     def __call__(self, first_step: int, n_steps: int) -> FloatArray:
         return self.play(first_step, n_steps)
@@ -61,8 +62,8 @@ def excitation(texts: Sequence[str], rig: Rig) -> Excitation:
         Either one file: a recording, whose commands are sent again, or a .csv, .npy or .npz file with a row of inputs
         for each fast step, (n_steps, n_inputs), after which the safe input follows. Or any number of
         ``KIND:NAME=VALUE,...``, which are added to the offset of the rig's drive (``drive.offset``). The kinds, and
-        what they take beside ``amplitude`` (in units of the inputs) and ``column`` (which input, counted from 0; all of
-        them without it):
+        their parameters beside ``amplitude`` (in units of the inputs) and ``column`` (which input, counted from 0; all
+        of them without it):
 
         ``sine``: ``frequency``, Hz.
         ``chirp``: ``from`` and ``to``, Hz, and ``period`` (10 s), in which the frequency goes from one to the other;
@@ -74,7 +75,7 @@ def excitation(texts: Sequence[str], rig: Rig) -> Excitation:
     Raises
     ------
     RigError
-        The text, the file or a number in it is not what is expected.
+        The text, the file or a number in it is not valid.
     DeviceError
         An input would be beyond the mirror's limits, or change faster than ``mirror.slew_max_per_s``.
     RecordingError
@@ -179,7 +180,8 @@ def _numbers(text: str, kind: str, rest: str) -> dict[str, float]:
 
 
 def _chirp_cycles(t: FloatArray, low: float, high: float, period_s: float) -> FloatArray:
-    """Cycles since the beginning of a frequency that goes from ``low`` to ``high`` and back, ``period_s`` each way."""
+    """Cycles since the beginning, for a frequency that goes from ``low`` to ``high`` and back, ``period_s`` each
+    way."""
     whole, since = np.divmod(t, 2 * period_s)
     up, down = np.minimum(since, period_s), np.maximum(since - period_s, 0.0)
     bend = (high - low) / (2 * period_s)

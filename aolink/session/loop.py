@@ -43,24 +43,27 @@ from aolink.session.report import EstimatorReport, LatencyBook, Report
 from aolink.wire import messages_pb2 as wire
 
 LEAD_BLOCKS = 3
-"""Command blocks that are queued on the device ahead of time; all but five in a queue of more than eight."""
+"""Command blocks that are queued on the device ahead of time; in a queue of more than eight blocks, all but five are
+filled."""
 _ROOM_BLOCKS = 5
 _START_DELAY_S = 0.25
-"""Real time: from the first command to its first step, at least; as long as a long queue, so that it is full then."""
+"""In real time, the least time from the first command to its first step, s; with a long queue it is the queue's length,
+so that the queue is full then."""
 _START_TRIES = 5
 _STATISTICS_PERIOD_S = 1.0
 ANSWER_NS = 200_000_000
 """How long the start waits for the answer to one clock query."""
 _GRACE_S = 1.5
-"""Real time: how long a frame may take after its exposure's end before it counts as lost."""
+"""In real time, how long a frame may take after its exposure's end before it counts as lost, s."""
 _KEEP_ALIVES = 3
 """Least number of messages that a mirror is sent in the time of its watchdog."""
 _OUTAGE_WATCHDOGS = 2.0
-"""A mirror that was out of reach for more than this many times its watchdog is not re-armed."""
+"""A mirror that was out of reach for more than this many times its watchdog's time is not re-armed."""
 ESTIMATES_S = 5.0
-"""Real time: how long the session's end waits for estimates that are under way."""
+"""In real time, how long the session's end waits for estimates that are under way, s."""
 _ALIGNED = 0.2
-"""Part of an exposure to which its alignment is to be known (sd): intervals of estimates hold up to there."""
+"""Largest standard deviation of an exposure's alignment without a warning, as a part of the exposure: estimates'
+intervals hold up to there."""
 _NOT_YET = 1 << 63
 """The first fast step of a session that has not begun."""
 
@@ -69,13 +72,13 @@ Inputs = Callable[[int, int], NDArray[np.float64]]
 """First fast step since the session's start and number of steps -> inputs to command, (n_steps, n_inputs)."""
 
 Show = Callable[[Exposure, Sequence[Outcome]], None]
-"""Given each exposure, with the estimates that have come since the one before; must not take time."""
+"""A function that gets each exposure, with the estimates that have come since the one before; it must not take time."""
 
 
 def lead_steps(mirror: MirrorDriver) -> int:
     """How far ahead of the device commands are sent, fast steps.
 
-    With a queue of more than eight blocks, estimators may take longer than three blocks last.
+    With a queue of more than eight blocks, estimators may take longer than the duration of three blocks.
     """
     return max(LEAD_BLOCKS * mirror.block_steps, mirror.queue_steps - _ROOM_BLOCKS * mirror.block_steps)
 
@@ -104,12 +107,12 @@ class SessionLoop:
         if beside is not None:
             self.report.estimation |= {name: EstimatorReport() for name in beside.names}
         self._unsettled: dict[int, list[Outcome]] = {}
-        """Outcomes so far of the exposures that not all estimators are done with, by frame."""
+        """Outcomes so far of the exposures that some estimators are still working on, by frame."""
         self._show = show
         self._unseen: Exposure | None = None
-        """The exposure that has not been given to the session's watcher yet, ..."""
+        """The exposure that has not been given to the session's watcher yet."""
         self._unseen_estimates: list[Outcome] = []
-        """... and the estimates that have not."""
+        """The estimates that have not been given to the session's watcher yet."""
         self._inputs = inputs or partial(rig.drive.inputs, fast_step_s=rig.timing.fast_step_s)
         self._controlling = controlling
         if controlling is not None:
@@ -123,7 +126,7 @@ class SessionLoop:
         self._aligned = True
         """Whether all exposures were aligned well enough so far."""
         self._devices: list[Camera | Mirror] = [camera, mirror] if mirror.commanded else [camera]
-        """In the order in which their clocks are queried; the next one first."""
+        """The devices in the order in which their clocks are queried; the next one first."""
         self._last_query_ns = self._next_statistics_ns = 0
         self._last_frame_ns = 0
         self._end_step: int | None = None
@@ -134,11 +137,11 @@ class SessionLoop:
         self._absent: list[Device] = []
         """Devices whose port has vanished, until the session goes on with them."""
         self._returned: list[Device] = []
-        """Vanished devices that have been identified again; their clocks are being asked."""
+        """Vanished devices that have been identified again; their clocks are being queried."""
         self._newest_steps: dict[int, int] = {}
-        """First fast step of the newest frame, by its plane."""
+        """First fast step of the newest frame, by its sensor's number on the wire."""
         self._restarted: set[int] = set()
-        """Planes of which no frame has come since the camera was started again."""
+        """Numbers of the sensors from which no frame has come since the camera was started again."""
         self._account = Account(self.report)
         self._latencies = LatencyBook(self.report, partial(self._record, topics.LATENCY))
 
@@ -184,14 +187,14 @@ class SessionLoop:
             self._camera.stop()
 
     def close_account(self) -> None:
-        """No more reports of the mirror will come: each commanded step that is still open ends now."""
+        """End each commanded step that is still open: no more reports of the mirror will come."""
         if self._parked_from is not None:
             self._account.parked_from(self._parked_from)
         self._account.close()
         self._count_tries()
 
     def finish_estimates(self, patience_s: float = ESTIMATES_S) -> None:
-        """Wait for the estimates under way, and record the exposures that none comes for as skipped."""
+        """Wait for the estimates under way, and record exposures without an estimate as skipped."""
         outcomes = self._estimating.finish(patience_s)
         self._take_outcomes(outcomes, self._time.now_ns())
         self._note_failures()
@@ -220,14 +223,15 @@ class SessionLoop:
         self._next_statistics_ns = self._time.now_ns() + round(_STATISTICS_PERIOD_S * 1e9)
 
     def _query_next_clock(self, now: int) -> None:
-        """Camera and mirror in turn, so that the one's query does not wait for the other's."""
+        """Query the clocks of camera and mirror in turn, so that one query does not wait for the other."""
         asked = self._devices.pop(0)
         self._devices.append(asked)
         asked.query_clock(now)
         self._last_query_ns = now
 
     def _next_query_ns(self) -> int:
-        """When to ask one of the two clocks again: soon where one may have been set, so that it is settled soon."""
+        """The time of the next query of one of the two clocks: soon where one may have been set, so that this is
+        decided soon."""
         suspected = self._camera.clock.suspected or self._mirror.clock.suspected
         return self._last_query_ns + round((SUSPICION_PERIOD_S if suspected else QUERY_PERIOD_S) / 2 * 1e9)
 
@@ -250,7 +254,7 @@ class SessionLoop:
         )
 
     def _device_step(self) -> int:
-        """The fast step that the device is in: by its clock, or on virtual time the one that it waits at."""
+        """The fast step that the device is in by its clock; on virtual time, the step that it waits at."""
         if self._time.virtual:
             return self._queued_until
         return self._mirror.since_zero_ns(self._time.now_ns()) // self._step_ns
@@ -269,7 +273,7 @@ class SessionLoop:
         if self._mirror.latched and is_there:
             self._rearm("in this session")
         now, due_ns = time.now_ns(), self._mirror.next_due_ns() if is_there else None
-        if due_ns is not None and time.virtual:  # the rig has dealt with everything, so this one was lost
+        if due_ns is not None and time.virtual:  # the rig has handled everything, so this frame was lost
             time.elapse_until(due_ns)
             now = time.now_ns()
         if due_ns is not None and due_ns <= now:
@@ -309,7 +313,7 @@ class SessionLoop:
         self.report.rearmed += 1
         out = f", {outage_s:.2f} s after its last command" if outage_s else ""
         self._log(Log.WARNING, f"the mirror was parked by its watchdog {when}: re-armed at fast step {step}{out}")
-        self._queued_until = min(self._queued_until, step)  # what was queued is dropped
+        self._queued_until = min(self._queued_until, step)  # the queued inputs are dropped
 
     def _vanished(self, device: Device, why: str) -> None:
         if device not in self._absent:
@@ -317,7 +321,7 @@ class SessionLoop:
         if device in self._returned:
             self._returned.remove(device)
         self.report.ports_vanished += 1
-        self._log(Log.WARNING, f"the port of the {device.name} has vanished, and is waited for: {why}")
+        self._log(Log.WARNING, f"the port of the {device.name} has vanished; the session waits for it: {why}")
 
     def _has_returned(self, device: Device, away_s: float) -> None:
         self._returned.append(device)
@@ -325,7 +329,7 @@ class SessionLoop:
         self._log(Log.WARNING, f"the {device.name} has returned {away_s:.2f} s after its port had vanished")
 
     def _go_on_with(self, device: Device) -> None:
-        """Go on with a device that has returned: it was stopped or parked when it was asked who it is."""
+        """Go on with a device that has returned: the request for its identity has stopped or parked it."""
         self._returned.remove(device)
         self._absent.remove(device)
         try:
@@ -337,10 +341,10 @@ class SessionLoop:
                 self._queued_until = max(self._first_step, self._device_step() + self._rig.mirror.block_steps)
                 self._log(Log.INFO, f"commands to the mirror go on from fast step {self._queued_until}")
         except PortError:
-            self._absent.append(device)  # it has vanished again, and is waited for as before
+            self._absent.append(device)  # it has vanished again, and the session waits for it as before
 
     def _go_on_with_camera(self) -> None:
-        """Start the camera again with an exposure of those that it would have taken."""
+        """Start the camera again with the next exposure of its schedule."""
         timing, first, end = self._rig.timing, self._first_step, self._end_step
         period = timing.frame_period_steps
 
@@ -362,7 +366,7 @@ class SessionLoop:
             return
         block_steps, end_step = self._rig.mirror.block_steps, self._end_step
         lead, control, cause = lead_steps(self._rig.mirror), self._controlling, self._newest_frame
-        if control is not None:  # what is queued is sent anew after each exposure
+        if control is not None:  # queued inputs are sent anew after each exposure
             lead, cause = LEAD_BLOCKS * block_steps, control.cause_frame
         horizon = device_step + lead
         if control is not None and self._time.virtual:
@@ -385,7 +389,8 @@ class SessionLoop:
             self._queued_until += n_steps
 
     def _leave_out(self) -> None:
-        """Leave out what would come too late, so that the slew limit holds from what the mirror has come to hold."""
+        """Leave out inputs that would come too late, so that the slew limit applies from the input that the mirror then
+        holds."""
         first, step = self._queued_until, self._reached_step()
         step = step if self._end_step is None else min(step, self._end_step)
         if step <= first:
@@ -415,7 +420,7 @@ class SessionLoop:
         return False
 
     def _finish(self, exposures: int) -> None:
-        """Take what is still on its way when the last command has been applied, and end the session."""
+        """Take the messages that are still on their way when the last command has been applied, and end the session."""
         self._receive(0.0)
         self._collect_reports()
         now = self._time.now_ns()
@@ -433,7 +438,7 @@ class SessionLoop:
         self._log(Log.INFO, f"session {self.report.ended}: {self.report.exposures} exposures")
 
     def _collect_reports(self) -> None:
-        """Ask for the reports that have not come, now that the mirror is parked."""
+        """Request the reports that have not come, now that the mirror is parked."""
         end, now = self._queued_until, self._time.now_ns()
         end = end if self._parked_from is None else min(end, self._parked_from)
         self._take(self._mirror, self._mirror.await_reports(end, now), now)
@@ -447,7 +452,7 @@ class SessionLoop:
     def _take(self, device: Device, events: Sequence[Event], receive_ns: int) -> None:
         for event in events:
             if isinstance(event, Frame):
-                if event.first_step >= self._first_step:  # not one of a session before
+                if event.first_step >= self._first_step:  # not one of an earlier session
                     event = self._count_lost(event)
                     take = self._take_scene if event.plane else self._take_frame
                     take(event, receive_ns)
@@ -468,7 +473,7 @@ class SessionLoop:
                 self._log(level, f"{device.name}: {event.text}")
 
     def _count_lost(self, frame: Frame) -> Frame:
-        """Count what a camera that was started again has not taken: it does not number those exposures."""
+        """Count the exposures that a camera has not taken before it was started again: it does not number them."""
         before = self._newest_steps.get(frame.plane)
         self._newest_steps[frame.plane] = frame.first_step
         if before is None or frame.plane not in self._restarted:
@@ -498,14 +503,15 @@ class SessionLoop:
         self._estimate(self._assembler.add_frame(frame), receive_ns)
 
     def _check_alignment(self, frame: Frame) -> None:
-        """Warn once where nobody knows well enough which of the mirror's steps an exposure is of."""
+        """Warn once where it is not known well enough which of the mirror's steps an exposure covers."""
         exposure_ns = self._rig.timing.exposure_steps * self._step_ns
         if self._aligned and self._mirror.commanded and frame.alignment_sigma_ns > _ALIGNED * exposure_ns:
             self._aligned = False
             self.report.warnings.append(
-                f"it is known to {frame.alignment_sigma_ns / exposure_ns:.2g} of an exposure only (sd, frame"
-                f" {frame.frame_id}) which of the mirror's fast steps an exposure is of: intervals of estimates hold up"
-                f" to {_ALIGNED:g}; give delay_s and delay_sd_s of the devices as well as they are known"
+                "which of the mirror's fast steps an exposure covers is known only to"
+                f" {frame.alignment_sigma_ns / exposure_ns:.2g} of an exposure (sd, frame {frame.frame_id}): intervals"
+                f" of estimates are reliable up to {_ALIGNED:g}; give delay_s and delay_sd_s of the devices as well as"
+                " they are known"
             )
 
     def _take_scene(self, frame: Frame, receive_ns: int) -> None:
@@ -559,12 +565,13 @@ class SessionLoop:
             self._take_outcomes(outcomes, log_time_ns)
 
     def _control(self, exposure: Exposure, estimate: Estimate | None, log_time_ns: int) -> None:
-        """Let the controller change the inputs that are not due yet: they are sent anew, and supersede the queued."""
+        """Let the controller change the inputs that are not due yet: they are sent anew, and supersede the queued
+        ones."""
         if self._controlling is None or self._is_safe:
             return
         change = self._controlling.see(exposure, estimate, self._reached_step())
         if (first_step := change.first_step) < self._queued_until:
-            # No later than what was changed: the limits count from what the controller goes on from.
+            # No later than the first changed step: the limits apply from the input that the controller continues from.
             self._queued_until = min(first_step, max(self._device_step() + 1, self._mirror.withdraw(first_step)))
         self._record(topics.CONTROL, change.message, log_time_ns)
         if change.warning:
@@ -601,14 +608,14 @@ class SessionLoop:
                 self._log(Log.ERROR, text)
 
     def _settle(self, frame_id: int) -> None:
-        """All estimators are done with an exposure, or have skipped it."""
+        """Finish an exposure that all estimators have estimated or skipped."""
         outcomes = self._unsettled.pop(frame_id)
         if all(each.message is None for each in outcomes):
             self._know(frame_id, 0 if outcomes else self._time.now_ns())
         self._show_unseen()
 
     def _know(self, frame_id: int, estimated_ns: int) -> None:
-        """Note that commands from now on know a frame: its first estimate is there, or there will be none."""
+        """Note that commands from now on depend on a frame: its first estimate is there, or there will be none."""
         self._newest_frame = max(self._newest_frame, frame_id)
         self._latencies.estimated(frame_id, estimated_ns)
 
@@ -626,7 +633,7 @@ class SessionLoop:
                 self._latencies.applied(applied.block_id, end_ns - applied.n_steps * self._step_ns, receive_ns)
         report, end = self.report, applied.first_step + applied.n_steps
         end = end if self._end_step is None else min(end, self._end_step)
-        n_steps = max(0, end - max(applied.first_step, self._first_step))  # of this session
+        n_steps = max(0, end - max(applied.first_step, self._first_step))  # it belongs to this session
         if applied.source in (wire.Applied.PARKED, wire.Applied.WATCHDOG):
             report.steps_parked += n_steps
         self._estimate(self._assembler.add_applied(applied), receive_ns)
@@ -663,7 +670,7 @@ class SessionLoop:
             size_s, period_s = sampled.step.size_ns / 1e9, (sampled.step.before_ns - sampled.step.after_ns) / 1e9
             direction = "forward" if size_s > 0 else "back"
             warning = (
-                f"the {device.name}'s clock was set {direction} by {abs(size_s):.6f} s: host times of what it stamped"
+                f"the {device.name}'s clock was set {direction} by {abs(size_s):.6f} s: host times of its stamps"
                 f" in the {period_s:.3f} s from {sampled.step.after_ns} ns on may be off by as much"
             )
             report.warnings.append(warning)

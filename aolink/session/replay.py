@@ -1,4 +1,4 @@
-"""Replay of a recording: its exposures through estimators, at any pace, or its commands through a rig."""
+"""Replay of a recording: its exposures go through estimators at any pace, or its commands are sent to a rig."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from aolink.recording.reestimate import skipped_by
 from aolink.wire import messages_pb2 as wire
 
 _NAP_S = 0.1
-"""Longest sleep between two questions whether to stop."""
+"""Longest sleep between two checks whether to stop, s."""
 
 
 def replay(
@@ -78,24 +78,23 @@ def replay(
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class WouldCommand:
-    """What a controller would have commanded after an exposure, and what was held."""
+    """The inputs that a controller would have commanded after an exposure, and those that the mirror held."""
 
     act: Act
     inputs: NDArray[np.float64]
-    """From ``act.first_step`` on, as the mirror's converter puts them out, to the same step after the next exposure,
+    """Inputs from ``act.first_step`` on to the same step after the next exposure, rounded by the mirror's converter,
     (k, n_inputs)."""
     recorded: NDArray[np.float64]
-    """What the mirror held in those of these steps that the recording knows, (at most k, n_inputs)."""
+    """Inputs that the mirror held in these steps, as far as the recording has them, (at most k, n_inputs)."""
 
 
 def would_command(
     recording: Recording, controller: str, estimator: str, *, stop: Callable[[], bool] = lambda: False
 ) -> Iterator[WouldCommand]:
-    """What a controller would have commanded, exposure by exposure, had it been asked in the session.
-
-    Each exposure, and the inputs that were pending at its end, are those of the recording: the answer is to what
-    happened, not to what would have come of it. Another controller than the session's does not fall back, because
-    whether it pays cannot be seen where it did not act.
+    """The inputs that a controller would have commanded in the session, exposure by exposure. Each exposure, and the
+    inputs that were pending at its end, are those of the recording: the controller responds to what happened in the
+    session, not to the effect of its own commands. Another controller than the session's does not fall back, because
+    where it did not act, its benefit cannot be measured.
 
     Raises
     ------

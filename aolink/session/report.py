@@ -22,9 +22,9 @@ class EstimatorReport:
 
     estimated: int = 0
     skipped: int = 0
-    """Exposures that it had no time for, or that came after it had failed."""
+    """Exposures that the estimator had no time for, or that came after it had failed."""
     failed: str = ""
-    """Why it gave up; empty where it did not."""
+    """The reason of its failure; empty where it did not fail."""
     took_ms: list[float] = field(default_factory=list)
     """Durations of its estimates, one after the other; the newest ones, `_KEPT_LATENCIES` at most."""
 
@@ -54,7 +54,7 @@ class ControlReport:
     misfit_exposures: int = 0
     """Exposures at which the model no longer fitted."""
     fall_back_exposures: int = 0
-    """Exposures after which another controller acted, because this one did not pay."""
+    """Exposures after which another controller acted, because this one left larger slopes."""
     clipped_steps: int = 0
     """Fast steps whose wanted input the limits have changed."""
     slope_rms: float = float("nan")
@@ -62,7 +62,7 @@ class ControlReport:
     delay_ms: list[float] = field(default_factory=list)
     """From the end of each exposure to the first step that it changed; the newest ones, `_KEPT_LATENCIES` at most."""
     note: str = ""
-    """What the newest exposure says, in a few words, for a screen."""
+    """The loop's state at the newest exposure, in a few words, for a screen."""
     _squares: tuple[float, int] = (0.0, 0)
 
     def add(self, act: Act, fast_step_s: float) -> None:
@@ -87,7 +87,7 @@ class ControlReport:
             self.note += f", fallen back to {act.acting}"
 
     def counts(self) -> dict[str, Any]:
-        """Everything but the single delays, of which it gives the median and the longest."""
+        """All counts, with the median and the longest of the delays."""
         names = (
             "exposures", "open_exposures", "late_exposures", "misfit_exposures", "fall_back_exposures", "clipped_steps",
             "slope_rms",
@@ -111,7 +111,7 @@ class Report:
     frames_lost: int = 0
     """Frames never received at all."""
     scenes_received: int = 0
-    """The same three counts for the picture sensor."""
+    """The counts of complete, incomplete and lost frames for the picture sensor."""
     scenes_incomplete: int = 0
     scenes_lost: int = 0
     packets_bad_crc: int = 0
@@ -121,35 +121,35 @@ class Report:
     packets_missing: int = 0
     """Gaps in the sequence numbers of either device."""
     chunks_refused: int = 0
-    """Pieces of frames that made no sense."""
+    """Invalid chunks of frames."""
     steps_commanded: int = 0
     """Steps of all command blocks; at the end of the session they are the sum of the five counts that follow."""
     steps_applied: int = 0
     steps_superseded: int = 0
     """Steps that were queued, and replaced by a later command, or dropped when the mirror parked."""
     steps_late: int = 0
-    """Steps that had gone by when their block came, or whose block was never answered and something else applied."""
+    """Steps that had gone by when their block came, or whose block was never answered and another input was applied."""
     steps_refused: int = 0
     steps_not_reported: int = 0
-    """Steps in which the mirror held an unknown input: the reports did not come, though they were asked for again."""
+    """Steps in which the mirror held an unknown input: the reports did not come, although they were requested again."""
     steps_clipped: int = 0
     """Applied steps whose input the device's own protection had changed."""
     steps_parked: int = 0
-    """Fast steps of the session in which the mirror held its safe input, whatever became of commands for them."""
+    """Fast steps of the session in which the mirror held its safe input, however the commands for them ended."""
     blocks_retransmitted: int = 0
     reports_asked: int = 0
-    """How often missing reports of the mirror were asked for again."""
+    """How often missing reports of the mirror were requested again."""
     rearmed: int = 0
     """How often the mirror was parked by its watchdog and re-armed."""
     ports_vanished: int = 0
-    """How often the port of a device vanished and was waited for."""
+    """How often the port of a device vanished and the session waited for it."""
     away_s: float = 0.0
     """How long ports were gone until their devices had returned, all together, s."""
     clock_offset_ns: float = float("nan")
     clock_frequency_ppm: float = float("nan")
     clock_sigma_ns: float = float("nan")
     estimation: dict[str, EstimatorReport] = field(default_factory=dict)
-    """By the estimator's name. Empty on virtual time, which waits for every estimate."""
+    """Counts of each estimator, by its name. Empty on virtual time, which waits for every estimate."""
     control: ControlReport | None = None
     """Counts of the closed loop; None where the session played its inputs."""
     unwatched: int = 0
@@ -158,7 +158,7 @@ class Report:
     files: list[str] = field(default_factory=list)
     """Files that were written."""
     latencies: list[pb.Latency] = field(default_factory=list)
-    """The newest ones, `_KEPT_LATENCIES` at most; all of them are in the recording."""
+    """The newest latencies, `_KEPT_LATENCIES` at most; all of them are in the recording."""
 
     @property
     def exposures_skipped(self) -> dict[str, int]:
@@ -166,7 +166,7 @@ class Report:
         return {name: each.skipped for name, each in self.estimation.items() if each.skipped}
 
     def counts(self) -> dict[str, str]:
-        """Everything but the latencies, as text, for the recording's metadata."""
+        """All counts without the latencies, as text, for the recording's metadata."""
         facts = asdict(replace(self, control=None))
         for name in ("latencies", "warnings", "files", "estimation", "unwatched", "control"):
             del facts[name]
@@ -180,26 +180,25 @@ class Report:
 
 
 class LatencyBook:
-    """The latency of each frame, from the end of its exposure to the first command that knew it. Real time only.
-
-    A command knows a frame when it is sent after the first estimate of the frame was there, or all estimators had
-    skipped it. (What each estimator takes is in `EstimatorReport`.)
+    """The latency of each frame, from the end of its exposure to the first command that could depend on it. It is for
+    real time only. A command can depend on a frame when it is sent after the first estimate of the frame was there, or
+    all estimators had skipped it. (`EstimatorReport` has the time of each estimator.)
     """
 
     def __init__(self, report: Report, record: Callable[[pb.Latency, int], None]) -> None:
         self._report, self._record = report, record
         self._open: dict[int, pb.Latency] = {}
         self._blocks: dict[int, int] = {}
-        """First command block that knew a frame, by frame."""
+        """First command block that could depend on a frame, by frame."""
         self._known: set[int] = set()
-        """Frames that the next command knows."""
+        """Frames that the next command can depend on."""
 
     def frame(self, latency: pb.Latency) -> None:
-        """A frame is complete."""
+        """Note that a frame is complete."""
         self._open[latency.frame_id] = latency
 
     def estimated(self, frame_id: int, now_ns: int) -> None:
-        """The first estimate of a frame is there; ``now_ns`` is 0 if all estimators have skipped it."""
+        """Note that the first estimate of a frame is there; ``now_ns`` is 0 if all estimators have skipped it."""
         if latency := self._open.get(frame_id):
             latency.estimated_ns = now_ns
             self._known.add(frame_id)
@@ -215,7 +214,7 @@ class LatencyBook:
             self._open[frame_id].command_acknowledged_ns = receive_ns
 
     def applied(self, block_id: int, applied_ns: int, receive_ns: int) -> None:
-        """The device reports the first steps of a block: the way is over."""
+        """Note that the device reports the first steps of a block, which ends the latency of its frames."""
         for frame_id in [frame_id for frame_id, block in self._blocks.items() if block == block_id]:
             self._open[frame_id].command_applied_ns = applied_ns
             self._close(frame_id, receive_ns)

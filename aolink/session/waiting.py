@@ -13,19 +13,19 @@ from aolink.rig import Timing
 Item = TypeVar("Item")
 
 _BEHIND_S = 0.5
-"""How far a consumer may be behind the camera."""
+"""The most by which a consumer may be behind the camera, s."""
 
 
 def most_waiting(timing: Timing) -> int:
-    """How many exposures may wait for an estimator or a viewer: those of half a second, and two at least."""
+    """How many exposures may wait for an estimator or a viewer: those of half a second, and at least two."""
     return max(2, math.ceil(_BEHIND_S / (timing.frame_period_steps * timing.fast_step_s)))
 
 
 class Waiting(Generic[Item]):
     """A bounded queue that drops old items.
 
-    Items leave in order, so short delays cost nothing. When it is full, its consumer is too slow: then all items are
-    dropped for the new one, so that the consumer goes on with new ones, without a gap for a while.
+    Items leave in order, so short delays cost nothing. When it is full, its consumer is too slow: then all waiting
+    items are dropped for the new one, so that the consumer goes on with new items, for some time without a gap.
     """
 
     def __init__(self, most: int) -> None:
@@ -43,7 +43,7 @@ class Waiting(Generic[Item]):
         return self._items.popleft() if self._items else None
 
     def clear(self) -> list[Item]:
-        """Drop all items, and give them."""
+        """Drop all items, and return them."""
         items = list(self._items)
         self._items.clear()
         return items
@@ -64,7 +64,7 @@ class Aside(Generic[Item]):
         self.skipped = 0
         """Items that the function had no time for."""
         self.failed: Exception | None = None
-        """What the function raised."""
+        """The exception that the function raised."""
         self._function = function
         self._waiting = Waiting[Item](most)
         self._changed = threading.Condition()
@@ -98,5 +98,5 @@ class Aside(Generic[Item]):
                 continue
             try:
                 self._function(item)
-            except Exception as error:  # a session must not end for its picture
+            except Exception as error:  # a session must not end because its picture fails
                 self.failed = error

@@ -1,7 +1,6 @@
-"""The simulated camera and mirror driver: messages from the host in, messages to the host out.
-
-State only: no ports and no time of its own. `aolink.simulation.server` puts it behind ports. It is the
-device's side of protocol version 1; the host's code never imports it and meets it on the wire only.
+"""The simulated camera and mirror driver: they take messages from the host and give messages to the host. They are
+state only, with no ports and no time of their own. `aolink.simulation.server` puts it behind ports. It is the device's
+side of protocol version 1; the host's code never imports it and meets it on the wire only.
 """
 
 from __future__ import annotations
@@ -25,9 +24,9 @@ from aolink.wire.truth import truth_message
 Line = Literal["camera", "mirror"]
 FIRMWARE = "aolink simulated rig 1"
 _REMEMBERED_BLOCKS = 256
-_PACKET_INPUTS = 512  # numbers of an `Applied` that is one packet
-_HISTORY_WATCHDOGS = 4  # an outage of two is survived; what was held during it is asked for when it is over
-_HISTORY_INPUTS = 1 << 20  # numbers that are remembered at most, beside one queue
+_PACKET_INPUTS = 512  # numbers in an `Applied` of one packet
+_HISTORY_WATCHDOGS = 4  # an outage of two is survived; the inputs held during it are requested when it is over
+_HISTORY_INPUTS = 1 << 20  # the most numbers that are remembered, beside one queue
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,7 +39,7 @@ class Outgoing:
 
 
 class _Held(NamedTuple):
-    """What the mirror held in one fast step."""
+    """The input that the mirror held in one fast step."""
 
     block_id: int
     source: pb.Applied.Source
@@ -70,7 +69,7 @@ class SimulatedDevices:
         self.latched = False
         """Whether the watchdog has parked the mirror and no Rearm has come since."""
         self.clock_set_ns = 0
-        """By how much the clock that the device's stamps are read from has been set forward."""
+        """How far the clock of the device's stamps has been set forward, ns."""
 
     @property
     def step(self) -> int:
@@ -95,7 +94,7 @@ class SimulatedDevices:
         return self._step_zero_ns + step * self.rig.timing.fast_step_ns
 
     def _stamp_ns(self, step: int) -> int:
-        """The same on the clock as it is now: what the device says."""
+        """Device time at which a fast step begins, on the clock as it is now, which the device reports."""
         return self.device_ns(step) + self.clock_set_ns
 
     def next_report_step(self) -> int:
@@ -157,7 +156,7 @@ class SimulatedDevices:
         self.parked, self.armed, self._reporting = True, False, False
 
     def watchdog_expires(self) -> None:
-        """Park the mirror, since no valid packet has come on its line for the watchdog's time; until a Rearm comes."""
+        """Park the mirror until a Rearm comes, because no valid packet has come on its line for the watchdog's time."""
         if not self.armed:
             return
         self._queue.clear()
@@ -292,7 +291,7 @@ class SimulatedDevices:
             self._model.stop_camera()
             self._camera_start = None
         elif control.first_step == self._camera_start:
-            pass  # asked again: the answer was lost
+            pass  # the request came again: the answer was lost
         elif control.first_step < self.step:
             text = f"fast step {control.first_step} has gone by, the next is {self.step}"
             return pb.Ack(sequence=sequence, code=pb.TOO_LATE, text=text)
@@ -302,7 +301,7 @@ class SimulatedDevices:
         return pb.Ack(sequence=sequence)
 
     def _answer_query(self, query: pb.AppliedQuery) -> None:
-        """What the mirror held from a step on, as much of it as one report holds."""
+        """Report the inputs that the mirror held from a step on, as many as one report holds."""
         first, oldest = query.first_step, self.step - len(self._history)
         end = min(first + query.n_steps, self.step)
         if first < min(oldest, end):
@@ -315,7 +314,7 @@ class SimulatedDevices:
             self._say("mirror", self._runs(first, held, most)[0])
 
     def _runs(self, first: int, held: Sequence[_Held], most: int) -> list[pb.Applied]:
-        """Reports on the steps from ``first`` on, one for each run of one block and source, ``most`` steps or fewer."""
+        """Reports of the steps from ``first`` on, one for each run of one block and source, ``most`` steps or fewer."""
         runs = []
         start = 0
         for k in range(1, len(held) + 1):
@@ -335,7 +334,8 @@ class SimulatedDevices:
         return runs
 
     def _send_frame(self, frame: CameraFrame) -> None:
-        """The spots' picture, the truth, and last the scene's: the estimators do not wait for that."""
+        """Send the spots' picture, the truth, and last the scene's picture, because the estimators do not wait for
+        that."""
         last_step = frame.first_step + frame.n_steps - 1
         self._send_picture(frame, frame.pixels, plane=0)
         data = truth_message(frame.frame_id, frame.truth).SerializeToString()
@@ -371,6 +371,6 @@ class SimulatedDevices:
 
 
 def history_steps(rig: Rig) -> int:
-    """Number of fast steps for which a simulated mirror remembers what it held."""
+    """Number of fast steps for which a simulated mirror remembers its inputs."""
     watchdogs = math.ceil(_HISTORY_WATCHDOGS * rig.mirror.watchdog_s / rig.timing.fast_step_s)
     return max(rig.mirror.queue_steps, min(watchdogs, _HISTORY_INPUTS // rig.n_inputs))

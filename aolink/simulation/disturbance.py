@@ -72,7 +72,7 @@ class DisturbancePlayer:
 
 
 def _recorded(rig: Rig, name: str) -> FloatArray:
-    """Slopes from a .npy, .npz (its only array) or .csv file, beside the rig file where its path is relative."""
+    """Slopes from a .npy, .npz (its only array) or .csv file; a relative path starts at the rig file's folder."""
     path = rig.path_of(name, "disturbance.recorded")
     try:
         slopes = load_table(path)

@@ -1,4 +1,5 @@
-"""What a bad line does to bytes, by rate and by seed: the faults of ``[simulation.faults]`` that need no clock."""
+"""The damage of a bad serial line to bytes, by rate and by seed: the faults of ``[simulation.faults]`` that need no
+clock."""
 
 from __future__ import annotations
 
@@ -11,9 +12,8 @@ _BURST = 64
 
 
 class Way:
-    """One direction of one line: damages bytes, and says how long they take.
-
-    It is given whole packets, so that what it does depends on what is sent and not on how the bytes are read.
+    """One direction of one serial line: it damages bytes, and gives their delay. It takes whole packets, so that its
+    faults depend on the bytes sent and not on how they are read.
     """
 
     def __init__(self, faults: Faults, rng: np.random.Generator, *, to_host: bool) -> None:
@@ -24,17 +24,17 @@ class Way:
         self._delay_s = faults.delay_to_host_s if to_host else faults.delay_to_device_s
 
     def damage(self, packet: bytes) -> bytes:
-        """What comes out at the other end for the bytes of a packet and its delimiter."""
+        """The bytes that arrive at the other end for a packet and its delimiter."""
         if self.hits(self._loss):
             return b""
-        if self.hits(self._flip):  # of the packet, not of its delimiter
+        if self.hits(self._flip):  # the size of the packet, not of its delimiter
             packet = _flipped(packet, self._rng.integers(8 * (len(packet) - 1), size=1))
         if self.hits(self._duplicate):
             packet *= 2
         return self._damage_bytes(packet)
 
     def delay_ns(self) -> int:
-        """How much later than on a good line a packet comes."""
+        """The delay of a packet beyond that of a good line, ns."""
         delay_s = self._delay_s
         if self._faults.jitter_s:
             delay_s += self._faults.jitter_s * float(self._rng.standard_exponential())
@@ -56,7 +56,7 @@ class Way:
         for start in self._some(len(data), faults.burst_rate):
             end = min(start + int(rng.integers(1, _BURST + 1)), len(data))
             data = data[:start] + rng.bytes(end - start) + data[end:]
-        # From the end on: what is before stays where it is.
+        # From the end backwards, so that earlier places stay valid.
         for k in self._some(len(data), faults.byte_loss_rate)[::-1]:
             data = data[:k] + data[k + 1 :]
         for k in self._some(len(data), faults.byte_repeat_rate)[::-1]:

@@ -69,18 +69,19 @@ class RigModel:
         self._rest: FloatArray | None = None  # where a still spot is held
 
     def start_camera(self, first_step: int, exposures: int = 0) -> None:
-        """Expose from ``first_step`` on, ``exposures`` times (0: until stopped); what ran before is dropped."""
+        """Expose from ``first_step`` on, ``exposures`` times (0: until stopped); an earlier run is dropped."""
         if first_step < self.step:
             raise ValueError(f"fast step {first_step} has gone by, the next one is {self.step}")
         self._exposure, self._exposures_left = first_step, exposures
         self._light, self._rest = next(self._lights, self._light), None
 
     def stop_camera(self) -> None:
-        """Expose no more; an exposure that runs gives no frame."""
+        """Stop exposing; an exposure under way gives no frame."""
         self._exposure = None
 
     def advance(self, u: FloatArray) -> list[CameraFrame]:
-        """Apply the mirror values ``u``, (k, axes * n_inputs), for k fast steps; the frames that end within them."""
+        """Apply the mirror values ``u``, (k, axes * n_inputs), for k fast steps; gives the frames that end within
+        them."""
         first, states = self.step, self._run(u)
         outputs = (self.rig.plant.C @ states[:-1, ..., None]).reshape(len(u), self.rig.n_outputs)
         if self._disturbance is not None and len(u):
@@ -100,7 +101,7 @@ class RigModel:
         return frames
 
     def _run(self, u: FloatArray) -> FloatArray:
-        """States before each of k steps and after the last, (k + 1, axes, n_states). Mishra & Wen (1)."""
+        """States before each of k steps and after the last, (k + 1, axes, n_states), by Mishra & Wen (1)."""
         plant = self.rig.plant
         w = self._process_noise.standard_normal((len(u), plant.axes, self._noise_input.shape[1], 1))
         # One small product for each step: the bits of a product over all steps would depend on their number.
@@ -184,8 +185,8 @@ def simulate(
     seed:
         Seed of the random numbers; the rig file's own where None.
     inputs:
-        Inputs that the mirror applies at each fast step, (steps, n_inputs); the rig's drive, as its converter
-        puts it out, where None.
+        Inputs that the mirror applies at each fast step, (steps, n_inputs); where None, the rig's drive, rounded by its
+        converter.
 
     Examples
     --------

@@ -20,8 +20,8 @@ _FLAT = 0.5
 class SceneCamera:
     """Integrates a picture along a path, blurred by the sensor's kernel, noisy and in counts.
 
-    Shifts are exact for the picture's own, finer pixels, by its Fourier transform; what moves out on one side
-    comes in on the other, so the picture should reach beyond the frame by as much as the scene moves.
+    Shifts are exact for the picture's own, finer pixels, by its Fourier transform; light that moves out on one side
+    comes in on the other, so the picture should reach beyond the frame by the scene's motion.
     """
 
     def __init__(self, rig: Rig, rng: np.random.Generator) -> None:
@@ -33,7 +33,7 @@ class SceneCamera:
         self._fy, self._fx = np.fft.fftfreq(picture.shape[0])[:, None], np.fft.rfftfreq(picture.shape[1])[:, None]
         self._spectrum = np.fft.rfft2(picture) * self._kernel(rig.scene.kernel)
         self._along_x = rig.n_outputs == 1
-        if self._along_x:  # what happens to the rows is always the same
+        if self._along_x:  # nothing moves along y: only rows need transforms
             rows = framed_rows(rig.scene, np.fft.irfft2(self._spectrum, picture.shape))
             self._spectrum = np.fft.rfft(rows)
 
@@ -47,7 +47,7 @@ class SceneCamera:
         weights:
             Share of the exposure in each step, (n_steps,).
         light:
-            As in `aolink.rig.Light`.
+            The light, as in `aolink.rig.Light`.
         """
         sensor = self._sensor
         if light in ("dark", "flat"):

@@ -1,8 +1,8 @@
-"""The simulated rig as a process: two lines (camera, mirror) on pseudo terminals or TCP ports.
+"""The simulated rig as a process: two serial lines (camera, mirror) on pseudo terminals or TCP ports.
 
 In real time the plant runs with the clock. On virtual time it runs to the end of the last queued
-command block and waits there; every line is told the host's time with `VirtualTime` packets, so
-commands drive time, and the same seed gives the same bytes however fast the host is.
+command block and waits there; the host's time is sent on every line with `VirtualTime` packets, so commands drive time,
+and the same seed gives the same bytes however fast the host is.
 """
 
 from __future__ import annotations
@@ -35,14 +35,14 @@ from aolink.wire.signing import refusal
 VIRTUAL_EPOCH_NS = 1_767_225_600_000_000_000
 """Host time at which a virtual session begins: 2026-01-01 00:00 UTC, always the same."""
 _TURNAROUND_NS = 5_000
-"""Between a clock query and its reply."""
+"""Time between a clock query and its reply."""
 _IDLE_S = 0.5
 """Longest sleep in real time: the plant is never further behind than this."""
 _MOST_REST = 16 << 10
-"""Bytes without a delimiter that are held: more than any packet has."""
+"""The most bytes without a delimiter that are held: more than any packet has."""
 _LAST_NS = 1 << 62
 _LONGEST_PAUSE_NS = 3_600_000_000_000
-"""Virtual time goes on with the host's clock queries, but no further at once."""
+"""Virtual time also advances with the host's clock queries, at once by no more than this, ns."""
 _UNREAD_LIMIT = 16 << 20
 """Bytes that wait for a host that does not read; in real time, what is beyond it is dropped."""
 
@@ -50,16 +50,17 @@ _UNREAD_LIMIT = 16 << 20
 class LineEnd:
     """The device's end of one line: bytes in and out, their faults and delays, packets, counts.
 
-    Faults act on the bytes of whole packets between the port and the decoder. They begin after Identify and Identity:
-    who is there is asked in real time, so again on a slow machine. `VirtualTime` is a side channel and suffers none.
+    Faults act on the bytes of whole packets between the port and the decoder. They begin after Identify and Identity,
+    because a host on a slow machine may send Identify again, in real time. `VirtualTime` is a side channel and suffers
+    none.
     """
 
     def __init__(self, line: Line, stream: Stream, faults: Faults, seed: np.random.SeedSequence) -> None:
         self.line, self.stream = line, stream
         self.taken = 0
-        """Bytes from this session's Identify on that have been dealt with, lost and damaged ones included."""
+        """Bytes from this session's Identify on that have been handled, lost and damaged ones included."""
         self.unsent = bytearray()
-        # One for each direction: how packets in and packets out take turns is a matter of speed.
+        # One generator for each direction, because the order of incoming and outgoing packets depends on speed.
         incoming, outgoing = (np.random.default_rng(each) for each in seed.spawn(2))
         self.to_device, self.to_host = Way(faults, incoming, to_host=False), Way(faults, outgoing, to_host=True)
         self._faulty, self._vanish_ns = faults != Faults(), round(faults.vanish_s * 1e9)
@@ -71,12 +72,12 @@ class LineEnd:
         self._rest = b""
         """The beginning of a packet whose delimiter has not come yet."""
         self._incoming: deque[tuple[int, bytes]] = deque()
-        """Real time: packets that a slow line still has, and when they come."""
+        """In real time, packets that are still on a slow line, and the times at which they come."""
         self._outgoing: deque[tuple[int, bytes]] = deque()
         self._sequence = 0
 
     def read(self, now_ns: int, *, real_time: bool) -> None:
-        """Take what has come at the port; with the line's delay if time is real."""
+        """Take the bytes that have come at the port; in real time with the line's delay."""
         if self.returns_ns is not None:
             return
         *whole, self._rest = (self._rest + self.stream.read()).split(DELIMITER)
@@ -88,7 +89,7 @@ class LineEnd:
             self._put_off(self._incoming, now_ns + delay_ns, piece)
 
     def take_undelimited(self) -> bool:
-        """Take what has come without a delimiter as well; False if there is none."""
+        """Take bytes that have come without a delimiter as well; False if there are none."""
         if self._rest:
             self._incoming.append((0, self._rest))
             self._rest = b""
@@ -96,12 +97,12 @@ class LineEnd:
         return False
 
     def pieces(self, now_ns: int) -> Iterator[bytes]:
-        """What has come by now, packet by packet, as the host sent it."""
+        """The bytes that have come by now, packet by packet, as the host sent them."""
         while self._incoming and self._incoming[0][0] <= now_ns:
             yield self._incoming.popleft()[1]
 
     def messages(self, piece: bytes) -> list[tuple[Message, int]]:
-        """(message, sequence) of what the line makes of the bytes of a packet."""
+        """The messages, (message, sequence), in the bytes of a packet after the line's faults."""
         if self._faulty and piece != DELIMITER:
             identify = any(packet.type == PacketType.IDENTIFY for packet in PacketDecoder().feed(piece))
             self._vanishes |= not identify and self.to_device.vanishes()
@@ -110,9 +111,10 @@ class LineEnd:
         return [(m, packet.sequence) for packet in packets if (m := self._parse(packet)) is not None]
 
     def begin_session(self) -> None:
-        """On Identify: what was not sent yet is for a host that is gone."""
+        """Begin a session on Identify: drop the bytes that were not sent yet, because they are for a host that is
+        gone."""
         self._outgoing.clear()
-        self.unsent[:] = DELIMITER  # ends what was sent of a packet
+        self.unsent[:] = DELIMITER  # ends a packet that was partly sent
         self._sequence = 0
 
     def put(self, message: Message, due_ns: int = 0) -> None:
@@ -120,14 +122,15 @@ class LineEnd:
         for packet in encode_packets(message, self._sequence, self.stream.signing):
             self._sequence = (self._sequence + 1) & 0xFFFF
             if isinstance(message, pb.VirtualTime):
-                packet = DELIMITER + packet  # ends whatever damage is before it
+                packet = DELIMITER + packet  # ends any damaged packet before it
             elif not isinstance(message, pb.Identity) and self._faulty:
                 self._vanishes |= self.to_host.vanishes()
                 packet = self.to_host.damage(packet)
             self._put_off(self._outgoing, due_ns, packet)
 
     def vanish_and_return(self, now_ns: int) -> None:
-        """Let the port vanish, with all that is on the line, if a packet was hit by that; let it return in time."""
+        """Let the port vanish, with all bytes on the line, if this fault has hit a packet; let it return when it is
+        due."""
         if self._vanishes and self.returns_ns is None:
             self.stream.close()
             self.returns_ns = now_ns + self._vanish_ns
@@ -140,7 +143,7 @@ class LineEnd:
                 self._vanishes, self.returns_ns = False, None
 
     def flush(self, now_ns: int) -> None:
-        """Send what the port takes now."""
+        """Send the bytes that the port takes now."""
         while self._outgoing and self._outgoing[0][0] <= now_ns:
             self.unsent += self._outgoing.popleft()[1]
         while self.unsent:
@@ -154,13 +157,13 @@ class LineEnd:
         return len(self.unsent) + sum(len(data) for _, data in self._outgoing)
 
     def due_ns(self) -> float:
-        """When the next bytes come out of a slow line, one way or the other."""
+        """The time at which the next bytes come out of a slow line, in either direction."""
         if self.returns_ns is not None:
             return self.returns_ns
         return min((way[0][0] for way in (self._incoming, self._outgoing) if way), default=math.inf)
 
     def _put_off(self, way: deque[tuple[int, bytes]], due_ns: int, data: bytes) -> None:
-        """Queue bytes in order: none overtakes those before."""
+        """Queue bytes in order: none overtakes earlier ones."""
         way.append((max(due_ns, way[-1][0]) if way else due_ns, data))
 
     def _parse(self, packet: Packet) -> Message | None:
@@ -178,7 +181,7 @@ class LineEnd:
 
 
 class RigServer:
-    """Runs the simulated devices behind two lines until told to stop."""
+    """Runs the simulated devices behind two serial lines until it is stopped."""
 
     def __init__(
         self,
@@ -214,7 +217,7 @@ class RigServer:
         self.devices = SimulatedDevices(rig, seed, virtual_time=not real_time, step_zero_ns=self._step_zero_ns)
 
     def run(self, stop: Callable[[], bool]) -> None:
-        """Serve until ``stop()``; it is asked at least twice a second."""
+        """Serve until ``stop()`` gives True; it is called at least twice a second."""
         while not stop():
             self._wait()
             self.serve()
@@ -236,7 +239,7 @@ class RigServer:
             line.flush(self._host_ns())
 
     def idle_s(self) -> float:
-        """How long there is nothing to do if nothing comes, s; at most half a second."""
+        """Time until something is due if no bytes come, s; at most half a second."""
         if not self._real_time:
             return _IDLE_S
         due_ns: float = self.devices.device_ns(self.devices.next_report_step()) - self._device_ns()
@@ -263,8 +266,8 @@ class RigServer:
         return self._step_zero_ns + math.floor((self._host_ns() - self._start_ns) * self._clock_rate)
 
     def _deal_with(self, line: LineEnd, piece: bytes) -> None:
-        """Deal with what the line makes of a packet that the host has sent; on virtual time with all that follows."""
-        if piece == DELIMITER:  # before an Identify: it ends what was left on the line
+        """Handle a packet of the host after the line's faults; on virtual time also everything that follows from it."""
+        if piece == DELIMITER:  # a delimiter before an Identify: it ends a packet that was left on the line
             line.messages(piece)
             return
         size_ns, at_ns = self._clock_step
@@ -294,18 +297,19 @@ class RigServer:
                 self._tell_time(each, done=True)
 
     def _handle(self, line: LineEnd, message: Message, sequence: int) -> None:
-        if self._real_time:  # what is late is judged by the clock, not by the last report
+        if self._real_time:  # lateness is judged by the clock, not by the last report
             self._catch_up(whole_reports=False)
         self.devices.handle(line.line, message, sequence)
 
     def _put_off(self, block: pb.CommandBlock, sequence: int) -> None:
-        """A block that comes late: when half of its steps have gone by, unless that is never."""
+        """Hold back a block that a fault makes late: it comes when half of its steps have gone by, unless that is
+        never."""
         step = block.first_step + block.n_steps // 2
         if step <= self.devices.step + self._queue_steps:
             self._late.append((step, block, sequence))
 
     def _take_late(self) -> None:
-        """Take the blocks that come late and are due now; on virtual time nothing else moves time on to them."""
+        """Take the late blocks that are due now; on virtual time nothing else advances time to them."""
         late, self._late = self._late, []
         for step, block, sequence in late:
             if not self._real_time:
@@ -342,7 +346,7 @@ class RigServer:
         line.put(message, self._host_ns() + line.to_host.delay_ns() if self._real_time else 0)
 
     def _draw_latency(self) -> int:
-        """One way: never under 80 % of the median, with a tail."""
+        """The latency in one direction: never under 80 % of the median, with a tail."""
         return round(self._latency_ns * (0.8 + 0.29 * float(self._latency_rng.standard_exponential())))
 
     def _post(self, outbox: list[Outgoing]) -> None:
@@ -364,14 +368,14 @@ class RigServer:
         outbox.clear()
 
     def _tell_time(self, line: LineEnd, *, done: bool = False) -> None:
-        """Hand the clock down if it moved, or if a packet has been dealt with."""
+        """Send the host's time if it has changed, or if a packet has been handled."""
         if done or self._told.get(line.line) != self._now_ns:
             self._told[line.line] = self._now_ns
             taken = {name: end.taken for name, end in self._lines.items()}
             line.put(pb.VirtualTime(host_ns=self._now_ns, camera_bytes=taken["camera"], mirror_bytes=taken["mirror"]))
 
     def _catch_up(self, *, whole_reports: bool) -> None:
-        """Real time: let the plant run to now; with ``whole_reports``, only to the end of a report."""
+        """In real time, let the plant run to now; with ``whole_reports``, only to the end of a report."""
         now_step = (self._device_ns() - self._step_zero_ns) // self._step_ns
         while (step := self.devices.next_report_step()) <= now_step:
             self.devices.advance_to(step)

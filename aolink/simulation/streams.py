@@ -1,9 +1,9 @@
 """The device's ends of ports: pseudo terminals and TCP ports.
 
-A serial line is one wire to one host, and what is no packet on it is noise. A TCP port can be reached by every
-program of the machine, a web page in a browser among them, which may send bytes of its choice inside a request. So
-whoever connects must begin with an Identify packet, from the very first byte: no browser sends one in the place of
-"POST /". Nothing that comes before it is interpreted.
+A serial line is one wire to one host, and any bytes on it that are not a packet are noise. A TCP port can be reached by
+every program of the machine, a web page in a browser among them, which may send bytes of its choice inside a request.
+So a host that connects must begin with an Identify packet, from the very first byte: no browser sends one instead of
+"POST /". Bytes before it are not interpreted.
 """
 
 from __future__ import annotations
@@ -36,15 +36,15 @@ from aolink.wire.packet import (
 from aolink.wire.signing import Signing, refusal
 
 INTRODUCTION_S = 2.0
-"""Whoever connects and has not sent an Identify packet by then is dropped."""
+"""A connection without an Identify packet by this time is dropped, s."""
 IDLE_S = 10.0
-"""A host that has sent nothing for so long gives way to the next one that identifies itself."""
+"""A host that has sent nothing for this long gives way to the next one that identifies itself, s."""
 _MOST_GUESTS = 16
 """Connections that may be waiting to identify themselves; beyond that, the oldest is dropped."""
 VERSIONS = (PROTOCOL_VERSION, SIGNED_VERSION)
-"""Protocol versions of packets whose sender is told why they are refused."""
+"""Protocol versions of refused packets whose sender gets the reason."""
 _MOST_INTRODUCTION = 64
-"""Bytes of an encoded Identify packet, and more than it can have."""
+"""More bytes than an encoded Identify packet can have."""
 
 
 class Stream(Protocol):
@@ -52,7 +52,7 @@ class Stream(Protocol):
 
     name: str
     signing: Signing | None
-    """None where packets are not signed."""
+    """The signing of packets; None where they are not signed."""
 
     def fileno(self) -> int: ...
     def read(self) -> bytes: ...
@@ -103,18 +103,18 @@ class PtyStream:
 
 
 class _Peer:
-    """A TCP connection, and when something last came over it."""
+    """A TCP connection, and the time at which bytes last came over it."""
 
     def __init__(self, connection: socket.socket) -> None:
         self.connection = connection
         self.since_s = self.heard_s = time.monotonic()
         self.introduction = b""
-        """What has come before it has identified itself."""
+        """Bytes that have come before it has identified itself."""
         connection.setblocking(False)
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
     def receive(self) -> bytes | None:
-        """What has come; None once the connection is over."""
+        """The bytes that have come; None once the connection is over."""
         try:
             data = self.connection.recv(65_536)
         except BlockingIOError:
@@ -131,9 +131,9 @@ class TcpStream:
     """A TCP port that serves one host at a time; ``name`` is the address for pyserial.
 
     A connection that begins with anything but an Identify packet is closed at once, and one that has sent nothing is
-    closed after `introduction_s`; one whose Identify is not signed as it should be is told why, and may try again until
-    then. A host that has identified itself keeps the port until it leaves; once it has been silent for `idle_s`, the
-    next host that identifies itself takes its place.
+    closed after `introduction_s`; a host whose Identify is not signed correctly gets the reason, and may try again
+    until then. A host that has identified itself keeps the port until it leaves; once it has been silent for `idle_s`,
+    the next host that identifies itself takes its place.
     """
 
     def __init__(self, host: str, port: int, signing: Signing | None = None) -> None:
@@ -163,7 +163,7 @@ class TcpStream:
 
     def read(self) -> bytes:
         if (introduction := self._admit()) is not None:
-            # Whatever the host before had begun to send ends here.
+            # A packet that the previous host had begun to send ends here.
             return DELIMITER + introduction
         if self._peer is None:
             return b""
@@ -174,7 +174,7 @@ class TcpStream:
 
     def write(self, data: bytes) -> int:
         if self._peer is None:
-            return len(data)  # nobody there to read it
+            return len(data)  # there is no host to read it
         try:
             return self._peer.connection.send(data)
         except BlockingIOError:
@@ -225,9 +225,8 @@ class TcpStream:
 
 
 def begins_with_identify(data: bytes, signing: Signing | None = None) -> bool | str | None:
-    """Whether bytes begin with a whole Identify packet, or with a zero byte and one; None while it cannot be known.
-
-    Where it does, but is not signed as it should be, a text says why.
+    """Whether bytes begin with a whole Identify packet, or with a zero byte and one; None while this cannot be known.
+    Where they do, but the packet is not signed correctly, the result is a text with the reason.
     """
     piece, end, _ = data.removeprefix(DELIMITER).partition(DELIMITER)
     if not end:
@@ -245,7 +244,7 @@ def begins_with_identify(data: bytes, signing: Signing | None = None) -> bool | 
 
 
 def refusal_event(why: str) -> pb.Event:
-    """What a host is told whose Identify is not signed as it should be."""
+    """The message for a host whose Identify is not signed correctly."""
     return pb.Event(level=pb.Event.WARNING, text=f"this Identify {why}")
 
 
@@ -293,7 +292,7 @@ def open_streams(
 
 
 def _address(host: str, listen: str) -> str:
-    """The address of a host, looked up once: what was checked is what is listened on."""
+    """The address of a host, looked up once, so that the checked address is the one that is used."""
     try:
         found = socket.getaddrinfo(host.removeprefix("[").removesuffix("]"), None, type=socket.SOCK_STREAM)
     except OSError as error:

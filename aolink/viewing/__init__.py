@@ -1,4 +1,4 @@
-"""What a session looks like: Rerun files, their layout, and the viewer.
+"""Views of a session: Rerun files, their layout, and the viewer.
 
 Each topic has a function that turns a batch of plain data into Rerun entities on a given stream; `save_rrd`
 calls them with a whole recording, `LiveView` with one exposure after the other.
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from aolink.viewing.process import check_display, open_viewer, serve_web
     from aolink.viewing.save import save_rrd
     from aolink.viewing.viewer import screenshot
-else:  # the type checker would believe in any name
+else:  # the type checker would accept any name
     from aolink.names import at_first_use
 
     __getattr__ = at_first_use(

@@ -1,4 +1,4 @@
-"""Which views there are and where: one layout for every session, less what it has no data for."""
+"""The layout of the views: one for every session, without the views that it has no data for."""
 
 from __future__ import annotations
 
@@ -23,7 +23,8 @@ PATH_WINDOW = 2
 
 
 _LEGEND_ROW, _LEGEND_MOST = 0.1, 0.65
-"""Height of a legend's row in a plot of the bottom row over the plot's own, and the most that all of them get."""
+"""Height of a legend's row in a plot of the bottom row, and the most that all rows get, as shares of the plot's
+height."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,27 +33,27 @@ class Contents:
 
     rig: Rig
     estimators: list[str]
-    """In rank order; the last is the one whose band is shown first."""
+    """The estimators in rank order; the band of the last one is shown first."""
     measuring: list[str]
     """Estimators that have an innovation."""
     density_top: float
     """Top of the intensity profile's plot, one over slope units."""
     truth: bool
     scenes: list[str]
-    """Entities of the scene: as it came, restored, at rest; those that there are."""
+    """The entities that the scene has, of: as it came, restored, at rest."""
     restored_spots: bool = False
     topics: frozenset[str] = frozenset()
     """Topics of the devices that have messages."""
     drawn: Drawing
-    """What its lines were drawn on."""
+    """The drawing on which its lines were drawn."""
     maps: Mapping[str, float] = field(default_factory=dict)
-    """Maps over the lenslets, and where the colours of each end."""
+    """Maps over the lenslets, and the value at the end of each one's colours."""
     warnings: bool = False
-    """Whether anything went wrong."""
+    """Whether there are warnings."""
     alone: bool = False
-    """Whether it is one exposure that is looked into."""
+    """Whether one exposure is shown alone."""
     compared: Contents | None = None
-    """What is shown beside it."""
+    """The contents of the recording that is shown beside it."""
 
     @property
     def focus(self) -> str | None:
@@ -63,7 +64,7 @@ class Contents:
 def blueprint(contents: Contents) -> rrb.Blueprint:
     """The layout: the exposure on top, the session's estimates below it, the devices at the bottom.
 
-    For one exposure alone it shows why its blur looks as it does, beside its paths and its frame.
+    For one exposure alone it has the path that explains its blur, beside its paths and its frame.
     """
     layout: rrb.Container
     if contents.alone:
@@ -89,7 +90,7 @@ def blueprint(contents: Contents) -> rrb.Blueprint:
 
 
 def _camera(contents: Contents) -> rrb.Container | rrb.View:
-    """The frame and the page that the exposure is on; a tab for what is compared with it."""
+    """The frame and the page that the exposure is on; a tab for the recording that is compared."""
     sensor = contents.rig.sensor
     views: list[rrb.View] = []
     for each in (contents, contents.compared):
@@ -129,7 +130,7 @@ def _picture(paths: list[str], name: str, rows: int, columns: int) -> rrb.View:
 
 
 def _profile(contents: Contents) -> rrb.Container | rrb.View:
-    """Why the blur looks as it does: path, histogram and intensity over one axis, with the key of all colours."""
+    """The explanation of the blur: path, histogram and intensity over one axis, with the key of all colours."""
     views: list[rrb.View] = []
     for each in (contents, contents.compared):
         if each is None:
@@ -140,7 +141,7 @@ def _profile(contents: Contents) -> rrb.Container | rrb.View:
         views.append(
             rrb.Spatial2DView(
                 origin=f"{each.drawn.root}profile",
-                name=f"{title}; time at a place; intensity (1/slope unit) over slope",
+                name=f"{title}; time at a position; intensity (1/slope unit) over slope",
                 visual_bounds=rrb.VisualBounds2D(x_range=x_range, y_range=y_range),
             )
         )
@@ -148,7 +149,8 @@ def _profile(contents: Contents) -> rrb.Container | rrb.View:
 
 
 def _paths(contents: Contents) -> rrb.Container | rrb.View:
-    """A tab for each estimator with its band, the one to look at first in front, and one with all of them."""
+    """A tab for each estimator with its band, with the estimator of the highest rank in front, and a tab with all of
+    them."""
     truth = _path(contents, "truth") if contents.truth else []
     names = contents.estimators
     what = ", y fainter" if len(contents.drawn.chosen.labels) > 1 else ""
@@ -240,7 +242,7 @@ def _devices(contents: Contents) -> list[rrb.Container | rrb.View]:
         views.append(_lines(contents, "Mirror input (mirror's units)", _with_axes(shown), legend=True))
     if topics.CONTROL in contents.topics:
         loop = [
-            ("Loop: what is left (slope units)", ["control/slope_rms", "control/path_rms"]),
+            ("Loop: residual (slope units)", ["control/slope_rms", "control/path_rms"]),
             ("Loop: delay (ms)", ["control/delay"]),
             ("Loop: steps clipped (count)", ["control/clipped"]),
         ]
@@ -287,9 +289,8 @@ def _texts(contents: Contents) -> rrb.Container:
 def _lines(
     contents: Contents, name: str, shown: list[str], *, window: bool = False, legend: bool = False
 ) -> rrb.TimeSeriesView:  # fmt: skip
-    """A plot over time: of the whole session, or of `PATH_WINDOW` exposures about the time cursor.
-
-    A ``legend`` stands above the lines; where there is none the profile's key has the colours.
+    """A plot over time: of the whole session, or of `PATH_WINDOW` exposures about the time cursor. A ``legend`` stands
+    above the lines; without one, the profile's key has the colours.
     """
     axis_y = _room_above(contents, shown) if legend else None
     corner = rrb.PlotLegend(rrb.Corner2D.LeftTop, visible=legend)
@@ -313,7 +314,7 @@ def _lines(
 
 
 def _room_above(contents: Contents, shown: list[str]) -> rrb.ScalarAxis | None:
-    """An axis with room above the lines for a legend of them all; None where nothing is known of them yet."""
+    """An axis with room above the lines for a legend of them all; None where their extents are not known yet."""
     found = [(path, ends) for path, ends in contents.drawn.extents.items() if any(_names(each, path) for each in shown)]
     if not found:
         return None
@@ -324,7 +325,7 @@ def _room_above(contents: Contents, shown: list[str]) -> rrb.ScalarAxis | None:
 
 
 def _names(expression: str, path: str) -> bool:
-    """Whether an expression of a view is of a path."""
+    """Whether an expression of a view selects a path."""
     return path == expression or (expression.endswith("/**") and path.startswith(expression[:-2]))
 
 

@@ -1,4 +1,4 @@
-"""What the camera saw: frames, pages of exposures under each other, the intensity profile.
+"""Views of the camera's frames: the frames, pages of exposures under each other, the intensity profile.
 
 A page is one picture of neighbouring exposures: a row each, and time runs down inside a row too, so that a path is
 drawn as a line through the blur that it made.
@@ -33,26 +33,28 @@ Paths = Mapping[str, Mapping[int, FloatArray]]
 HISTORY = 32
 """Exposures on a page."""
 _PANELS = (0.20, 0.16, 0.32)
-"""Heights of the profile's panels over the width of all: path, how long the spot was where, intensity."""
+"""Heights of the profile's panels as shares of their width: path, histogram of the path, intensity."""
 _GAP = 0.03
-"""Between them."""
+"""Gap between the panels, in the same unit."""
 _KEY_ROW, _KEY_COLUMNS = 0.095, 5
-"""Height of a row of the key over the width, and names in it."""
+"""Height of a row of the key as a share of the width, and number of names in it."""
 _MOST = 1.0 + _GAP / _PANELS[2]
-"""Highest predicted intensity drawn, relative to the panel's top: what is higher would be in the panel above."""
+"""Highest predicted intensity drawn, relative to the panel's top: a higher one would reach into the panel above."""
 _LIGHT = 2.5
-"""Top of the histogram over that of the intensity, which is the histogram blurred."""
+"""Top of the histogram divided by that of the intensity, which is the histogram blurred."""
 _POINTS_IN_ROW = 21
-"""Points of a path inside one row of a page: more than can be told apart."""
+"""Points of a path inside one row of a page: more than the eye can separate."""
 _SWINGS_IN_ROW = 5
-"""A path over some pixels that a line through so many points would miss is drawn as its range: a row is not high."""
+"""A path over some pixels that a curve through this many points would miss is drawn as its range, because a row is not
+high."""
 _PIXELS = 6.0
 """Pixels that a path has to move by to be drawn as its range."""
 _POINTS_OF_SPOT = 51
 """Points of a spot's path on the frame."""
 _ERF_AT = np.linspace(-5.0, 5.0, 1001)
 _ERF = np.array([math.erf(u) for u in _ERF_AT.tolist()])
-"""The error function; between these points lines are wrong by 1e-5. To load SciPy's takes a third of a second."""
+"""The error function; linear interpolation between these points is wrong by 1e-5. Loading SciPy's takes a third of a
+second."""
 _BRIGHTEST = 190
 """Grey of the brightest pixel: short of white, so that the paths stand out."""
 
@@ -75,7 +77,7 @@ def centroid(sensor: Sensor, profile: FloatArray) -> float:
 def density_top(sensor: Sensor, exposures: Sequence[Exposure]) -> float:
     """Density at the top of the profile's plot: the brightest pixel of all but the most extreme exposures.
 
-    Where all exposures are dark, the peak of a resting spot: the plot has the scale that it has with light.
+    Where all exposures are dark, it is the peak of a resting spot, so that the plot has the same scale as with light.
     """
     brightest = [np.nanmax(density(sensor, e)) for e in exposures if e.mask.any()]
     top = float(np.percentile(brightest, 98)) if brightest else 0.0
@@ -126,7 +128,7 @@ def log_spot_paths(
 
 
 def page_of(exposure: Exposure, first_frame: int) -> int:
-    """Number of the page that an exposure is on, of a session that began with a frame."""
+    """Number of the page that an exposure is on, in a session that began with the given frame."""
     return (exposure.frame_id - first_frame) // HISTORY
 
 
@@ -143,9 +145,9 @@ def log_page(
     top:
         Density that is drawn brightest.
     until:
-        The frame that came after them: those on the page before it that are not here were lost.
+        The frame that came after them: frames on the page before it that are not among the exposures were lost.
     at:
-        At the start of which exposure it appears; by default of the first.
+        The exposure at whose start the page appears; by default the first.
     """
     n, first = sensor.pixels, timebase.frame_id
     origin = first + HISTORY * page_of(exposures[0], first)
@@ -189,7 +191,7 @@ def log_page(
 
 
 def log_now(drawing: Drawing, sensor: Sensor, timebase: Timebase, exposures: Sequence[Exposure]) -> None:
-    """A frame about each exposure's row of its page: ``/camera/history/now``."""
+    """A border about each exposure's row of its page: ``/camera/history/now``."""
     corners = np.array([(0, 0), (sensor.pixels, 0), (sensor.pixels, 1), (0, 1), (0, 0)], dtype=np.float32)
     rows = [(e.frame_id - timebase.frame_id) % HISTORY for e in exposures]
     strips = [[corners + np.array((0, row), dtype=np.float32)] for row in rows]
@@ -199,7 +201,7 @@ def log_now(drawing: Drawing, sensor: Sensor, timebase: Timebase, exposures: Seq
 def log_profile_axes(drawing: Drawing, sensor: Sensor, top: float, names: Sequence[str]) -> None:
     """Grids, numbers and the key of the profile's plot, which Rerun has no view for: ``/profile/axes``.
 
-    The key has the colour of each of ``names`` and of what was measured; they are the same in all views.
+    The key has the colour of each of ``names`` and of the measured profile; they are the same in all views.
     """
     low, high = sensor.field
     place = Panels(sensor, top)
@@ -241,7 +243,7 @@ def log_path_profile(
     drawing: Drawing, sensor: Sensor, timebase: Timebase, exposures: Sequence[Exposure], name: str,
     by_frame: Mapping[int, FloatArray], top: float, light: float = 1.0,
 ) -> None:  # fmt: skip
-    """Why the blur looks as it does: a path, how long the spot was where, and what the kernel makes of that.
+    """The explanation of the blur: a path, its histogram, and the intensity that the kernel makes of it.
 
     ``/profile/path/NAME`` (time runs upwards), ``/profile/histogram/NAME`` and ``/profile/predicted/NAME``, both as
     densities over the same slopes. ``light`` is the spot's share of its light.
@@ -264,7 +266,7 @@ def log_path_profile(
 
 
 def profile_bounds(sensor: Sensor, top: float, names: int) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Range of the profile's plot with a key of so many names in its drawing units: x, and y downwards."""
+    """Range of the profile's plot with a key of a number of names, in its drawing units: x, and y downwards."""
     (low, high), place = sensor.field, Panels(sensor, top)
     bottom = place.intensity(np.array([(low, -place.depth / top - 0.15)]))[0, 1]
     return (low - 0.1 * (high - low), high + 0.05 * (high - low)), (
@@ -276,7 +278,7 @@ def profile_bounds(sensor: Sensor, top: float, names: int) -> tuple[tuple[float,
 class Panels:
     """Where the three panels of the profile's plot lie in its drawing units: slope to the right, y downwards.
 
-    The path is above, then its histogram, and the intensity's zero is at y = 0.
+    The path is on top, then its histogram, and the intensity's zero is at y = 0.
 
     Each panel takes points (slope, height from 0 to 1), (n, 2).
     """
@@ -285,18 +287,18 @@ class Panels:
         self._low, high = sensor.field
         self._width = high - self._low
         self.depth = max(0.08 * top, 2.5 * pixel_noise_sd(sensor))
-        """How far the noise reaches below zero, in density: what is written under the plot goes there."""
+        """How far the noise reaches below zero, in density; labels under the plot stand below that."""
 
     def path(self, points: FloatArray) -> NDArray[np.float32]:
-        """Upwards: time in the exposure."""
+        """Points of the path; time in the exposure runs upwards."""
         return self._panel(points, 0)
 
     def histogram(self, points: FloatArray) -> NDArray[np.float32]:
-        """Upwards: how long the spot was where."""
+        """Points of the histogram; time at each position runs upwards."""
         return self._panel(points, 1)
 
     def intensity(self, points: FloatArray) -> NDArray[np.float32]:
-        """Upwards: intensity density."""
+        """Points of the intensity; its density runs upwards."""
         return self._panel(points, 2)
 
     def key(self, number: int) -> NDArray[np.float32]:
@@ -316,13 +318,13 @@ class Panels:
 
 
 def _predicted(sensor: Sensor, edges: FloatArray, path: FloatArray) -> FloatArray:
-    """Density in each pixel after an exposure, as `exposure_density` has it, near enough to be drawn."""
+    """Density in each pixel after an exposure, as by `exposure_density`, accurate enough for a drawing."""
     u = (edges - path[:, None]) / math.sqrt(2 * sensor.kernel.variance)
     return np.asarray(np.diff(np.interp(u, _ERF_AT, _ERF).mean(axis=0)) / (2 * sensor.pixel_width))
 
 
 def _histogram(sensor: Sensor, path: FloatArray, top: float) -> FloatArray:
-    """How long a path was where as stairs of half a pixel, (n, 2): slope, density over ``top``."""
+    """Histogram of a path as stairs of half a pixel, (n, 2): slope, density divided by ``top``."""
     half = 0.5 * sensor.pixel_width
     last = 2 * sensor.pixels - 1
     bins = np.clip(((path - sensor.field[0]) / half).astype(int), 0, last)
@@ -344,7 +346,7 @@ def _ticks(low: float, high: float) -> list[float]:
 
 @lru_cache(maxsize=8)
 def _drawn(n_steps: int, most: int) -> NDArray[np.int64]:
-    """Which steps of a path are drawn, at most so many."""
+    """The steps of a path that are drawn, at most a given number."""
     return np.unique(np.linspace(0, n_steps - 1, min(most, n_steps)).astype(np.int64))
 
 

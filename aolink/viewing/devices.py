@@ -1,4 +1,4 @@
-"""Series of devices and link: commands, latency, drops, clock, log."""
+"""Series of devices and links: commands, latency, drops, clock, log."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ LINK_COUNTS = ("bad_crc", "bad_framing", "bad_payload", "sequence_gaps", "duplic
 """Fields of LinkStatistics that count faults."""
 
 _MOST_INPUTS = 2
-"""Most inputs that are lines of their own; where there are more, the first ones are, and percentiles of all."""
+"""Most inputs with lines of their own; where there are more, the first ones have them, and percentiles show all."""
 _LEVELS = dict(enumerate(("TRACE", "DEBUG", "INFO", "WARN", "ERROR", "CRITICAL")))
 """Rerun's levels by the number of foxglove's."""
 
@@ -42,8 +42,9 @@ def log_commands(drawing: Drawing, timebase: Timebase, records: Sequence[Timed])
 
 
 def log_applied(drawing: Drawing, timebase: Timebase, records: Sequence[Timed]) -> None:
-    """What the mirror held (Applied), at every fast step: ``/mirror/applied``; and why: ``/status/mirror``."""
-    # A report that was asked for again came out of order; what was never reported shows only in the status.
+    """Inputs that the mirror held (Applied), at every fast step: ``/mirror/applied``; and their source:
+    ``/status/mirror``."""
+    # A report that was requested again came out of order; steps that were never reported show only in the status.
     blocks = sorted((r.message for r in records if r.message.source != Applied.AWAITED), key=lambda b: b.first_step)
     if not blocks:
         return
@@ -70,7 +71,7 @@ def log_latency(drawing: Drawing, timebase: Timebase, records: Sequence[Timed]) 
 
 
 def log_estimation(drawing: Drawing, timebase: Timebase, records: Sequence[Timed]) -> None:
-    """How long an estimator took for each estimate, ms: ``/latency/estimation/NAME``."""
+    """Time that an estimator took for each estimate, ms: ``/latency/estimation/NAME``."""
     name, made = records[0].message.estimator, [r.message for r in records if not r.message.skipped]
     if made:
         times = timebase.at_frames([m.frame_id for m in made])
@@ -91,7 +92,7 @@ def log_drops(drawing: Drawing, timebase: Timebase, records: Sequence[Timed]) ->
 def log_link(drawing: Drawing, timebase: Timebase, records: Sequence[Timed]) -> None:
     """Health of each device's link: faults by cause, command round trip and traffic.
 
-    ``/link/faults/DEVICE`` and, of causes that there were, ``/link/faults/DEVICE/CAUSE`` (since the start),
+    ``/link/faults/DEVICE`` and, for causes that occurred, ``/link/faults/DEVICE/CAUSE`` (since the start),
     ``/link/round_trip/DEVICE`` (ms), ``/link/received/DEVICE`` (kB/s).
     """
     for d, (device, samples) in enumerate(_by_device(records).items()):
@@ -146,11 +147,9 @@ def log_log(drawing: Drawing, timebase: Timebase, records: Sequence[Timed]) -> N
 
 
 def log_control(drawing: Drawing, timebase: Timebase, records: Sequence[Timed]) -> None:
-    """What a controller has made of each exposure.
-
-    ``/control/slope_rms`` of the centroids and ``/control/path_rms`` inside the exposures (slope units),
-    ``/control/delay`` from the end of the exposure to the first step that it has changed (ms),
-    ``/control/clipped`` (fast steps), ``/status/loop``.
+    """The results of a controller for each exposure: ``/control/slope_rms`` of the centroids and ``/control/path_rms``
+    inside the exposures (slope units), ``/control/delay`` from the end of the exposure to the first step that it has
+    changed (ms), ``/control/clipped`` (fast steps), ``/status/loop``.
     """
     changes = [r.message for r in records]
     times = timebase.at_frames([m.frame_id for m in changes])

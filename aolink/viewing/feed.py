@@ -1,6 +1,5 @@
-"""A viewer that a recording feeds while it is read.
-
-Rerun takes most of a second to load, and its viewer as long to start: the viewer is started first.
+"""A viewer that a recording feeds while it is read. Rerun takes most of a second to load, and its viewer as long to
+start, so the viewer is started first.
 """
 
 from __future__ import annotations
@@ -20,14 +19,13 @@ if TYPE_CHECKING:
     from aolink.recording.reader import Recording
 
 _FLUSH_S = 60.0
-"""For what the viewer has not taken yet at the end."""
+"""Longest wait at the end until the viewer has taken all data, s."""
 
 
 @contextmanager
 def fed(server: Server, recording_id: str | None = None) -> Iterator[rr.RecordingStream]:
-    """A stream into a viewer, which stays after the block until it is closed.
-
-    Raises `ViewerError` where the viewer takes nothing any more.
+    """A stream into a viewer, which stays open after the block until it is closed. Raises `ViewerError` where the
+    viewer takes no more data.
     """
     import rerun as rr  # while the viewer starts
 
@@ -36,7 +34,7 @@ def fed(server: Server, recording_id: str | None = None) -> Iterator[rr.Recordin
     stream.connect_grpc(server.data_address)
     try:
         yield stream
-        # Without a bound for it, a viewer that takes nothing would be waited for without end, and no signal heard.
+        # Without a bound, a viewer that takes nothing would block this for ever, and no signal would be handled.
         flushing = threading.Thread(target=stream.flush, daemon=True)
         flushing.start()
         flushing.join(_FLUSH_S)
@@ -54,9 +52,9 @@ def show(recording: Recording, look: Look | None = None, *, progress: Callable[[
     Parameters
     ----------
     look:
-        A part of it, another spot, or another recording beside it; by default all of it alone.
+        A part of it, another spot, or another recording beside it; by default the whole recording alone.
     progress:
-        Is told how many exposures have been sent.
+        Called with the number of exposures that have been sent.
 
     Raises
     ------
@@ -71,7 +69,7 @@ def serve(
     recording: Recording, look: Look | None = None, *, port: int | None = None,
     on_ready: Callable[[str], None] | None = None, progress: Callable[[int], None] | None = None,
 ) -> None:  # fmt: skip
-    """Serve a recording with the web viewer on this machine's loopback until interrupted, from when it is being read.
+    """Serve a recording with the web viewer on this machine's loopback until interrupted, already while it is read.
 
     Parameters are those of `show` and of `serve_web`. Raises `ViewerError`.
     """

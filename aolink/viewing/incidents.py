@@ -1,4 +1,4 @@
-"""When the camera exposed, what became of each exposure, and what went wrong: lanes of states, and warnings."""
+"""Lanes of states, and warnings: when the camera exposed, how each exposure was used, and what went wrong."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _REFUSED = {
     Status.REINITIALISED: "begun anew",
     Status.INPUT_INVALID: "not usable",
 }
-"""What is said of an estimate that is not as it should be."""
+"""Words for an estimate whose exposure was not used normally."""
 
 
 def log_exposures(
@@ -51,12 +51,12 @@ def log_status(
     drawing: Drawing, timebase: Timebase, name: str, exposures: Sequence[Exposure],
     estimates: Mapping[int, Estimate], skipped: Collection[int] = (),
 ) -> None:  # fmt: skip
-    """What became of each exposure in an estimator: ``/status/NAME``.
+    """The status of each exposure in an estimator: ``/status/NAME``.
 
     Parameters
     ----------
     estimates:
-        By frame id.
+        Estimates by frame id.
     skipped:
         Frames that it had no time for in the session.
     """
@@ -73,10 +73,9 @@ def log_warnings(
     estimates: Mapping[str, Mapping[int, Estimate]], skipped: Mapping[str, Collection[int]],
     before: Exposure | None = None,
 ) -> int:  # fmt: skip
-    """What went wrong, in words, on the timelines: ``/warnings``; gives how many there are.
-
-    Frames lost or incomplete, inputs that the mirror did not report, exposures that an estimator gated, could not use
-    or had no time for, and those in which it diverged or began anew.
+    """Warnings in words, on the timelines: ``/warnings``; gives how many there are. They are about frames lost or
+    incomplete, inputs that the mirror did not report, exposures that an estimator gated, could not use or had no time
+    for, and those in which it diverged or began anew.
     """
     said: list[tuple[Exposure, str]] = []
     for last, e in zip([before, *exposures], exposures, strict=False):

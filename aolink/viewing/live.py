@@ -28,7 +28,7 @@ from aolink.viewing.timebase import Timebase
 class LiveView:
     """Sends exposures with their estimates to a viewer, one after the other.
 
-    An estimate may come with a later exposure than its own, where it took long.
+    An estimate that took long may come with a later exposure than its own.
     """
 
     def __init__(
@@ -41,12 +41,12 @@ class LiveView:
         self._drawing = Drawing(stream=stream, chosen=Chosen.of(rig))
         self._rig, self._names = rig, by_rank(list(estimators))
         self._exposures: list[Exposure] = []
-        """The last ones, as many as a page has."""
+        """The last exposures, as many as a page has."""
         self._estimates: dict[str, list[Estimate]] = {name: [] for name in self._names}
         self._timebase: Timebase | None = None
         self._top: float | None = None
         self._scenes: list[str] = []
-        """What is shown of the scene."""
+        """The entities that are shown of the scene."""
         self._measuring: set[str] = set()
         """Estimators that have an innovation."""
         self._true_scene = true_scene
@@ -83,7 +83,8 @@ class LiveView:
             self._lay_out(exposure)
 
     def _show_scene(self, exposure: Exposure, estimates: Sequence[Estimate]) -> list[str]:
-        """The scene as it came and restored with the last estimator's path; gives all that was shown of it by now."""
+        """Show the scene as it came, and restored with the last estimator's path; gives all entities of it that were
+        shown so far."""
         sensor, timebase = self._rig.scene, self._timebase
         shown = set(self._scenes)
         if sensor is None or timebase is None or exposure.scene is None:
@@ -118,7 +119,7 @@ class LiveView:
 def live_viewer(
     rig: Rig, estimators: Sequence[str], true_scene: NDArray[np.uint16] | None = None
 ) -> Iterator[LiveView]:
-    """Open the native viewer and give what feeds it; the viewer stays until its window is closed.
+    """Open the native viewer and give a `LiveView` that feeds it; the viewer stays open until its window is closed.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""What of a recording is looked at, and by what name Rerun knows it."""
+"""The part of a recording that is shown, and the name by which Rerun knows it."""
 
 from __future__ import annotations
 
@@ -14,18 +14,19 @@ APPLICATION = "aolink"
 
 @dataclass(frozen=True, kw_only=True)
 class Look:
-    """What of a recording is shown, and how closely."""
+    """The part of a recording that is shown, and in how much detail."""
 
     exposures: range | None = None
-    """Numbers of the exposures, counted from 0; None for all. Of a few, paths are shown at every fast step."""
+    """Numbers of the exposures, counted from 0; None for all. For a few exposures, paths are shown at every fast
+    step."""
     spot: int = 0
-    """Which of many spots has its lines, its profile and its pages."""
+    """Number of the spot whose lines, profile and pages are shown."""
     compared: Recording | None = None
-    """A recording that is shown beside it, from its own first exposure on."""
+    """Another recording that is shown beside it, from its own first exposure on."""
 
 
 def identity(recording: Recording, look: Look) -> str:
-    """What Rerun knows a recording by, and this look at it."""
+    """The name by which Rerun knows a recording with this `Look`."""
     if look == Look():
         return recording.digest
     exposures, spot, other = look.exposures, look.spot, look.compared

@@ -21,7 +21,7 @@ from aolink.viewing.series import Drawing, Style, send_axes, send_line
 from aolink.viewing.timebase import Timebase
 
 MOST_STATES = 8
-"""Most states that are drawn: of a plant with more it is the first ones, and all of them are in the recording."""
+"""Most states that are drawn: a plant with more has its first ones drawn, and all of them are in the recording."""
 
 
 def log_truth(drawing: Drawing, timebase: Timebase, exposures: Sequence[Exposure]) -> None:
@@ -47,9 +47,9 @@ def log_estimates(drawing: Drawing, timebase: Timebase, estimates: Sequence[Esti
     """One estimator's path with its band, states with theirs, NIS with its bounds, and status.
 
     ``/path/NAME/mean`` and ``/band`` (lines `BAND` standard deviations up and down, of the chosen outputs), or
-    ``/path/NAME/range`` of a path that swings too often for a line, with ``/band`` outside of it;
-    ``/state/start/xI/NAME/mean`` and ``/band``, ``/state/end/...`` alike, ``/nis/NAME``; and ``/estimate/NAME``, which
-    is not drawn: columns for whoever reads the file as a table.
+    ``/path/NAME/range`` for a path that swings too often for a line, with ``/band`` outside of it;
+    ``/state/start/xI/NAME/mean`` and ``/band``, likewise ``/state/end/...``, ``/nis/NAME``; and ``/estimate/NAME``,
+    which is not drawn: columns for programs that read the file as a table.
     """
     if not estimates:
         return
@@ -129,7 +129,7 @@ def _log_nis(drawing: Drawing, timebase: Timebase, estimates: Sequence[Estimate]
     values = np.array([e.nis for e in measured])
     _send_state(drawing, f"nis/{name}/value", times, values, line)
     bounds = np.array([nis_bounds(e.innovation.shape[1]) for e in measured])
-    # What stays the same is a line between its ends.
+    # A constant is a line between its ends.
     kept = [0, *range(len(bounds) - 1, 0, -1)[:1]] if (bounds == bounds[0]).all() else list(range(len(bounds)))
     ends = timebase.at_steps([measured[k].first_step for k in kept], [measured[k].frame_id for k in kept])
     label = f"{name}, {NIS_COVERAGE:.0%} bounds"
@@ -144,10 +144,10 @@ def _send_path(
     drawing: Drawing, path: str, timebase: Timebase, paths: Sequence[tuple[int, FloatArray]], style: Style,
     reach: Sequence[FloatArray] = (), band: Style | None = None,
 ) -> None:  # fmt: skip
-    """Paths (first step, (n_outputs, n_steps)) end to end; where one does not follow at once, the line is broken.
+    """Send paths (first step, (n_outputs, n_steps)) end to end; where one does not follow at once, the line is broken.
 
     With a ``band`` the path is at ``path``/mean, and lines at ``reach`` from it, (outputs chosen, n_steps), at
-    ``path``/band. Of a path that swings more than its points would show, ``path``/range has what it is between.
+    ``path``/band. For a path that swings more than its points would show, ``path``/range has its range.
     """
     chosen, points = drawing.chosen, drawing.points
     outputs = list(chosen.outputs)
@@ -183,7 +183,8 @@ def _send_path(
 def _line(
     every: FloatArray, half: FloatArray, outputs: list[int], points: int
 ) -> tuple[NDArray[np.int64], FloatArray, FloatArray]:  # fmt: skip
-    """Some steps of a path, evenly spread: which, its values, and what is above and below of the outputs."""
+    """Some steps of a path, evenly spread: their numbers, the values, and the lines above and below them for each
+    output."""
     steps = every.shape[1]
     kept = np.arange(steps) if steps <= points else np.linspace(0, steps - 1, points).astype(np.int64)
     ends = [(every[outputs] + sign * half)[:, kept].T for sign in (1, -1)]
@@ -193,7 +194,7 @@ def _line(
 def _range(
     every: FloatArray, half: FloatArray, outputs: list[int], points: int
 ) -> tuple[NDArray[np.int64], FloatArray, FloatArray]:  # fmt: skip
-    """What a path is between in each part of it: the parts' middles, the outputs' extremes, and those of the band."""
+    """The range of a path in each part of it: the parts' middles, the outputs' extremes, and those of the band."""
     parts = max(1, points // 2)
     middles = np.array([part[len(part) // 2] for part in np.array_split(np.arange(every.shape[1]), parts)])
     chosen = every[outputs]
@@ -205,12 +206,12 @@ def _range(
 
 
 def _about(middle: FloatArray, reach: FloatArray) -> FloatArray:
-    """Above and below each column of (rows, n), (rows, 2 n)."""
+    """The values above and below each column of (rows, n), as (rows, 2 n)."""
     return np.asarray(np.stack([middle + reach, middle - reach], axis=-1).reshape(len(middle), -1))
 
 
 def _send_state(drawing: Drawing, path: str, times: Sequence[rr.TimeColumn], values: FloatArray, style: Style) -> None:
-    """A component of the states, (rows, axes)."""
+    """Send a component of the states, (rows, axes)."""
     chosen = drawing.chosen
     labels = chosen.labels if len(chosen.axes) == len(chosen.labels) else ("",)
     send_axes(drawing, path, times, values, style, chosen.axes, labels)

@@ -9,9 +9,9 @@ MEASURED: Colour = (165, 165, 165)
 COMMANDED: Colour = (150, 150, 255)
 APPLIED: Colour = (40, 200, 180)
 MISSING: Colour = (90, 20, 40)
-"""A pixel or a frame that never came."""
+"""Colour of a pixel or a frame that never came."""
 NOTHING: Colour = (13, 13, 13)
-"""Where there was no exposure yet: the viewer's own background."""
+"""Colour of places without an exposure yet: the viewer's own background."""
 
 _SERIES: tuple[Colour, ...] = (
     (86, 180, 233),
@@ -44,7 +44,8 @@ STATUS_COLOURS: dict[str, Colour] = {
     "READOUT": (25, 25, 25),
     "LOST": (190, 50, 50),
 }
-"""Colours of an estimate's status, of what drove the mirror, of the loop, and of what the camera did."""
+"""Colours of an estimate's status, of the source of the mirror's inputs, of the loop's state, and of the camera's
+state."""
 
 
 def series_colour(index: int) -> Colour:

@@ -28,17 +28,17 @@ from aolink.viewing.vulkan import has_vulkan
 
 HOST = "127.0.0.1"
 WEB_PORT = 9090
-"""Port of the web viewer's page, where nothing else uses it."""
+"""Port of the web viewer's page, if no other program uses it."""
 POLL_S = 0.05
 
 _START_S = 30.0
 """How long a viewer may take to answer; a software renderer on a busy machine needs a few seconds."""
 _STOP_S = 5.0
-"""How long it may take to end by itself."""
+"""How long a viewer may take to end by itself, s."""
 _LAST_WORDS_S = 2.0
 """How long a viewer that has failed may take to end."""
 _MAGIC = b"RRF"
-"""What every Rerun file begins with; the version of the format follows."""
+"""The first bytes of every Rerun file; the version of the format follows."""
 
 _NO_DRIVER = (
     "this machine has no Vulkan driver, which the Rerun viewer needs to draw;"
@@ -87,14 +87,14 @@ def serve_web(
 
 @dataclass(frozen=True)
 class Server:
-    """Rerun's program as it listens for data, and shows it."""
+    """Rerun's program, which listens for data and shows it."""
 
     process: subprocess.Popen[bytes]
     said: IO[bytes]
     data_port: int
-    """Where data comes in and, for a web page, goes out."""
+    """The port at which data comes in and, for a web page, goes out."""
     page_port: int | None = None
-    """Where the web page is."""
+    """The port of the web page."""
 
     @property
     def data_address(self) -> str:
@@ -106,22 +106,21 @@ class Server:
         return f"http://{HOST}:{self.page_port}/?url={quote(self.data_address, safe='')}"
 
     def listen(self) -> None:
-        """Until it listens, which it does not yet when it has been started. Raises `ViewerError` if it never does."""
+        """Wait until it listens, which takes some time after its start. Raises `ViewerError` if it never does."""
         for port in (self.page_port, self.data_port):
             if port is not None:
                 wait_for_server(port, self.process, self.said)
 
     def wait(self) -> None:
-        """Until it ends. Raises `ViewerError` where nobody has ended it."""
+        """Wait until it ends. Raises `ViewerError` if it ends by itself."""
         if self.process.wait() != 0:
             raise why_it_ended(self.said)
 
 
 @contextmanager
 def serving(files: Sequence[str] = (), port: int | None = None) -> Iterator[Server]:
-    """The web viewer's page on this machine's loopback, which shows files, or what comes to its data's address.
-
-    Raises `ViewerError` where the port that is asked for is in use.
+    """The web viewer's page on this machine's loopback, which shows files, or the data that comes to its data port.
+    Raises `ViewerError` where the requested port is in use.
     """
     if port is None:
         port = WEB_PORT if is_free(WEB_PORT) else free_port()
@@ -143,7 +142,7 @@ def window() -> Iterator[Server]:
 
 
 def free_port() -> int:
-    """A port on which nobody listens."""
+    """A port on which no program listens."""
     with socket.socket() as probe:
         probe.bind((HOST, 0))
         return int(probe.getsockname()[1])
@@ -151,7 +150,7 @@ def free_port() -> int:
 
 @contextmanager
 def running_rerun(options: Sequence[str], said: IO[bytes]) -> Iterator[subprocess.Popen[bytes]]:
-    """Rerun's program, ended with the block."""
+    """Rerun's program, which ends with the block."""
     # It leaves its own temporary files behind when it is ended.
     with tempfile.TemporaryDirectory(prefix="aolink-", ignore_cleanup_errors=True) as temporary:
         process = subprocess.Popen(
@@ -160,7 +159,7 @@ def running_rerun(options: Sequence[str], said: IO[bytes]) -> Iterator[subproces
             stdout=said,
             stderr=said,
             env={**os.environ, "NO_COLOR": "1", "TMPDIR": temporary},
-            start_new_session=True,  # Ctrl-C comes to us alone, and we end it
+            start_new_session=True,  # Ctrl-C comes to this process alone, which ends Rerun's
             preexec_fn=_end_with_parent,
         )
         try:
@@ -175,7 +174,7 @@ def running_rerun(options: Sequence[str], said: IO[bytes]) -> Iterator[subproces
 
 
 def _program() -> Path:
-    """The program itself: the `rerun` command is a wrapper whose child outlives it."""
+    """The path of the program itself: the `rerun` command is a wrapper whose child outlives it."""
     folder = Path(rerun_cli.__file__).parent
     for name in ("rerun", "Rerun.app/Contents/MacOS/Rerun"):
         if (folder / name).is_file():
@@ -188,7 +187,7 @@ _PR_SET_PDEATHSIG = 1
 
 
 def _end_with_parent() -> None:
-    """In the child: end when the parent does, however that comes about. Linux only."""
+    """Make the child process, in which this runs, end with its parent, however that ends. It works on Linux only."""
     if _LIBC is not None:
         _LIBC.prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
 
@@ -229,7 +228,7 @@ def existing(path: str | Path) -> Path:
 
 
 def ended(process: subprocess.Popen[bytes]) -> bool:
-    """Whether a viewer has ended, or does so now: one that fails writes where it failed before it ends."""
+    """Whether a viewer has ended, or ends soon: one that fails writes its error before it ends."""
     try:
         process.wait(_LAST_WORDS_S)
     except subprocess.TimeoutExpired:
@@ -238,7 +237,7 @@ def ended(process: subprocess.Popen[bytes]) -> bool:
 
 
 def why_it_ended(said: IO[bytes]) -> ViewerError:
-    """Why a viewer ended that nobody stopped: the machine's lack of a driver, or else Rerun's own first words."""
+    """The reason why a viewer ended by itself: a driver that the machine lacks, or else Rerun's own first error."""
     if sys.platform == "linux" and not has_vulkan():
         return RendererError(_NO_DRIVER)
     said.seek(0)

@@ -16,11 +16,11 @@ from aolink.viewing.series import Drawing
 from aolink.viewing.timebase import Timebase
 
 _COLOURS = {"viridis": "Viridis", "magma": "Magma", "RdBu_r": "Spectral"}
-"""Rerun's colour maps that come nearest to those of `MAPS`."""
+"""Rerun's colour maps that are nearest to those of `MAPS`."""
 _SHARE = 98
 """Percentile of the values in the first exposures that is the end of the colours."""
 _FIRST = 64
-"""Exposures that the colours are found from."""
+"""Exposures from which the range of the colours is found."""
 
 
 def log_maps(
@@ -34,7 +34,8 @@ def log_maps(
     estimates:
         By frame id.
     scales:
-        Where the colours end, by the map's name; a map that is not in it yet gets its own from these exposures.
+        Value at the end of the colours, by the map's name; a map that is not in it yet gets its value from these
+        exposures.
     """
     sensor, (rows, columns) = rig.sensor, rig.sensor.grid
     seen: dict[str, list[tuple[Exposure, NDArray[np.float32]]]] = {}

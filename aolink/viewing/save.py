@@ -33,14 +33,15 @@ if TYPE_CHECKING:
     from aolink.restoration import RestoredPictures
 
 COMPARED = "compared/"
-"""Begins the names of what is beside the recording."""
+"""Prefix of the entities of the recording that is compared."""
 
 _PAGES = 16
-"""Pages of exposures in a part of a recording, which is in memory as a whole; the first has one, to be there soon."""
+"""Pages of exposures in a part of a recording, which is in memory as a whole; the first part has one page, so that it
+is there soon."""
 _BYTES_IN_PART = 100e6
-"""Bytes that a part's frames, and as many numbers of each estimator's paths, may take."""
+"""The most bytes that a part's frames, or each estimator's paths, may take."""
 _BESIDE_NS = 1_000_000_000
-"""How long before and after its exposures a part's messages may have come."""
+"""How long before and after its exposures a part's messages may have come, ns."""
 
 
 def save_rrd(
@@ -58,11 +59,11 @@ def save_rrd(
     path:
         The file to write; it appears only when it is whole.
     look:
-        A part of it, another spot, or another recording beside it; by default all of it alone.
+        A part of it, another spot, or another recording beside it; by default the whole recording alone.
     overwrite:
         Whether a file of that name may be replaced.
     progress:
-        Is told how many exposures are written.
+        Called with the number of exposures written.
 
     Raises
     ------
@@ -81,9 +82,8 @@ def save_rrd(
 def sent_parts(
     stream: rr.RecordingStream, recording: Recording, look: Look, *, at_once: bool = False
 ) -> Iterator[int]:  # fmt: skip
-    """Send a recording to a stream part by part, at the end its layout; gives how many exposures have been sent.
-
-    With ``at_once`` a layout comes after the first part too, for a viewer that shows what there is by then.
+    """Send a recording to a stream part by part, and its layout at the end; gives how many exposures have been sent.
+    With ``at_once`` a layout comes after the first part too, for a viewer that shows the data so far.
 
     Raises
     ------
@@ -115,7 +115,7 @@ def sent_parts(
 
 
 class Sender:
-    """Sends a recording to a stream, part by part: what is in memory does not grow with its length."""
+    """Sends a recording to a stream, part by part, so that the memory does not grow with its length."""
 
     def __init__(self, stream: rr.RecordingStream, recording: Recording, look: Look, root: str = "") -> None:
         check_stands_alone(recording)
@@ -131,7 +131,7 @@ class Sender:
         self._measuring: set[str] = set()
         self._shown = [topic for topic in recording.counts if topics.named(topic).shown_by]
         self._known: set[str] = set()
-        """Entities and kinds of data that there are."""
+        """Entities and kinds of data that have been sent."""
         self._scales: dict[str, float] = {}
         self._timebase: Timebase | None = None
         self._top: float | None = None
@@ -142,7 +142,8 @@ class Sender:
         """Exposures that have been sent."""
 
     def parts(self) -> Iterator[int]:
-        """Send the exposures with what belongs to them, then the devices; gives after each part how many are sent."""
+        """Send the exposures with all that belongs to them, then the devices; gives after each part how many exposures
+        are sent."""
         recording = self._recording
         restored = iter(recording.restored())
         ahead = next(restored, None)
@@ -175,7 +176,7 @@ class Sender:
         self._finished = True
 
     def _read(self) -> Iterator[tuple[list[Exposure], dict[str, dict[int, Estimate]], Exposure | None]]:
-        """Parts: whole pages of exposures, their estimates by name and frame, and the exposure after them."""
+        """Read parts: whole pages of exposures, their estimates by name and frame, and the exposure after them."""
         rig = self._rig
         series = self._recording[self._numbers.start : self._numbers.stop] if self._look.exposures else self._recording
         steps = rig.timing.exposure_steps * rig.n_outputs * 8 * (1 + 2 * len(self._names))
@@ -247,7 +248,7 @@ class Sender:
         return first, first if len(self._numbers) == 1 else self._recording[self._numbers[-1]]
 
     def _messages(self, wanted: Sequence[str]) -> Iterator[RecordedMessage]:
-        """Messages of some topics: of a part of the recording those that belong to it."""
+        """Messages of some topics; for a part of the recording only those that belong to it."""
         recording = self._recording
         there = [topic for topic in wanted if recording.counts.get(topic)]
         if not there:
@@ -285,7 +286,7 @@ class Sender:
         self._known |= by_topic.keys()
 
     def contents(self, other: Sender | None = None) -> Contents:
-        """What has been sent, for the layout."""
+        """The contents that have been sent, for the layout."""
         return Contents(
             rig=self._rig,
             estimators=self._names,
@@ -303,7 +304,8 @@ class Sender:
         )
 
     def _summary(self) -> str:
-        """What a session was, what it has not, and, where the truth is known, who was right: a page of Markdown."""
+        """A page of Markdown about a session, with the data that it lacks and, where the truth is known, the
+        estimators' scores."""
         rig, recording, last = self._rig, self._recording, self._last
         assert last is not None
         assert self._timebase is not None
@@ -338,13 +340,13 @@ class Sender:
             other = self._look.compared.path.name
             lines += ["", f"Fainter lines are of {other}, from its own first exposure on."]
         if missing := self._missing():
-            lines += ["", "What it has not: " + "; ".join(missing) + "."]
+            lines += ["", "It lacks: " + "; ".join(missing) + "."]
         if recording.damage:
             lines += ["", f"Damaged: {recording.damage}"]
         return "\n".join([*lines, "", rig.summary])
 
     def _missing(self) -> list[str]:
-        """What other recordings have and this one has not, and what would make it."""
+        """The data that other recordings have and this one lacks, and how to make it."""
         known, found = self._known, []
         if not self._names:
             found.append(f"no estimates (`aolink estimate {self._recording.path.name}` makes them)")
@@ -362,7 +364,7 @@ def send_camera(
     estimates: Mapping[str, Mapping[int, Estimate]], names: Sequence[str], *, top: float | None = None,
     following: Exposure | None = None, live: bool = False,
 ) -> float:  # fmt: skip
-    """Send frames, pages and profiles of exposures; of a live session the last of them and its page.
+    """Send frames, pages and profiles of exposures; in a live session those of the last exposure and its page.
 
     Gives the density at the top of the profile's plot, found from the exposures if ``top`` is not given.
     """
@@ -374,7 +376,7 @@ def send_camera(
     if sensor.directions == 2:
         for name, by_frame in outputs.items():
             camera.log_spot_paths(drawing, sensor, timebase, new, name, by_frame)
-    # What follows is one slope over time.
+    # The following is about one slope over time.
     paths = {name: {k: path[output] for k, path in by_frame.items()} for name, by_frame in outputs.items()}
     line, seen = sensor.profile, camera.one_profile(sensor, exposures, output)
     if top is None:

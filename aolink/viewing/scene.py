@@ -1,4 +1,5 @@
-"""The picture sensor's scene as it came, without its blur, and at rest; and the spots' frames without theirs.
+"""Views of the picture sensor's scene as it came, without its blur, and at rest; and of the spots' frames without their
+blur.
 
 All scenes are drawn alike: black is dark, white an intensity of one.
 """
@@ -27,7 +28,7 @@ TRUE_SCENE = "scene/true"
 RESTORED_SCENE = "restored/image"
 RESTORED_SPOTS = "restored/spot"
 SCENES = (SCENE, RESTORED_SCENE, TRUE_SCENE)
-"""What is shown of the scene, in this order."""
+"""The entities of the scene, in this order."""
 
 
 def log_scenes(drawing: Drawing, sensor: SceneSensor, timebase: Timebase, exposures: Sequence[Exposure]) -> bool:
@@ -76,7 +77,7 @@ def _send(
     drawing: Drawing, path: str, timebase: Timebase, steps: Sequence[int], frames: Sequence[int],
     pictures: Sequence[NDArray[np.uint8]],
 ) -> None:  # fmt: skip
-    """Send pictures of one shape, (rows, columns) or (rows, columns, 3), a row of the columns each."""
+    """Send pictures of one shape, (rows, columns) or (rows, columns, 3), one for each row of the time columns."""
     if not pictures:
         return
     height, width = pictures[0].shape[:2]

@@ -1,4 +1,5 @@
-"""What is drawn on, and lines over time: how a column of numbers becomes a named, coloured Rerun entity."""
+"""Lines over time, and the stream on which they are drawn: a column of numbers becomes a named, coloured Rerun
+entity."""
 
 from __future__ import annotations
 
@@ -17,23 +18,23 @@ from aolink.viewing.palette import STATUS_COLOURS
 from aolink.viewing.timebase import Timebase
 
 PERCENTILES = (5, 50, 95)
-"""What stands for many axes."""
+"""Percentiles that represent many axes."""
 POINTS = 32
 """Points that a path is drawn with in a long session: more than its exposure has columns on a screen."""
 _SECOND = 0.55
-"""Opacity of the second of two lines that belong together, and of those that something is compared with."""
+"""Opacity of the second of two lines that belong together, and of the lines of a recording that is compared."""
 
 
 @dataclass(frozen=True)
 class Chosen:
-    """Which of many spots is drawn as lines."""
+    """The spot, of many, that is drawn as lines."""
 
     outputs: tuple[int, ...]
     """Rows of a path."""
     axes: tuple[int, ...]
     """Axes whose states and NIS belong to it."""
     labels: tuple[str, ...] = ("",)
-    """What the legend adds for each output."""
+    """The text that the legend adds for each output."""
 
     @classmethod
     def of(cls, rig: Rig, spot: int = 0) -> Chosen:
@@ -46,14 +47,14 @@ class Chosen:
 
 @dataclass(kw_only=True)
 class Drawing:
-    """A stream into a file or a viewer, how things are drawn on it, and what is known of what has been drawn."""
+    """A stream into a file or a viewer, the options of the drawing, and facts about the lines drawn so far."""
 
     stream: rr.RecordingStream
     chosen: Chosen
     root: str = ""
-    """Begins the name of every entity, with its slash, where a recording is shown beside another."""
+    """Prefix of every entity's name, with its slash, where a recording is shown beside another."""
     points: int | None = POINTS
-    """Points that a path of one exposure is drawn with; None: every fast step."""
+    """Points with which a path of one exposure is drawn; None: every fast step."""
     extents: dict[str, tuple[float, float]] = field(default_factory=dict)
     """The least and the largest value of each entity's lines."""
     swinging: dict[str, bool] = field(default_factory=dict)
@@ -62,7 +63,7 @@ class Drawing:
     """The last state of each lane."""
 
     def log(self, path: str, what: Any) -> None:
-        """Log what holds for the whole session."""
+        """Log data that is valid for the whole session."""
         self.stream.log(self.root + path, what, static=True)
 
     def send_columns(self, path: str, times: Sequence[rr.TimeColumn], columns: Iterable[Any]) -> None:
@@ -72,13 +73,13 @@ class Drawing:
 
 @dataclass(frozen=True)
 class Style:
-    """How a line looks."""
+    """The style of a line."""
 
     name: str
-    """In the legend."""
+    """The line's name in the legend."""
     colour: Colour
     width: float = 1.5
-    """Points."""
+    """Width of the line, points."""
     alpha: int = 255
     steps: bool = False
     """Whether a value holds until the next one, rather than being joined to it."""
@@ -95,7 +96,7 @@ def send_line(
     values:
         (rows,) or (rows, lines).
     labels:
-        What the legend adds to the name of each line; all but the first are then fainter.
+        Texts that the legend adds to the name of each line; lines after the first are then fainter.
     """
     columns: NDArray[np.float64] = np.asarray(values, dtype=np.float64)
     if not len(columns):
@@ -107,7 +108,7 @@ def send_line(
         names=[style.name + label for label in (labels or [""] * lines)],
         colors=[(*style.colour, each) for each in faint],
         widths=[style.width] * lines,
-        interpolation_mode="StepAfter" if style.steps else None,  # by itself a line is linear
+        interpolation_mode="StepAfter" if style.steps else None,  # without a style a line is linear
     )
     drawing.log(path, look)
     drawing.send_columns(path, times, rr.Scalars.columns(scalars=columns))
@@ -129,7 +130,7 @@ def send_axes(
     shown:
         The axes that are lines of their own.
     labels:
-        What the legend adds to the name of each of those.
+        Texts that the legend adds to the names of these axes.
     """
     columns = np.asarray(values, dtype=np.float64)
     send_line(drawing, path, times, columns[:, list(shown)], style, labels if len(shown) > 1 else ())
@@ -153,7 +154,7 @@ def send_states(drawing: Drawing, path: str, timebase: Timebase, steps: ArrayLik
 
 
 def some_rows(values: NDArray[np.float64], count: int) -> IntArray:
-    """Which rows to keep of lines with more than ``count``: those of the extremes of each part, and the ends.
+    """The rows to keep of lines with more than ``count`` rows: those of the extremes of each part, and the ends.
 
     Parameters
     ----------

@@ -14,7 +14,7 @@ from aolink.optics.slopes import FrameSlopes
 from aolink.viewing.rrd_file import new_rrd
 
 _ARROW = 5.0
-"""Length of an arrow over its displacement."""
+"""Length of an arrow divided by the displacement that it shows."""
 _CELL = 12
 """Points of the wavefront's picture from a lenslet to the next one."""
 _DARK = (40, 40, 40)
@@ -50,7 +50,7 @@ def save_slopes(result: FrameSlopes, path: Path, *, overwrite: bool = False) -> 
 
 
 def lenslet_map(result: FrameSlopes) -> NDArray[np.float64]:
-    """The wavefront as the frame lies, each lenslet a square or a hexagon, turned as the lattice is.
+    """The wavefront in the frame's orientation; each lenslet is a square or a hexagon, turned like the lattice.
 
     Returns
     -------
@@ -61,7 +61,7 @@ def lenslet_map(result: FrameSlopes) -> NDArray[np.float64]:
     middles = reference.node_positions(reference.nodes)
     low, high = middles.min(axis=0) - reference.pitch, middles.max(axis=0) + reference.pitch
     x, y = (np.arange(start, stop, step) for start, stop in zip(low, high, strict=True))
-    # The cell of a node is all that is nearer to it than to any other node, with a spot or without.
+    # The cell of a node is the region nearer to it than to any other node, with a spot or without.
     rows, columns = result.wavefront.shape
     nodes = np.stack(np.meshgrid(np.arange(-1, columns + 1), np.arange(-1, rows + 1)), axis=-1)
     tree = cKDTree(reference.node_positions(nodes).reshape(-1, 2))

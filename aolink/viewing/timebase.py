@@ -1,7 +1,7 @@
 """The three timelines of every view: seconds since the first exposure began, fast step and frame number.
 
-Fast steps are what the devices count, so the time on their clock and the frame number follow from them exactly; what
-only has a host time (the log, the link) comes to the devices' clock by the exposures' own pairs of both.
+The devices count fast steps, so the time on their clock and the frame number follow from them exactly; messages with a
+host time only (the log, the link) are placed on the devices' clock by the exposures, which have both times.
 """
 
 from __future__ import annotations
@@ -26,16 +26,16 @@ FRAME = "frame"
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Timebase:
-    """How fast steps, device time, frames and host time go together in one session."""
+    """The relation of fast steps, device time, frames and host time in one session."""
 
     fast_step_ns: int
     frame_period_steps: int
     first_step: int
-    """First fast step of the exposure that the others are counted from."""
+    """First fast step of the exposure from which time is counted."""
     frame_id: int
-    """Its frame."""
+    """The frame of that exposure."""
     origin_ns: int
-    """When it began on the device's clock, ns: the zero of the timeline of seconds."""
+    """The start of that exposure on the device's clock, ns: the zero of the timeline of seconds."""
     device_ns: IntArray
     """Starts of exposures on the device's clock, ns, (n,)."""
     host_ns: IntArray
@@ -59,7 +59,7 @@ class Timebase:
         )
 
     def followed_by(self, exposures: Sequence[Exposure]) -> Timebase:
-        """The same, knowing the times of later exposures too."""
+        """The timebase with the times of later exposures added."""
         device, host = ([getattr(e, name) for e in exposures] for name in ("device_start_ns", "host_start_ns"))
         return replace(
             self, device_ns=np.append(self.device_ns, device), host_ns=np.append(self.host_ns, host)

@@ -35,11 +35,11 @@ PICTURE_SIZE = (1920, 1200)
 """Size of a screenshot, pixels."""
 
 _SETTLE_S = 60.0
-"""How long its picture may take to stop changing."""
+"""How long the viewer's picture may take to stop changing, s."""
 _EQUAL = 3
 """Pictures in a row that must be equal: views appear one by one while their data is loaded."""
 _CORNER = 40
-"""Pixels that hold the rounded corners of its window."""
+"""Pixels along each side that hold a rounded corner of the window."""
 _LEAST_COLOURS = 50
 """A picture with fewer is blank: an empty viewer has about a dozen."""
 
@@ -64,7 +64,7 @@ def screenshot(
     Raises
     ------
     ViewerError
-        Nothing was shown, or the picture cannot be written.
+        The viewer showed nothing, or the picture cannot be written.
     RendererError
         The machine has no driver to draw with; the message names the package.
     """
@@ -91,7 +91,7 @@ def headless_viewer(
     ViewerError
         The viewer cannot show the file, or ended while the block used it.
     RendererError
-        It did so because the machine has no driver to draw with.
+        The viewer ended because the machine has no driver to draw with.
     """
     path = existing(rrd_path)
     port = free_port()
@@ -109,7 +109,7 @@ def headless_viewer(
             yield client
         except (RuntimeError, OSError, ViewerError) as error:
             # A viewer that cannot draw answers at first and ends with its first frame, during any of these calls;
-            # what the call says then ("transport error") is not the cause.
+            # the call's own error then ("transport error") is not the cause.
             if ended(process):
                 raise why_it_ended(said) from None
             if isinstance(error, ViewerError):
@@ -146,7 +146,7 @@ def _connected(process: subprocess.Popen[bytes], port: int, said: IO[bytes]) -> 
     clients: list[ViewerClient] = []
 
     def answers() -> bool:
-        # A connection to a port on which nobody listens yet may block for seconds.
+        # A connection to a port on which no program listens yet may block for seconds.
         if is_free(port):
             return False
         try:
@@ -162,8 +162,8 @@ def _connected(process: subprocess.Popen[bytes], port: int, said: IO[bytes]) -> 
 
 
 def _inside_once_loaded(client: ViewerClient) -> tuple[str, int]:
-    """A place at which everything has begun and nothing has ended: ns since the first exposure began or, in a file of
-    an older aolink, a fast step; before it the timeline.
+    """A time at which everything has begun and nothing has ended, with its timeline before it: ns since the first
+    exposure began or, in a file of an older aolink, a fast step.
     """
     deadline = time.monotonic() + _SETTLE_S
     while True:

@@ -1,6 +1,6 @@
-"""Whether this machine has a Vulkan device, graphics card or software, that a viewer could draw with.
+"""The check whether this machine has a Vulkan device, graphics card or software, that a viewer could draw with.
 
-It is run as a program of its own, because a driver that is broken may take the process that loads it with it.
+It is run as a program of its own, because a broken driver may crash the process that loads it.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import subprocess
 import sys
 
 _INSTANCE_CREATE_INFO = 1
-"""VK_STRUCTURE_TYPE_INSTANCE_CREATE_INFO"""
+"""The value of VK_STRUCTURE_TYPE_INSTANCE_CREATE_INFO."""
 _TIMEOUT_S = 20.0
 
 
@@ -23,7 +23,7 @@ def has_vulkan() -> bool:
 
 
 def _devices() -> int:
-    """How many devices the Vulkan loader knows. Raises OSError where there is no loader."""
+    """The number of devices that the Vulkan loader knows. Raises OSError where there is no loader."""
     vulkan = ctypes.CDLL("libvulkan.so.1")
     # VkInstanceCreateInfo has 64 bytes; all but its type may be zero.
     info, instance, count = (ctypes.c_uint64 * 8)(_INSTANCE_CREATE_INFO), ctypes.c_void_p(), ctypes.c_uint32()

@@ -1,8 +1,8 @@
-"""Both lines of a rig as one stream of messages in order of the host's time.
+"""Both serial lines of a rig as one stream of messages in order of the host's time.
 
-In real time the hub waits on the ports. On virtual time it waits until the rig has dealt with
-everything that was sent and has said so on every line; what came by then does not depend on the
-speed of either side, so neither does anything that follows from it.
+In real time the hub waits on the ports. On virtual time it waits until the rig has handled everything that was sent and
+has said so on every line; the messages that have come by then do not depend on the speed of either side, nor does
+anything that follows from them.
 """
 
 from __future__ import annotations
@@ -22,19 +22,19 @@ from aolink.wire.port import Served, Transport, is_local, wait_readable
 from aolink.wire.signing import Signing
 
 ANSWER_S = 1.0
-"""How long an answer may take before a request is sent again, and how long one is waited for after a stop."""
+"""How long an answer may take before a request is sent again, and the longest wait for an answer after a stop, s."""
 TRIES = 3
 _VIRTUAL_SILENCE_S = 20.0
-"""A rig on virtual time that says nothing for so long is gone."""
+"""A rig on virtual time that sends nothing for this long counts as gone, s."""
 _BUDGET_BYTES = 64 << 20
-"""What may come between two times that the session deals with what came, besides what the camera is to send."""
+"""Most bytes that may come before the session takes them, besides the frames that the camera was asked for."""
 _MESSAGE_BYTES = 512
-"""What a message takes in memory beyond its own bytes."""
+"""Memory that a message takes beyond its own bytes."""
 _MOST_HOST_NS = 1 << 62
 _LAST_PATIENCE_S = 0.2
-"""How long a device is waited for that has kept a session from ending before."""
+"""How long to wait for a device that has already delayed the session's end, s."""
 _SLICE_S = 0.1
-"""Longest sleep: a request to stop is seen that soon."""
+"""Longest sleep, s: a request to stop is noticed within this time."""
 
 AnyMessage = TypeVar("AnyMessage", bound=Message)
 
@@ -42,30 +42,30 @@ AnyMessage = TypeVar("AnyMessage", bound=Message)
 class Hub:
     """The host's clock and the links of one session.
 
-    Once ``stop()`` says so, nobody is waited for longer than for one answer.
+    Once ``stop()`` gives True, no wait is longer than for one answer.
     """
 
     def __init__(self, stop: Callable[[], bool] = lambda: False) -> None:
         self._stop = stop
         self._hurried = False
         self._patience_s = ANSWER_S
-        """How long the rig on virtual time may take to deal with something once the session is to end."""
+        """How long the rig on virtual time may take to handle a message once the session is to end, s."""
         self.links: list[Link] = []
         self.virtual = False
         self.beside: Sequence[Served] = ()
         """Served while the hub waits in real time."""
         self.virtual_since_ns = 0
-        """Host time at which the rig began to hand it down."""
+        """Host time at which the rig began to set it."""
         self.elapsed_ns = 0
-        """Virtual time that went by in time-outs."""
+        """Virtual time that passed in time-outs, ns."""
         self.budget_bytes = _BUDGET_BYTES
-        """Memory for messages that nobody has dealt with yet; a device that sends more ends the session."""
+        """Memory for messages that the session has not taken yet; a device that sends more ends the session."""
         self._epoch_ns = time.time_ns() - time.monotonic_ns()
         self._virtual_ns = 0
         self._pending: list[tuple[Link, Received]] = []
 
     def now_ns(self) -> int:
-        """Host time, ns since 1970: steady within a session, handed down by the rig on virtual time."""
+        """Host time, ns since 1970: steady within a session; on virtual time the rig sets it."""
         return self._virtual_ns if self.virtual else self._epoch_ns + time.monotonic_ns()
 
     def hurry(self) -> None:
@@ -79,10 +79,10 @@ class Hub:
         return link
 
     def go_virtual(self, check: Callable[[Link, pb.VirtualTime], None]) -> None:
-        """From now on time is what the rig says, as far as ``check`` lets it, which raises DeviceError.
+        """Take the time from the rig from now on, as far as ``check`` allows, which raises DeviceError.
 
-        Only a simulated rig on this machine may do that: a device on a serial line or on another machine that says so
-        would take the session's clock away from it.
+        Only a simulated rig on this machine may do that: otherwise a device on a serial line or on another machine
+        could set the session's clock.
         """
         for link in self.links:
             if not is_local(link.transport):
@@ -103,7 +103,7 @@ class Hub:
             link.before_send = partial(self._settle_others, link)
 
     def elapse_until(self, host_ns: int) -> None:
-        """Virtual time: let a time-out pass in which nothing can come."""
+        """On virtual time, advance the clock by a time-out in which nothing can come."""
         if self.virtual and host_ns > self._virtual_ns:
             self.elapsed_ns += host_ns - self._virtual_ns
             self._virtual_ns = host_ns
@@ -113,7 +113,8 @@ class Hub:
         pending, self._pending = self._pending, []
         if self.virtual:
             pending += self._receive_until_dealt_with()
-            # Time moves here and nowhere else: what a send sees must not depend on what has come by then.
+            # Time moves here and nowhere else: the time at a send must not depend on the messages that have come by
+            # then.
             self._virtual_ns = max(self._virtual_ns, *(link.handed.host_ns for link in self.links if link.handed))
         elif not pending:
             beside = [each for each in self.beside if each.alive]
@@ -137,13 +138,13 @@ class Hub:
     ) -> AnyMessage | None:
         """Send a request until its answer comes; None if it never does. Other messages wait for `wait`.
 
-        ``is_it(answer, sequence)`` tells whether an answer belongs to the request of that sequence number: of the last
-        try or of one before. Each of the ``tries`` waits for ``answer_s``.
+        ``is_it(answer, sequence)`` says whether an answer belongs to the request of that sequence number: that of the
+        last try or of an earlier one. Each of the ``tries`` waits for ``answer_s``.
         """
         before = self._memory_bytes()
         sequences: list[int] = []
         for attempt in range(tries):
-            if attempt and (self._hurried or self._stop() or link.refusal):  # what is refused once is so again
+            if attempt and (self._hurried or self._stop() or link.refusal):  # it will be refused again
                 break
             sequences.append(link.send(request))
             deadline_ns = self.now_ns() + round(answer_s * 1e9)
@@ -162,7 +163,7 @@ class Hub:
                         and any(is_it(message, sequence) for sequence in sequences)
                     ):
                         answer = message
-                        if isinstance(request, pb.Identify):  # what came before belongs to a session before
+                        if isinstance(request, pb.Identify):  # messages that came before belong to an earlier session
                             kept = [each for each in kept if each[0] is not link]
                     else:
                         kept.append((source, received))
@@ -179,17 +180,16 @@ class Hub:
             link.transport.close()
 
     def _settle_others(self, link: Link) -> None:
-        """Virtual time: two lines are two queues, and which the rig looks at first is anybody's guess.
-
-        So nothing is sent on one while something sent on another has not been dealt with. Either nothing is
-        read here or everything that is due: what has been read must not depend on speed.
+        """On virtual time, wait until the rig has handled everything sent on the other line. Two lines are two queues,
+        and which of them the rig reads first is not determined, so nothing is sent on one before the other is handled.
+        Either nothing is read here or everything that is due: the messages read must not depend on speed.
         """
         others = [each for each in self.links if each is not link]
         if not all(self._has_dealt_with(others, each) for each in self.links):
             self._pending += self._receive_until_dealt_with()
 
     def _receive_until_dealt_with(self) -> list[tuple[Link, Received]]:
-        """Everything that came until the rig had dealt with all that was sent."""
+        """All messages that came until the rig had handled everything that was sent."""
         received: list[tuple[Link, Received]] = []
         before, heard, last_heard, stop_since = self._memory_bytes(), -1, time.monotonic(), math.inf
         while True:
@@ -209,11 +209,11 @@ class Hub:
             if (silence := now - last_heard) > (_LAST_PATIENCE_S if ended else _VIRTUAL_SILENCE_S):
                 raise DeviceError(f"the rig on virtual time has said nothing for {silence:.1f} s: is it stopped?")
             if ended:
-                raise DeviceError("the rig on virtual time talks without dealing with what it was sent")
+                raise DeviceError("the rig on virtual time sends messages without handling those it was sent")
             wait_readable(waiting, _SLICE_S)
 
     def _memory_bytes(self) -> int:
-        """What all messages so far took."""
+        """The memory that all messages so far took, bytes."""
         return sum(each.counts.bytes_received + _MESSAGE_BYTES * each.counts.packets_received for each in self.links)
 
     def _keep_to_budget(self, before: int) -> None:
@@ -224,10 +224,11 @@ class Hub:
             )
 
     def _has_dealt_with(self, senders: Sequence[Link], link: Link) -> bool:
-        """Whether the rig has said so on ``link``: everything that follows from it has come as well."""
+        """Whether the rig has reported on ``link`` that it has handled everything: all that follows from it has then
+        come as well."""
         handed = link.handed
         if handed is None:
             return False
         taken = {"camera": handed.camera_bytes, "mirror": handed.mirror_bytes}
-        # More than were sent is what it had taken in a session before.
+        # A larger number than was sent comes from an earlier session.
         return all(taken[each.name] == each.sent_bytes for each in senders)

@@ -22,21 +22,21 @@ from aolink.wire.port import Transport
 from aolink.wire.signing import Signing, refusal
 
 _REMEMBERED = 64
-"""Sequence numbers that are known for duplicates."""
+"""Number of sequence numbers that are remembered to find duplicates."""
 
 
 @dataclass(frozen=True, slots=True)
 class Received:
-    """A message and when it came."""
+    """A message and the time at which it came."""
 
     message: Message
     receive_ns: int
-    """Host clock."""
+    """The time at which it came, on the host's clock."""
 
 
 @dataclass(slots=True)
 class LinkCounts:
-    """What went over a link since the counts were reset."""
+    """Counts of the traffic over a link since they were reset."""
 
     packets_received: int = 0
     bytes_received: int = 0
@@ -52,8 +52,8 @@ class LinkCounts:
 class Link:
     """Messages over one port.
 
-    On virtual time the device hands the host's clock down with `VirtualTime` packets: what comes
-    behind one of them came at that time.
+    On virtual time the device sets the host's clock with `VirtualTime` packets: the messages behind such a packet came
+    at its time.
     """
 
     def __init__(
@@ -65,25 +65,27 @@ class Link:
         self.foreign_version: int | None = None
         """Version of the last packet that was refused for its version or its signature, if one came."""
         self.refusal = ""
-        """Why it was refused, as the end of a sentence about it."""
+        """The reason of the refusal, as the end of a sentence about it."""
         self.handed: pb.VirtualTime | None = None
         """The last `VirtualTime` that came."""
         self.virtual = False
-        """Whether time is what the device hands down. Until then, `VirtualTime` packets change no time."""
+        """Whether the device sets the time. Until then, `VirtualTime` packets change no time."""
         self.check_virtual_time: Callable[[pb.VirtualTime], None] = lambda handed: None
-        """Raises DeviceError for a time that cannot be."""
+        """Raises DeviceError for an impossible time."""
         self.sent_packets = 0
-        """Since the last Identify, which is packet 1."""
+        """Packets sent since the last Identify, which is packet 1."""
         self.sent_bytes = 0
-        """Bytes since then, those of the Identify included: the rig on virtual time says how many it has taken."""
+        """Bytes sent since then, those of the Identify included: the rig on virtual time reports how many it has
+        taken."""
         self.last_sent_ns = 0
-        """Host time at which something was sent last."""
+        """Host time of the last packet sent."""
         self.last_heard_ns = now_ns()
-        """Host time at which something came last."""
+        """Host time at which bytes came last."""
         self.reopen: Callable[[], Transport] | None = None
         """Opens the port again. Where it is None, losing the port is an error."""
         self.lost: PortError | None = None
-        """Why there is no port at present: what is sent is dropped then, and nothing comes."""
+        """The reason why there is no port at present; meanwhile packets that are sent are dropped, and nothing
+        comes."""
         self.before_send: Callable[[], None] = lambda: None
         """Called before anything is sent; the hub keeps the lines in step with it on virtual time."""
         self._now_ns = now_ns
@@ -104,7 +106,7 @@ class Link:
         self.before_send()
         if isinstance(message, pb.Identify):
             self._next_sequence = self.sent_packets = self.sent_bytes = 0
-            self._write(DELIMITER)  # ends what a host before has left on the line
+            self._write(DELIMITER)  # ends a packet that an earlier host has left on the line
         for data in encode_packets(message, self._next_sequence, self.signing):
             self._write(data)
             self.sent_bytes += len(data)
@@ -130,7 +132,7 @@ class Link:
                 continue
             if self.signing is not None:
                 packet = self.signing.take(packet)
-            if _begins_identity(packet):  # the device counts anew: what came before is of another session
+            if _begins_identity(packet):  # the device counts anew: the packets before belong to another session
                 self._recent.clear()
                 self._last_sequence = None
             if self._is_duplicate(packet.sequence):
@@ -180,7 +182,7 @@ class Link:
                 self.lose(error)
 
     def _is_duplicate(self, sequence: int) -> bool:
-        """Whether a packet came before; counts those that should have come between."""
+        """Whether a packet came before; also counts the packets missing between."""
         if sequence in self._recent:
             return True
         self._recent.append(sequence)

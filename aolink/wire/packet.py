@@ -1,4 +1,4 @@
-"""Packets: bytes <-> (version, type, sequence, payload).
+"""Conversion of bytes to packets and back: (version, type, sequence, payload).
 
 A packet is COBS([version u8 | type u8 | sequence u16 | payload | CRC-32 u32]) 0x00, little-endian, the
 CRC zlib's over everything before it. CRC-32 finds every burst of up to 32 bits and all but 2^-32 of
@@ -29,11 +29,11 @@ SIGNED_VERSION = 2
 TRAILER_BYTES = 13
 """Bytes of link, time stamp and signature."""
 MAX_PAYLOAD = 4608
-"""Bytes; 4 KiB of data and the fields around it."""
+"""The longest payload in bytes: 4 KiB of data and the fields around it."""
 MAX_CHUNK = 4096
 """Bytes of data in one chunk of a frame, and in one part of a message."""
 MAX_MESSAGE = 262_144
-"""Bytes of a message that comes in parts: a row of inputs and the limits of 10 000 of them."""
+"""The longest message in parts, bytes: a row of inputs and the limits of 10 000 of them."""
 HEADER = struct.Struct("<BBH")
 _CRC = struct.Struct("<I")
 _MIN_DECODED = HEADER.size + _CRC.size
@@ -43,7 +43,7 @@ DELIMITER = b"\0"
 
 
 class PacketType(IntEnum):
-    """The type byte; the numbers of messages.proto."""
+    """The values of the type byte, with the numbers of messages.proto."""
 
     IDENTIFY = 1
     IDENTITY = 2
@@ -113,11 +113,11 @@ class Signer(Protocol):
     """Signs packets; see `aolink.wire.signing`."""
 
     def sign(self, packet: Packet) -> Packet:
-        """The packet of version 2 that carries what one of version 1 does."""
+        """The packet of version 2 with the content of a packet of version 1."""
 
 
 def encode_packets(message: Message, sequence: int, signer: Signer | None = None) -> list[bytes]:
-    """The packets that carry ``message``, one or its parts, numbered from ``sequence`` on.
+    """The packets that carry ``message``, whole or in parts, numbered from ``sequence`` on.
 
     Raises ValueError if it is longer than `MAX_MESSAGE`.
     """
@@ -143,23 +143,22 @@ def encode_message(message: Message, sequence: int, signer: Signer | None = None
 
 
 class MessageDecoder:
-    """Packets, one after the other, become messages; it holds one message in parts at most."""
+    """Turns packets, one after the other, into messages; it holds one message in parts at most."""
 
     def __init__(self) -> None:
         self._data = bytearray()
         self._type = self._total = self._next_sequence = 0
 
     def take(self, packet: Packet) -> Message | None:
-        """The message that a packet completes; None where more of it is to come.
-
-        Raises DecodeError for a payload that is no message, and for a part without those before it.
+        """The message that a packet completes; None where more of it is to come. Raises DecodeError for a payload that
+        is not a message, and for a part without the parts before it.
         """
         type_, payload = packet.type, packet.payload
         if type_ == PacketType.PART:
             part = pb.Part.FromString(payload)
             if not self._append(part, packet.sequence):
                 self._data = bytearray()
-                raise DecodeError("a part that does not follow the one before, or of a message that cannot be")
+                raise DecodeError("a part that does not follow the one before, or of an impossible message")
             if len(self._data) < part.total:
                 return None
             type_, payload = part.type, bytes(self._data)
@@ -170,7 +169,7 @@ class MessageDecoder:
         return kind.FromString(payload)
 
     def _append(self, part: pb.Part, sequence: int) -> bool:
-        """Whether a part goes on where the message is, or begins one."""
+        """Add a part; gives whether it continues the present message, or begins one."""
         if part.offset == 0:
             self._data, self._type, self._total = bytearray(), part.type, part.total
         elif (part.type, part.total, sequence) != (self._type, self._total, self._next_sequence):
@@ -188,7 +187,7 @@ class MessageDecoder:
 class PacketDecoder:
     """Cuts a stream of bytes into packets; after damage it goes on at the next delimiter.
 
-    It never holds more than one packet's worth of bytes, whatever comes.
+    It never holds more bytes than one packet has, whatever it receives.
     """
 
     def __init__(self) -> None:

@@ -1,4 +1,4 @@
-"""Ports: whatever pyserial opens, behind five methods. The one place that knows pyserial."""
+"""Ports: everything that pyserial opens, behind five methods. No other module uses pyserial."""
 
 from __future__ import annotations
 
@@ -20,37 +20,38 @@ import serial
 from aolink.errors import PortError
 
 BAUD_RATE = 921_600
-"""For ports that have one; USB and pseudo terminals ignore it."""
+"""The baud rate of ports that have one; USB and pseudo terminals ignore it."""
 _WRITE_TIMEOUT_S = 5.0
 _STOPPED_TIMEOUT_S = 1.0
-"""The same once a stop is asked for."""
+"""The write time-out once a stop is requested, s."""
 _SLICE_S = 0.1
 _SOCKET_READ = 65_536
 _REOPEN_S = 0.05
-"""Between two tries to open a port that has vanished."""
+"""Time between two tries to open a port that has vanished, s."""
 
 
 class Transport(Protocol):
     """A byte stream to a device."""
 
     def read_some(self) -> bytes:
-        """What has come, without waiting; empty if nothing. Raises PortError when the port is lost."""
+        """The bytes that have come, without waiting; empty if there are none. Raises PortError when the port is
+        lost."""
 
     def write(self, data: bytes) -> None:
         """Hand over all of ``data``. Raises PortError when the port is lost or takes nothing for 5 s."""
 
     def unsent(self) -> int:
-        """Bytes of what was written that wait for the line; 0 where the port cannot tell."""
+        """Number of written bytes that still wait for the line; 0 where the port cannot say."""
 
     def fileno(self) -> int:
-        """For `wait_readable`."""
+        """The file descriptor, for `wait_readable`."""
 
     def close(self) -> None:
         """Give the port back. Closing twice does nothing."""
 
 
 class SerialPort:
-    """A `Transport` over pyserial. Once ``stop()`` says so, a device that takes nothing is not waited for."""
+    """A `Transport` over pyserial. Once ``stop()`` gives True, it does not wait for a device that takes nothing."""
 
     def __init__(self, url: str, baud_rate: int = BAUD_RATE, *, stop: Callable[[], bool] = lambda: False) -> None:
         self.url = url
@@ -60,7 +61,7 @@ class SerialPort:
             self._serial = serial.serial_for_url(
                 url, baudrate=baud_rate, timeout=0, write_timeout=_WRITE_TIMEOUT_S, exclusive=True
             )
-        except Exception as error:  # pyserial lets through whatever it meets in an address that it cannot read
+        except Exception as error:  # pyserial raises errors of many kinds for an address that it cannot read
             raise _open_error(url, error) from None
         try:
             self._serial.fileno()
@@ -129,14 +130,14 @@ class Reopening:
     def __init__(self, reopen: Callable[[], Transport]) -> None:
         self.opened: Transport | None = None
         self.failed: PortError | None = None
-        """Why the newest try did not succeed."""
+        """The error of the newest try, if it did not succeed."""
         self._reopen = reopen
         self._given_up = threading.Event()
         self._lock = threading.Lock()
         threading.Thread(target=self._run, name="aolink-reopening", daemon=True).start()
 
     def give_up(self) -> None:
-        """Try no more, and close the port if it was opened."""
+        """Stop trying, and close the port if it was opened."""
         with self._lock:
             self._given_up.set()
             if self.opened is not None:
@@ -159,13 +160,13 @@ class Reopening:
 
 
 class HasFileno(Protocol):
-    """Anything that the operating system can wait for."""
+    """An object that the operating system can wait for."""
 
     def fileno(self) -> int: ...
 
 
 class Served(HasFileno, Protocol):
-    """Somebody beside the lines whom a session's wait serves as well."""
+    """An object beside the serial lines that a session serves while it waits."""
 
     @property
     def alive(self) -> bool:
@@ -173,14 +174,14 @@ class Served(HasFileno, Protocol):
 
     @property
     def has_to_send(self) -> bool:
-        """Whether something is to be sent as soon as it is taken."""
+        """Whether bytes are waiting to be sent as soon as the other end accepts them."""
 
     def serve(self) -> None:
-        """Send and receive what goes without waiting."""
+        """Send and receive as much as possible without waiting."""
 
 
 def wait_readable(some: Sequence[HasFileno], timeout_s: float, writable: Sequence[HasFileno] = ()) -> None:
-    """Wait until one of ``some`` has something or one of ``writable`` takes something, or for ``timeout_s``."""
+    """Wait until one of ``some`` can be read or one of ``writable`` can be written, or for ``timeout_s``."""
     select.select(some, writable, [], max(0.0, timeout_s))
 
 
@@ -200,7 +201,7 @@ _FORMS = "a port is a device path such as /dev/ttyACM0, or an address such as so
 
 
 def _check_address(url: str) -> None:
-    """Raise PortError for what cannot be a port: an address without host or number, a folder, a file of data."""
+    """Raise PortError for a text that cannot be a port: an address without host or number, a folder, a file of data."""
     scheme, slashes, _ = url.partition("://")
     if not slashes:
         try:

@@ -1,8 +1,8 @@
 """Signed packets: version 2 of the packet, for lines that other programs or machines can reach.
 
 Its payload is followed by link u8, time stamp u48 and the first 6 bytes of HMAC-SHA-256(key, everything before them).
-Each way of each line has a link of its own, so that no packet can be sent back or over to the other line. Time stamps
-of a link only grow: what was recorded on it once is refused for ever.
+Each direction of each line has a link number of its own, so that no packet can be sent back or over to the other line.
+Time stamps of a link only grow: a packet that was recorded on it is refused for ever.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from aolink.errors import PortError
 from aolink.wire.packet import HEADER, PROTOCOL_VERSION, SIGNED_VERSION, TRAILER_BYTES, Packet
 
 LINK_OF_LINE = {"camera": 1, "mirror": 2}
-"""From the host to the device; the other way has `TO_HOST` more."""
+"""Link numbers from the host to the device; those of the other direction are greater by `TO_HOST`."""
 TO_HOST = 128
 STAMP_EPOCH_S = 1_420_070_400
 """2015-01-01 00:00 UTC, as in MAVLink 2."""
@@ -35,7 +35,7 @@ _HOW = (
 def read_key(path: str | Path) -> bytes:
     """The 32 bytes of a key file, which has them as 64 hexadecimal digits.
 
-    Raises PortError if it cannot be read, is no such file, or is open to other users of this machine.
+    Raises PortError if it cannot be read, is not a key file, or is open to other users of this machine.
     """
     try:
         descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
@@ -53,18 +53,18 @@ def read_key(path: str | Path) -> bytes:
 
 
 class Signing:
-    """One end of a line whose packets are signed: signs what goes out, and says what is wrong with what comes in.
+    """One end of a line whose packets are signed: it signs outgoing packets, and checks incoming ones.
 
-    Both ends send with time stamps beyond their own clock and beyond all that they have sent and heard. So a host whose
-    clock is behind the device's catches up with the answer to its first packet, which was refused.
+    Both ends send with time stamps beyond their own clock and beyond all that they have sent and received. So a host
+    whose clock is behind the device's catches up with the answer to its first packet, which was refused.
 
     Parameters
     ----------
     key:
         32 bytes that both ends have.
     line:
-        ``camera`` or ``mirror``. A host may give another name where it does not know who is there: it then takes the
-        line from the device's first answer.
+        ``camera`` or ``mirror``. A host may give another name where it does not know which device is there: it then
+        takes the line from the device's first answer.
     to_host:
         Whether this is the device's end.
     now_s:
@@ -79,14 +79,14 @@ class Signing:
         self._heard = self._clock()
 
     def sign(self, packet: Packet) -> Packet:
-        """The packet of version 2 that carries what one of version 1 does."""
+        """The packet of version 2 with the content of a packet of version 1."""
         self._sent = max(self._clock(), self._sent + 1, self._heard + 1)
         link = (self._link or LINK_OF_LINE["camera"]) + self._out
         head = packet.payload + bytes([link]) + self._sent.to_bytes(_STAMP_BYTES, "little")
         return Packet(SIGNED_VERSION, packet.type, packet.sequence, head + self._tag(packet, head))
 
     def refusal(self, packet: Packet) -> str:
-        """Why a packet is not to be taken, as the end of a sentence about it; empty if it is."""
+        """The reason to refuse a packet, as the end of a sentence about it; empty if it is accepted."""
         if packet.version == PROTOCOL_VERSION:
             return "is not signed"
         if packet.version != SIGNED_VERSION or len(packet.payload) < TRAILER_BYTES:
@@ -102,7 +102,7 @@ class Signing:
         return ""
 
     def take(self, packet: Packet) -> Packet:
-        """What a packet that is not refused carries, as one of version 1."""
+        """The content of an accepted packet, as a packet of version 1."""
         self._heard = _stamp(packet)
         self._link = packet.payload[-TRAILER_BYTES] - self._in
         return Packet(PROTOCOL_VERSION, packet.type, packet.sequence, packet.payload[:-TRAILER_BYTES])
@@ -116,7 +116,7 @@ class Signing:
 
 
 def refusal(packet: Packet, signing: Signing | None) -> str:
-    """Why a packet is not to be taken on a line that is signed, or is not; empty if it is."""
+    """The reason to refuse a packet on a line, signed or not; empty if it is accepted."""
     if signing is not None:
         return signing.refusal(packet)
     return (

@@ -1,4 +1,4 @@
-"""The wire's form of what really happened in an exposure."""
+"""The wire's form of an exposure's true states and path."""
 
 from __future__ import annotations
 

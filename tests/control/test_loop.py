@@ -153,7 +153,7 @@ def test_an_estimator_that_has_lost_itself_opens_the_loop_at_once(status: Status
             estimate = replace(estimate, status=status)
         acts.append(loop.see(exposure, estimate, exposure.first_step + 40))
     assert [act.state for act in acts] == [0, 0, 0, 1, 1, 1, 0, 0]
-    assert acts[3].reason == f"the estimator says {status.name.lower()} of frame 4"
+    assert acts[3].reason == f"the estimator is {status.name.lower()} at frame 4"
 
 
 def test_without_any_exposure_the_prediction_runs_on_and_then_the_mirror_holds() -> None:

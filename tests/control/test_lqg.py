@@ -89,7 +89,7 @@ def test_copies_of_a_plant_are_controlled_each_for_itself() -> None:
 
 
 def test_a_plant_that_wanders_off_unseen_is_an_error() -> None:
-    """The input moves a state that does not die out and that no slope shows: no gain can keep it."""
+    """The input moves a state that does not decay and that no slope shows: no gain can keep it."""
     plant = replace(
         load_rig("section-vi").plant, A=np.diag([1.0, 0.9]), B=np.array([[1.0], [1.0]]), C=np.array([[0.0, 1.0]])
     )

@@ -52,7 +52,7 @@ def test_notes_and_warnings_are_printed(aolink, rig, tmp_path):
     source = others.written_npy(tmp_path, frames)
     made = aolink("import", source, "-o", "a.mcap", "--rig", rig)
     assert made.stdout.splitlines() == [
-        "note: nothing says the frame rate: that of the rig file is assumed, 50 frames/s",
+        "note: the film does not state its frame rate: that of the rig file is assumed, 50 frames/s",
         "warning: 4 pixels (0.89%) are saturated in the film: they are masked",
         "a.mcap: 7 exposures of 7 frames",
     ]

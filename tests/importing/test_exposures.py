@@ -139,7 +139,7 @@ def test_what_is_given_of_times_goes_before_what_the_film_says(tmp_path):
 
 def test_a_rate_that_nothing_says_is_that_of_the_rig_file_and_said(tmp_path):
     _, account = made(tmp_path, film())
-    assert "nothing says the frame rate: that of the rig file is assumed, 50 frames/s" in account.notes
+    assert "the film does not state its frame rate: that of the rig file is assumed, 50 frames/s" in account.notes
 
 
 def test_rates_and_times_that_contradict_each_other_are_refused(tmp_path):

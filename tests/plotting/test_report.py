@@ -72,7 +72,7 @@ def test_a_page_stands_alone_and_has_every_section(tmp_path: Path) -> None:
         picture = base64.b64decode(source.partition(",")[2])
         assert ElementTree.fromstring(picture).tag.endswith("svg")
         assert b"<script" not in picture
-    for text in ("The session", "The estimates", "Inside the exposures that tell most", "Configuration"):
+    for text in ("The session", "The estimates", "Inside the most telling exposures", "Configuration"):
         assert text in page.text
     assert any("the largest blur" in each for each in page.captions)
     assert any("moments is furthest from the truth" in each for each in page.captions)

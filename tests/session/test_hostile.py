@@ -184,7 +184,7 @@ def test_a_device_that_says_what_the_other_has_to_say_is_refused(tmp_path: Path)
         return pb.CommandAck(block_id=1) if isinstance(message, pb.FrameChunk) else message
 
     assert_caught(
-        tmp_path, {"camera": lie}, "the camera says a message = CommandAck, expected what a camera has to say"
+        tmp_path, {"camera": lie}, "the camera says a message = CommandAck, expected a message that a camera may send"
     )
 
 

@@ -34,7 +34,7 @@ def test_one_exposure_has_every_step_of_its_paths_and_nothing_of_others(aolink: 
     applied = entities["/mirror/applied"]["fast_step"]
     assert applied[0] <= estimate.first_step < applied[-1] < estimate.first_step + 2 * estimate.n_steps
     layout = str(read_blueprint(tmp_path / "one.rrd"))
-    assert "Path; time at a place; intensity" in layout
+    assert "Path; time at a position; intensity" in layout
     assert "Latency" not in layout
 
 
@@ -123,4 +123,4 @@ def test_a_closed_loop_is_shown(tmp_path: Path) -> None:
     assert np.isfinite(left).any()
     assert (scalars(entities["/control/delay"]) > 0).all()
     assert next(state for (state,) in entities["/status/loop"]["StateChange:state"]).startswith("CLOSED")
-    assert "Loop: what is left (slope units)" in str(read_blueprint(tmp_path / "loop.rrd"))
+    assert "Loop: residual (slope units)" in str(read_blueprint(tmp_path / "loop.rrd"))

@@ -27,10 +27,9 @@ _TINY = 10_000
 
 
 def tiny_recordings(effort: Effort) -> list[Row]:
-    """Ten thousand recordings of three exposures into side files, in one folder: what each costs besides its estimates.
-
-    That is the time of each less that of the estimates, which is the slope of time against exposures; and the memory
-    that the process has at the end and did not have after the first thousand.
+    """Ten thousand recordings of three exposures are estimated into side files in one folder: what each costs besides
+    its estimates. The cost is the time of each less that of the estimates, which is the slope of time against
+    exposures; and the memory that the process has gained since the first thousand.
     """
     count = effort.of(_TINY, 20)
     with tempfile.TemporaryDirectory() as name:
@@ -127,7 +126,7 @@ def _serving_s3() -> Iterator[list[int]]:
 
     class Quiet(WSGIRequestHandler):
         def log(self, type: str, message: str, *arguments: Any) -> None:
-            """Requests are no news."""
+            """Do not print requests."""
 
     sent: list[int] = []
     answer: Callable[..., Iterable[bytes]] = DomainDispatcherApplication(create_backend_app)
@@ -165,7 +164,7 @@ def _serving_s3() -> Iterator[list[int]]:
 def cluster_workers(effort: Effort) -> Row:
     """Eight recordings estimated with moments on two workers of a Dask scheduler, against one worker.
 
-    Beside it what this machine can give: the same work by two plain processes against one, in the same rounds.
+    Beside it stands what this machine can reach: the same work by two plain processes against one, in the same rounds.
     """
     from distributed import Client
 
@@ -207,7 +206,7 @@ def cluster_workers(effort: Effort) -> Row:
 
         small, large = cluster(1), cluster(2)
         alone, pair = (stack.enter_context(pool_of(count)) for count in (1, 2))
-        for address, pool in ((small, alone), (large, pair)):  # they load what they need
+        for address, pool in ((small, alone), (large, pair)):  # the workers load their modules
             plain(pool, todo[:2])
             work(address, todo[:2])
         busy: list[float] = []

@@ -1,4 +1,5 @@
-"""Whether host times of frames are as uncertain as is said, on a line and a clock that are bad in every way at once."""
+"""Rows about the stated uncertainty of frames' host times, on a serial line and a clock that are bad in every way at
+once."""
 
 from __future__ import annotations
 
@@ -15,14 +16,15 @@ _WALK = 1e-6 / 60**0.5
 _JITTER_NS = 2e6
 """Mean of the exponential time that a packet takes beyond the shortest, each way."""
 _ROUND_TRIP_NS = 4e6
-"""The shortest; which part of it is the way there is drawn by seed, from none to all."""
+"""The shortest round trip; the share of it in the first direction is drawn by seed, from none to all."""
 _STEP_NS = 50_000_000
 _READOUT_S = 0.05
 _START_NS = 1_800_000_000_000_000_000
 
 
 def _session(seed: int, duration_s: float, *, stamps_show_it: bool) -> tuple[np.ndarray, int, int]:
-    """Error over sigma of the host time of each frame, 10 a second; how many off by the step are flagged, and are not.
+    """Error over sigma of the host time of each frame, 10 a second; and how many of the frames off by the step are
+    flagged and not flagged.
 
     Where no stamp shows the step (a device that counts its fast steps from its clock), those frames are flagged that
     began after the last query which agreed with the old clock, once the step is found.
@@ -83,7 +85,8 @@ def _session(seed: int, duration_s: float, *, stamps_show_it: bool) -> tuple[np.
 def host_times(effort: Effort) -> list[Row]:
     """Drift of 200 ppm and its walk, jitter of 2 ms each way, delay asymmetric by up to 4 ms, a step of 50 ms.
 
-    The way there's share of the round trip is the same in a whole session: a session counts as one sample of the NEES.
+    The share of the first direction in the round trip is the same in a whole session, so a session counts as one sample
+    of the NEES.
     """
     seeds, duration_s = effort.of(_SEEDS, 3), float(effort.of(round(_SESSION_S), 8))
     sessions = [_session(seed, duration_s, stamps_show_it=True)[0] for seed in range(1, seeds + 1)]

@@ -1,4 +1,4 @@
-"""Mirrors without a queue, and how well two clocks are compared."""
+"""Rows about mirrors without a queue, and about the comparison of two clocks."""
 
 from __future__ import annotations
 

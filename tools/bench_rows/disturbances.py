@@ -1,4 +1,4 @@
-"""What a loop is disturbed by, step by step, with what is known of it by one who has seen its true slopes."""
+"""Disturbances of a loop, step by step, with the best prediction by one who has seen the true slopes."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _PIXELS = 16
 _ORDER = 64
 _RIDGE = 1e-9
 _HIGHEST_HZ = 100.0
-"""Up to which a model is fitted to the spectrum of turbulence."""
+"""Highest frequency at which a model is fitted to the spectrum of turbulence, Hz."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +41,7 @@ class Disturbance:
     A: FloatArray
     C: FloatArray
     model: ProcessSum
-    """What an estimator is told."""
+    """The model that an estimator is given."""
 
 
 def together(parts: Sequence[Disturbance]) -> Disturbance:
@@ -69,8 +69,8 @@ def line(frequency_hz: float, sd: float, steps: int, seed: int) -> Disturbance:
 def turbulence(kind: str, sd: float, steps: int, past: int, seed: int) -> Disturbance:
     """Tilt of two von Karman layers in frozen flow: ``own`` waves, or HCIPy's screens, ``hcipy``.
 
-    It has no finite model. What is known is fitted to its true slopes in the first ``past`` steps: an autoregressive
-    model, and for the estimators the sum of two processes of second order with the likeliest spectrum (Whittle).
+    It has no finite model. Two models are fitted to its true slopes in the first ``past`` steps: an autoregressive one,
+    and for the estimators the sum of two processes of second order with the highest likelihood (Whittle).
     """
     slopes = sd * _tilt(kind, steps, seed)
     order = min(_ORDER, past // 4)
@@ -103,7 +103,7 @@ def _waves(speed_m_s: float, steps: int, random: np.random.Generator) -> FloatAr
 
 
 def _screen(speed_m_s: float, steps: int, random: np.random.Generator) -> FloatArray:
-    """The same by HCIPy's infinitely long screen: the difference of the phase between two sides of the pupil."""
+    """The mean slope by HCIPy's infinitely long screen: the difference of the phase between two sides of the pupil."""
     import hcipy
 
     side = _PIXELS + 1

@@ -15,7 +15,7 @@ from bench_rows.row import Effort, Row, median_s, timed
 
 
 def filterpy_loop(model: Any, R: Any, values: Any) -> Callable[[], None]:
-    """The same step with filterpy, axis by axis: of a plant without inputs, from moments (axes, 2) and their noise."""
+    """The same step with filterpy, axis by axis, for a plant without inputs, from moments (axes, 2) and their noise."""
     from filterpy.kalman import ExtendedKalmanFilter
 
     A, Q, row, M = model.transition, model.process_noise, model.mean_row, model.quadratic[0]
@@ -71,7 +71,7 @@ def o3_step(effort: Effort) -> Row:
 
 
 def many_lenslets() -> Rig:
-    """30 x 30 lenslets with windows of 16 x 16 pixels."""
+    """A sensor of 30 x 30 lenslets with windows of 16 x 16 pixels."""
     text = load_rig("sh-4x4").toml
     for old, new in (
         ("axes = 32", "axes = 1800"),
@@ -168,7 +168,7 @@ def frame_from_last_byte(effort: Effort) -> Row:
 
 
 def _of_many_axes(name: str, limit_ms: float, effort: Effort) -> Row:
-    """One exposure of 1800 line sensors of 16 pixels, against what is wanted at 5 Hz."""
+    """One exposure of 1800 line sensors of 16 pixels, against the time available at 5 Hz."""
     from paper_report.ensemble import side_by_side
 
     from aolink.estimation import make_estimator
@@ -222,7 +222,7 @@ def spots_under_turbulence(effort: Effort) -> list[Row]:
 
 
 def membrane_in_real_time(effort: Effort) -> list[Row]:
-    """An exposure of membrane-12x12, 288 states seen by 100 lenslets, at 5 Hz; and what memory it takes."""
+    """An exposure of membrane-12x12, 288 states seen by 100 lenslets, at 5 Hz; and the memory that it takes."""
     import lz4.frame
 
     from aolink.estimation import make_estimator

@@ -1,4 +1,5 @@
-"""`aolink identify` over logs drawn at random: whether its sets hold the truth, and what it offers when it follows."""
+"""Rows about `aolink identify` on recordings (logs) drawn at random: whether its sets hold the truth, and its offers
+when it follows."""
 
 from __future__ import annotations
 
@@ -42,8 +43,8 @@ class Log:
 
 
 def drawn(seed: int) -> Log:
-    """Kinds in turn; exposures of 50 or 100 steps, 64 to 128 of them; 0.3 to 3.6 cycles an exposure of damping 0.003 to
-    0.06; path sd of 0.5 to 4 kernel sds; noise densities V from 2e-5 to 1e-3."""
+    """The log of a seed: kinds in turn; exposures of 50 or 100 steps, 64 to 128 of them; 0.3 to 3.6 cycles an exposure
+    of damping 0.003 to 0.06; path sd of 0.5 to 4 kernel sds; noise densities V from 2e-5 to 1e-3."""
     random = np.random.default_rng(seed)
     steps, count = int(random.choice([50, 100])), int(random.choice([64, 96, 128]))
     exposure_s = steps * _STEP_S
@@ -133,12 +134,12 @@ def _rows(logs: list[dict[str, bool]]) -> Iterator[Row]:
 
 _FIRST_FOLLOWED = 40_000
 _CHANGED_AFTER = 80
-"""Exposures."""
+"""Exposures before the change."""
 
 
 @dataclass(frozen=True)
 class Change:
-    """What becomes of the disturbance of the rig `loop`, whose rig file goes on believing in what it was."""
+    """A change of the disturbance of the rig `loop`, whose rig file keeps the old model."""
 
     name: str
     frequency: float = 1.0
@@ -162,9 +163,8 @@ _CHANGES = (
 
 
 def following(effort: Effort) -> list[Row]:
-    """What `aolink identify --follow` offers on the rig `loop` when its disturbance changes after 80 of 320 exposures.
-
-    8 logs of each change; of logs without one, 16, and 8 of the rig `jitter`, with 320 exposures each.
+    """The offers of `aolink identify --follow` on the rig `loop` when its disturbance changes after 80 of 320
+    exposures. There are 8 logs of each change, 16 without a change, and 8 of the rig `jitter`, with 320 exposures each.
     """
     exposures, seeds = effort.of(320, 4), range(_FIRST_FOLLOWED, _FIRST_FOLLOWED + effort.of(8))
     rows = []
@@ -193,7 +193,7 @@ def following(effort: Effort) -> list[Row]:
 
 
 def _offers(exposures: Sequence[Exposure], rig: str) -> tuple[list[Offer], bool]:
-    """What is offered, and whether it was said that the rig file's model does not fit."""
+    """The offers, and whether the rig file's model was found not to fit."""
     job = Following(load_rig(rig), Wanted(), Path("identified.toml"))
     news = [each for exposure in exposures for each in job.see(exposure)]
     return [each for each in news if isinstance(each, Offer)], any(

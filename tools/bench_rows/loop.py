@@ -1,4 +1,5 @@
-"""What closing the loop is worth: residual slopes with lqg beside the best integrator, on the same disturbances."""
+"""Rows about the benefit of closing the loop: residual slopes with lqg beside the best integrator, on the same
+disturbances."""
 
 from __future__ import annotations
 
@@ -66,14 +67,14 @@ def residual_slopes(effort: Effort) -> list[Row]:
 
 
 Series = Callable[[int, np.random.Generator], NDArray[np.float64]]
-"""Slopes of so many fast steps, (steps, 1)."""
+"""A function that gives the slopes of a number of fast steps, (steps, 1)."""
 _PUPIL_M = 0.5
 
 
 def fall_back(effort: Effort) -> list[Row]:
     """lqg + o1 on the rig `loop` with other disturbances than its model has: 8 seeds of 240 exposures.
 
-    The best integrator is not looked for: it has the rig file's gain. In brackets as in `residual_slopes`.
+    The integrator has the rig file's gain, not the best one. Numbers in brackets are as in `residual_slopes`.
     """
     seeds, exposures = range(401, 401 + effort.of(8, 2)), effort.of(240, 6)
     wrong = _by_model(0.7 * 12.0), _by_model(1.3 * 12.0)
@@ -110,7 +111,7 @@ def _with_line(frequency_hz: float) -> Rig:
 
 
 def _disturbed(believed: Rig, series: Series | None, exposures: int, seed: int, folder: Path) -> Rig:
-    """A rig that believes in its model while something else disturbs it."""
+    """A rig that keeps its model while another disturbance acts."""
     if series is None:
         return believed
     steps = (exposures + 2) * believed.timing.frame_period_steps
@@ -122,7 +123,7 @@ def _disturbed(believed: Rig, series: Series | None, exposures: int, seed: int, 
 
 
 def _by_model(frequency_hz: float) -> Series:
-    """What the rig's model would make with its line elsewhere."""
+    """The disturbance of the rig's model with its vibration at another frequency."""
 
     def series(steps: int, rng: np.random.Generator) -> NDArray[np.float64]:
         disturbance = _with_line(frequency_hz).disturbance

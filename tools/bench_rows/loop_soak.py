@@ -17,15 +17,16 @@ from bench_rows.row import Effort, Row
 
 _HOUR_S, _SHORT_S = 3600.0, 5.0
 _SETTLED = 1 / 6
-"""Part of the session after which memory is looked at first: by then all has been used once."""
+"""Part of the session after which memory is first measured: by then all code has run once."""
 _MOST_GROWTH_MB = 20.0
 _INDEX_MB = 0.8e-3
-"""What the writer of MCAP keeps of each chunk until it writes the index at the end: some 0.8 kB."""
+"""Memory that the writer of MCAP keeps for each chunk until it writes the index at the end: some 0.8 kB."""
 _ENDS = ("steps_applied", "steps_late", "steps_superseded", "steps_refused", "steps_not_reported")
 
 
 def closed_loop_soak(effort: Effort) -> Row:
-    """`lqg` with `o1` on the rig `loop` over pseudo terminals; what has no account ends the row with an error."""
+    """`lqg` with `o1` on the rig `loop` over pseudo terminals; a frame or step that is not accounted for ends the row
+    with an error."""
     rig = load_rig("loop")
     period_s = rig.timing.frame_period_steps * rig.timing.fast_step_s
     exposures = round((_HOUR_S if effort.share >= 1 else _SHORT_S) / period_s)

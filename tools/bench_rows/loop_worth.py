@@ -1,4 +1,5 @@
-"""What closing the loop is worth under turbulence and a line, beside pyRTC's predictors and the limit."""
+"""Rows about the benefit of closing the loop under turbulence and a vibration ("line"), beside pyRTC's predictors and
+the limit."""
 
 from __future__ import annotations
 
@@ -32,12 +33,12 @@ _KERNEL_SD = 0.1 / math.sqrt(2)
 
 @dataclass(frozen=True)
 class Cell:
-    """A disturbance, a camera, and what finds the state for `lqg`."""
+    """A disturbance, a camera, and the estimators that serve `lqg`."""
 
     turbulence: str
     """``own``, ``hcipy``, or empty for none."""
     line: float
-    """Times the frame rate; 0 for none. Where there are both, their sd is equal."""
+    """Frequency of the vibration over the frame rate; 0 for none. Where there are both, their sd is equal."""
     widths: float = 1.5
     """Sd of the path over that of the kernel."""
     steps: int = 50
@@ -45,9 +46,9 @@ class Cell:
     noise: float = 0.02
     """Sd of the centroid's noise (of a sum over all pixels) over that of the path."""
     estimators: tuple[str, ...] = ("o1", "moments")
-    """With the model of who knows the disturbance."""
+    """Estimators with the known model of the disturbance."""
     identified: tuple[str, ...] = ()
-    """With the model that is found in the past exposures alone."""
+    """Estimators with the model that is identified from the past exposures alone."""
 
     def __str__(self) -> str:
         kind = {"own": "turbulence", "hcipy": "HCIPy's turbulence", "": ""}[self.turbulence]
@@ -79,7 +80,7 @@ class Cell:
         return together(parts)
 
     def rig(self, model: ProcessSum) -> Rig:
-        """The rig `loop` with this camera, which believes in ``model``."""
+        """The rig `loop` with this camera and ``model``."""
         text = load_rig("loop").toml.replace("exposure_steps = 50", f"exposure_steps = {self.steps}")
         # The variance of the centroid is 2/3 V.
         text = text.replace("noise_density = 1e-5", f"noise_density = {1.5 * (self.noise * self.sd) ** 2:.6g}")
@@ -108,7 +109,7 @@ FACTORS = tuple(
         Cell("own", at, noise=0.1),
     )
 )  # fmt: skip
-"""One at a time, around 1.5 widths, 50 steps and 2 %."""
+"""Cells in which one factor is changed at a time from 1.5 widths, 50 steps and 2 %."""
 
 
 @dataclass(frozen=True)
@@ -117,11 +118,11 @@ class Size:
 
     seeds: Sequence[int] = range(701, 706)
     past: int = 200
-    """Exposures with the mirror at rest that predictors are fitted to and models identified from, ..."""
+    """Exposures with the mirror at rest, to which predictors are fitted and from which models are identified."""
     exposures: int = 100
-    """... and those after them whose loop is closed, ..."""
+    """Exposures after those, with the loop closed."""
     settled: int = 20
-    """... the first of which are left out."""
+    """Number of the first of these, which are left out."""
     gains: Sequence[float] = GAINS
 
 
@@ -131,11 +132,11 @@ SHORT = Size(seeds=range(1, 3), past=64, exposures=6, settled=3, gains=GAINS[:1]
 
 @dataclass(frozen=True)
 class Goal:
-    """A ratio that is to be at most ``limit`` with its bound."""
+    """A goal: the bound of a ratio is at most ``limit``."""
 
     name: str
     over: str
-    """Empty for the best integrator."""
+    """What the ratio is to; empty for the best integrator."""
     limit: float
 
 
@@ -146,7 +147,7 @@ class Measured:
     cell: Cell
     rms: Mapping[str, FloatArray]
     lines: tuple[float, ...]
-    """Where the line was identified, times the frame rate, by seed; empty where it was not looked for."""
+    """Identified frequency of the vibration over the frame rate, by seed; empty where it was not searched for."""
 
     @cached_property
     def best(self) -> str:
@@ -155,7 +156,7 @@ class Measured:
 
     @property
     def ours(self) -> list[str]:
-        """What served `lqg`."""
+        """The estimators that served `lqg`."""
         return [*self.cell.estimators, *(f"identified {name}" for name in self.cell.identified)]
 
     @property
@@ -173,11 +174,11 @@ class Measured:
         return found
 
     def reaches(self, goal: Goal) -> bool:
-        """Whether the bound keeps it."""
+        """Whether the bound keeps the goal."""
         return self.ratio(goal.name, goal.over).bound <= goal.limit
 
     def ratio(self, name: str, over: str = "") -> Ratio:
-        """To the best integrator, or to another."""
+        """The ratio to the best integrator, or to another controller."""
         return Ratio.of(self.rms[name] / self.rms[over or self.best])
 
 
@@ -209,7 +210,8 @@ def measured(cell: Cell, size: Size) -> Measured:
 
 
 def all_measured(cells: Sequence[Cell], short: bool) -> Iterator[Measured]:
-    """Each cell measured; for a short form the first, with short exposures. Standard error says how long each took."""
+    """Each cell measured; in a short run only the first, with short exposures. Standard error output has the time of
+    each."""
     for cell in [replace(cells[0], steps=20)] if short else cells:
         start = time.monotonic()
         yield measured(cell, SHORT if short else FULL)
@@ -251,7 +253,7 @@ def _of_seed(cell: Cell, seed: int, size: Size) -> tuple[dict[str, float], Proce
 
 
 def _played(believes: Rig, slopes: FloatArray, path: Path) -> Rig:
-    """A rig that is disturbed by these slopes, whatever it believes in."""
+    """A rig that these slopes disturb, whatever its model is."""
     np.save(path.with_suffix(".npy"), slopes[:, None])
     table = f'[disturbance]\nplant_noise = false\nrecorded = "{path.stem}.npy"\n\n[simulation]'
     path.write_text(believes.toml.replace("[simulation]", table, 1))
@@ -259,7 +261,7 @@ def _played(believes: Rig, slopes: FloatArray, path: Path) -> Rig:
 
 
 def _identified(rig: Rig, exposures: list[Exposure], kinds: Sequence[str]) -> ProcessSum:
-    """What `aolink identify --model` finds of blurred frames alone, without its intervals."""
+    """The model that `aolink identify --model` finds from blurred frames alone, without its intervals."""
     seen = [readings(rig, exposures)]
     space = space_of(kinds, seen, rig.sensor.kernel.variance, with_noise=False, with_kernel=False)
     return space.model(maxima(space, seen)[0].x)
@@ -271,7 +273,7 @@ def worth_headline(effort: Effort) -> list[Row]:
 
 
 def worth_lines(effort: Effort) -> list[Row]:
-    """The same with the line elsewhere, and with HCIPy's turbulence."""
+    """The same with the vibration at other frequencies, and with HCIPy's turbulence."""
     return _rows(TURBULENCE_AND_LINE, effort)
 
 
@@ -291,7 +293,7 @@ def worth_factors(effort: Effort) -> list[Row]:
 
 
 def _rows(cells: Sequence[Cell], effort: Effort) -> list[Row]:
-    """A line for each cell, and one for each of its goals."""
+    """A row for each cell, and one for each of its goals."""
     rows = []
     for each in all_measured(cells, effort.share < 1):
         rows += [_row(each), *(_goal_row(each, goal) for goal in each.goals)]

@@ -13,12 +13,12 @@ from aolink.rig.scene_table import read_scene_picture
 from bench_rows.row import Effort, Row
 
 EXPOSURES = 100
-# What the estimated path is to give more than the blurred picture has.
+# Least gain in PSNR with the estimated path over the blurred picture, dB.
 _GOALS = {"moments": 1.5, "profile": 1.5}
 
 
 def moving_scene(effort: Effort) -> list[Row]:
-    """Mean PSNR over a session, by tv; the peer is the picture as it came, with its shift forgiven."""
+    """Mean PSNR over a session, by tv; the peer is the picture as it came, with its shift removed."""
     exposures = aolink.simulate("moving-scene", effort.of(EXPOSURES))
     rig, sensor = exposures.rig, exposures.rig.scene
     assert sensor is not None

@@ -33,7 +33,8 @@ from bench_rows.row import Effort, Row
 
 RIG = "section-vi"
 _LOOK_S = 1.4
-"""When the mirror is asked what it held, after the way out: later than all of them, and within what it remembers."""
+"""Time after the session's end at which the mirror is asked for its inputs, s: later than every parking, and within its
+history."""
 _DRIVEN_STEPS = 400
 _RAISES = """
 import sys, time
@@ -51,7 +52,8 @@ Host = subprocess.Popen[str]
 
 
 class Tap:
-    """A line between a host and a mirror, which can be cut, and whose mirror can be asked what it held."""
+    """A serial line between a host and a mirror, which can be cut, and whose mirror can be asked for the inputs that it
+    held."""
 
     def __init__(self, mirror_port: str) -> None:
         self._device = SerialPort(mirror_port)
@@ -60,7 +62,7 @@ class Tap:
         self.port = os.ttyname(slave)
         self._slave = slave
         self.driven = threading.Event()
-        """The mirror has held what a host commanded in some hundred steps."""
+        """Set when the mirror has held commanded inputs in some hundred steps."""
         self._steps = 0
         self._step_zero_ns = 0
         self._packets, self._messages = PacketDecoder(), MessageDecoder()
@@ -70,7 +72,7 @@ class Tap:
         self._thread.start()
 
     def cut(self) -> int:
-        """Nothing gets through any more; gives the time on the system's monotonic clock, ns."""
+        """Cut the line; gives the time on the system's monotonic clock, ns."""
         if not self._over.is_set():
             self._over.set()
             self._thread.join()
@@ -83,7 +85,7 @@ class Tap:
         self._device.close()
 
     def parked_after_s(self, since_ns: int, fast_step_ns: int) -> float:
-        """From a time to the first fast step from which on the mirror held its safe input; not a number if not yet."""
+        """Time until the first fast step from which on the mirror held its safe input, s; NaN if there is none yet."""
         before = time.monotonic_ns()
         reply = self._ask(pb.ClockQuery(query_id=1, host_send_ns=before), pb.ClockReply, lambda m: m.query_id == 1)
         offset_ns = reply.device_receive_ns - (before + time.monotonic_ns()) // 2
@@ -153,11 +155,11 @@ def _by_its_end(host: Host, tap: Tap) -> int:
 
 @dataclass(frozen=True)
 class Way:
-    """A way out of a session."""
+    """A way in which a session may end."""
 
     name: str
     take: Callable[[Host, Tap], int]
-    """Takes it, and gives the time, on the system's monotonic clock, ns."""
+    """Function that ends the session so, and gives the time on the system's monotonic clock, ns."""
 
 
 WAYS = (
@@ -173,7 +175,7 @@ WAYS = (
 
 
 def parked_after_s(way: Way, camera: str, mirror: str) -> float:
-    """Record a session from the two ports, take a way out of it, and ask the mirror when it was parked, s."""
+    """Record a session from the two ports, end it in the given way, and ask the mirror when it was parked, s."""
     rig = load_rig(RIG)
     tap = Tap(mirror)
     with tempfile.TemporaryDirectory() as folder:
@@ -214,7 +216,7 @@ def reference_device() -> Iterator[tuple[str, str]]:
 
 
 def time_to_park(effort: Effort) -> list[Row]:
-    """Each way out of a session, with the simulated rig and with the reference device in C."""
+    """Each way in which a session may end, with the simulated rig and with the reference device in C."""
     devices: dict[str, Callable[[], AbstractContextManager[tuple[str, str]]]] = {
         "simulated rig": lambda: simulated_rig(RIG, "--real-time")
     }

@@ -31,19 +31,19 @@ def _best(case: Case, made: list[FloatArray]) -> FloatArray:
 
 
 def wiener(case: Case) -> FloatArray:
-    """The best of many balances."""
+    """Wiener's filter with the best of many balances."""
     wide, taps = _padded(case.image), case.psf.values[None]
     return _best(case, [_cut(restoration.wiener(wide, taps, b, clip=False)) for b in np.geomspace(1e-4, 3, 19)])
 
 
 def unsupervised_wiener(case: Case) -> FloatArray:
-    """As it comes, with a fixed seed."""
+    """The unsupervised Wiener filter with its defaults and a fixed seed."""
     found, _ = restoration.unsupervised_wiener(_padded(case.image), case.psf.values[None], clip=False, rng=1)
     return _cut(found)
 
 
 def richardson_lucy(case: Case) -> FloatArray:
-    """The best of several numbers of iterations."""
+    """Richardson-Lucy with the best of several numbers of iterations."""
     wide, taps = np.maximum(_padded(case.image), 1e-6), case.psf.values[None]
     counts = (3, 6, 12, 25, 50, 100)
     return _best(case, [_cut(restoration.richardson_lucy(wide, taps, n, clip=False)) for n in counts])
@@ -76,13 +76,13 @@ def _bm3d(image: FloatArray, case: Case) -> FloatArray:
 
 
 def bm3d_padded(case: Case) -> FloatArray:
-    """Beyond the frame, its mirror image: so far that the ends, which its transforms join, fit."""
+    """BM3D with the frame's mirror image beyond the frame, so far that the ends, which its transforms join, fit."""
     half = case.image.shape[0] // 2
     return _bm3d(np.pad(case.image, half, mode="symmetric"), case)[half:-half, half:-half]
 
 
 def bm3d_filled(case: Case) -> FloatArray:
-    """Beyond the frame, what the scene that gauss_markov finds, which goes on there, would have left."""
+    """BM3D with the blur of the scene of gauss_markov, which continues there, beyond the frame."""
     found = restore(case.image, case.psf, method="gauss_markov")
     solver = line_solver(case.psf, case.image.shape, found.difference_weight * found.noise_sd**2)
     scene = solver.solve(solver.project(case.image[None]))[0]

@@ -25,7 +25,7 @@ KERNEL = Kernel(shape="gaussian", sigma=0.3)
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Case:
-    """A blurred picture and what it was."""
+    """A blurred picture and its scene."""
 
     name: str
     image: FloatArray
@@ -34,7 +34,7 @@ class Case:
 
 
 def _centred(values: FloatArray) -> Psf:
-    """An odd number of taps about the origin, as the peers expect it."""
+    """The PSF with an odd number of taps about the origin, as the peers expect it."""
     values = np.concatenate([np.zeros(1 - len(values) % 2), values])
     return Psf(values=values, origin=(len(values) // 2,))
 
@@ -51,7 +51,7 @@ def paths() -> dict[str, FloatArray]:
 
 
 def psfs() -> dict[str, Psf]:
-    """Uniform over 9, 15 and 31 pixels, and those of the two paths."""
+    """PSFs that are uniform over 9, 15 and 31 pixels, and those of the two paths."""
     moved = {
         name: _centred(np.trim_zeros(motion_psf(path, None, KERNEL, 1.0).values)) for name, path in paths().items()
     }
@@ -72,7 +72,7 @@ def wide_scene(name: str, size: int = 256) -> FloatArray:
 
 
 def blurred(name: str, psf: Psf, size: int = 256, noise_sd: float = NOISE_SD) -> Case:
-    """The scene goes on where the frame ends."""
+    """The picture of a scene that continues beyond the frame."""
     scene, (origin,), first = wide_scene(name, size), psf.origin, _MARGIN // 2
     image = np.zeros((size, size))
     for j, tap in enumerate(psf.values):
@@ -96,13 +96,13 @@ def picture_size(effort: Effort, whole: int = 256) -> int:
 
 
 def psnr(found: FloatArray, scene: FloatArray) -> float:
-    """dB, for a peak of one."""
+    """Peak signal-to-noise ratio, dB, for a peak of one."""
     return float(-10 * np.log10(np.mean((found - scene) ** 2)))
 
 
 @dataclass(frozen=True, kw_only=True)
 class Quality:
-    """Mean PSNR over pictures, dB: of all pixels, and apart of those more and less than 32 from left and right."""
+    """Mean PSNR over pictures, dB: of all pixels, and separately of those more and less than 32 from left and right."""
 
     whole: float
     inside: float

@@ -1,4 +1,4 @@
-"""What an exposure costs against what it grows with: curves on one page, and their slopes."""
+"""Curves of an exposure's cost against the sizes that it depends on, on one page, and their slopes."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Curve:
 
     @property
     def slope(self) -> float:
-        """Power of the size that the cost goes with in the larger half of the sizes: the slope of the logarithms."""
+        """Exponent of the cost as a power of the size, in the larger half of the sizes: the slope of the logarithms."""
         half = len(self.sizes) // 2
         x, y = np.log(self.sizes[half:]), np.log(self.costs[half:])
         return float(np.polyfit(x, y, 1)[0])
@@ -66,7 +66,7 @@ def _replaced(text: str, old: str, new: str) -> str:
 
 
 def curves(effort: Effort) -> list[Curve]:
-    """All of them, measured."""
+    """All curves, measured."""
     squares = [side * side for side in (1, 2, 4, 7, 12, 20, 30, 40, 50)]
 
     def grid(text: str, spots: int) -> str:
@@ -89,7 +89,7 @@ def curves(effort: Effort) -> list[Curve]:
 
 
 def _length(effort: Effort) -> Curve:
-    """A recording estimated again."""
+    """The time to estimate a recording again, against its length."""
     from aolink.recording.reader import Recording
     from aolink.recording.reestimate import reestimate
     from bench_rows.recording import record_long
@@ -103,7 +103,7 @@ def _length(effort: Effort) -> Curve:
 
 
 def _rate(effort: Effort) -> Curve:
-    """A second of data, whose fast steps are in more and more exposures."""
+    """The time for a second of data, against the number of exposures that its fast steps are divided into."""
     rates, text = [1, 2, 5, 10, 20, 50], load_rig("section-vi-lively").toml
     costs = []
     for rate in rates:

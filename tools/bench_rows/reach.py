@@ -1,4 +1,5 @@
-"""What comes through a line that flips bits: on virtual time beside a session without faults, and in real time."""
+"""Rows about sessions over a serial line that flips bits: on virtual time beside a session without faults, and in real
+time."""
 
 from __future__ import annotations
 
@@ -40,7 +41,7 @@ _DEVICE = Path(__file__).parents[1] / "device"
 
 
 class WrongError(Exception):
-    """Something false was recorded or done, which no rate of errors excuses."""
+    """False data was recorded, or a false command was executed, which no rate of errors excuses."""
 
 
 def _require(what: str, number: int) -> None:
@@ -64,8 +65,8 @@ def _virtual(folder: Path, rig_name: str, rate: float, exposures: int) -> tuple[
 def bit_errors(effort: Effort) -> list[Row]:
     """Ten minutes of section-vi on virtual time at each rate, against the same session without faults.
 
-    The same seed and the same commands make the same path, so the path that the rig says was true shows at each fast
-    step whether every command was taken once and in its place; truths that were lost on the line say nothing.
+    The same seed and the same commands make the same path, so the rig's true path shows at each fast step whether every
+    command was taken once and in its place; truths that were lost on the line are not checked.
     """
     exposures, rows = effort.of(_EXPOSURES, 20), []
     with tempfile.TemporaryDirectory() as name:
@@ -125,10 +126,11 @@ def large_frames(effort: Effort) -> Row:
 
 
 class Cable:
-    """A bad line to a device: a pseudo terminal whose bytes are damaged on their way, both ways, and what was true.
+    """A bad serial line to a device: a pseudo terminal whose bytes are damaged in both directions, and the undamaged
+    data.
 
-    It damages packets from the first command of a session on, as `aolink rig --fault` does, and keeps what the device
-    said before the damage: the pixels of frames, and which block held the mirror at each step, with which input.
+    It damages packets from the first command of a session on, as `aolink rig --fault` does, and keeps the device's
+    messages before the damage: the pixels of frames, and which block held the mirror at each step, with which input.
     """
 
     def __init__(self, port: str, rate: float, seed: int) -> None:
@@ -140,7 +142,7 @@ class Cable:
         self.pixels: dict[int, bytearray] = {}
         self.held: dict[int, tuple[int, bytes]] = {}
         self.contradictions = 0
-        """Steps about which the device said two things."""
+        """Steps for which the device reported two inputs."""
         self.held_up_s = 0.0
         """The longest time for which the machine did not run this thread though it had nothing to wait for."""
         self._device = SerialPort(port)
@@ -223,7 +225,8 @@ def _reference_device(folder: Path) -> Iterator[tuple[str, str]]:
 
 
 def _soak(device: str, rate: float, seconds: int, seed: int, folder: Path) -> Row:
-    """A session in real time through two bad lines; what was recorded and done is what the device said."""
+    """A session in real time through two bad lines; its recording and its commands are compared with the device's
+    messages."""
     from aolink.jobs.demo import simulated_rig
     from aolink.recording.reader import Recording
     from aolink.rig import load_rig
@@ -271,7 +274,7 @@ def _soak(device: str, rate: float, seconds: int, seed: int, folder: Path) -> Ro
 
 
 def soak(effort: Effort) -> list[Row]:
-    """Both devices at both rates, one after the other, in real time: what is false ends the row with an error."""
+    """Both devices at both rates, one after the other, in real time: false data ends the row with an error."""
     rows = []
     for number, (device, rate) in enumerate(itertools.product(("simulated rig", "reference device"), _LATE)):
         with tempfile.TemporaryDirectory() as name:

@@ -94,7 +94,7 @@ def kill_at_any_moment(effort: Effort) -> Row:
 
 
 def _many_chunks(folder: Path) -> tuple[bytes, list[tuple[int, int, int]]]:
-    """A recording of several MB, and of each chunk its first byte, the byte after its last, and its messages."""
+    """A recording of several MB, and for each chunk its first byte, the byte after its last, and its messages."""
     path = folder / "long.mcap"
     file = McapFile(path, WriteOptions())
     begin_recording(file, load_rig("section-vi"), {}, 0, {})
@@ -152,7 +152,8 @@ def flipped_bits(effort: Effort) -> Row:
 
 
 def loop_stall(effort: Effort) -> Row:
-    """The longest time that a 1 kHz loop waits for the recorder, in 20 s; and what the machine takes from it anyway."""
+    """The longest time that a 1 kHz loop waits for the recorder, in 20 s; and the delays by the machine without a
+    recorder."""
     with tempfile.TemporaryDirectory() as folder:
         spent = np.array(_session(Path(folder) / "a.mcap", effort.share * _LOOP_S)) * 1e3
     alone = np.array(_loop(effort.share * _LOOP_S, lambda topic, message, now: message.SerializeToString())) * 1e3
@@ -337,7 +338,7 @@ def hour(effort: Effort) -> Path:
 
 
 def rrd_size(effort: Effort) -> Row:
-    """The .rrd of an hour, in bytes of the recording; and by how much writing it makes the process grow."""
+    """The size of the .rrd of an hour over that of the recording; and the memory that writing it takes."""
     from aolink.viewing import save_rrd
 
     recording, grown = Recording(hour(effort)), list[float]()
@@ -350,7 +351,7 @@ def rrd_size(effort: Effort) -> Row:
 
 
 def view_first(effort: Effort) -> Row:
-    """From when a recording of an hour is opened until its first part is with the viewer, which is an unseen one."""
+    """Time from opening a recording of an hour until its first part is with the viewer, which has no window."""
     import rerun as rr
 
     from aolink.viewing import Look

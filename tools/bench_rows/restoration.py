@@ -25,9 +25,9 @@ from bench_rows.pictures import (
 )
 from bench_rows.row import Effort, Row, median_s
 
-# Mean PSNR that each method is to reach on the seven pictures, dB.
+# Mean PSNR that each method has to reach on the seven pictures, dB.
 _GOALS: dict[str, float] = {"smoother": 28.1, "gauss_markov": 28.8, "tv": 30.2, "pnp": 31.4}
-# Time that each is to take at 512 x 512 on two threads, ms.
+# Most time that each may take at 512 x 512 on two threads, ms.
 _LIMITS_MS = {"smoother": 15.0, "gauss_markov": 25.0, "tv": 200.0}
 
 
@@ -59,7 +59,8 @@ def restoration_quality(effort: Effort) -> list[Row]:
 
 
 def restoration_uncertainty(effort: Effort) -> list[Row]:
-    """The motion's range is off by one standard deviation: told of it, against not told."""
+    """The motion's range is wrong by one standard deviation: restoration with this uncertainty given, against without
+    it."""
     rows, path = [], paths()["damped sinusoid"]
     for share in (0.02, 0.05):
         told = motion_psf(path, share**2 * np.outer(path, path), KERNEL, 1.0)
@@ -83,7 +84,7 @@ def restoration_uncertainty(effort: Effort) -> list[Row]:
 
 
 def restoration_time(effort: Effort) -> list[Row]:
-    """With weights given; the Gauss-Markov solver of the PSF made before."""
+    """The time with given weights; the Gauss-Markov solver of the PSF is made before."""
     size = picture_size(effort, 512)
     case = blurred("camera", psfs()["uniform 15"], size)
     image, psf, variance, weight = case.image, case.psf, NOISE_SD**2, 80.0

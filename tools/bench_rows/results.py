@@ -1,4 +1,4 @@
-"""What a run of the benchmark found, as JSON, and what has moved since another run."""
+"""The results of a run of the benchmark, as JSON, and their changes since another run."""
 
 from __future__ import annotations
 
@@ -20,24 +20,24 @@ _PACKAGES = ("aolink", "numpy", "scipy", "numba", "mcap", "protobuf", "rerun-sdk
 _LEAST_NOISE = 0.02
 """Least noise of a ratio, where a few runs happen to agree better than that."""
 _SIGMAS = 2.0
-"""Times the noise that a change has to be to count as one."""
+"""Least size of a change that counts, in units of the noise."""
 
 
 @dataclass(kw_only=True)
 class Result:
-    """A figure as it came out, once or several times."""
+    """A figure, measured once or several times."""
 
     name: str
-    """Room and function, and the number of the figure where a function has several."""
+    """Module and function, and the number of the figure where a function has several."""
     figure: str
     ours: str
     peer: str
     values: list[float] = field(default_factory=list)
-    """How many times better than the peer or limit, one for each run."""
+    """Ratio to the peer or limit, above one where it is better, one value for each run."""
     target: float | None = None
-    """What it should be at least; None where the figure could not be measured."""
+    """The least value that it should have; None where the figure could not be measured."""
     error: str | None = None
-    """Why it could not."""
+    """The reason why it could not be measured."""
 
     @property
     def value(self) -> float:
@@ -51,7 +51,7 @@ class Result:
 
 
 def results(name: str, runs: Sequence[Row | list[Row]]) -> list[Result]:
-    """What the runs of one function found, figure by figure; the words are those of the last run."""
+    """The results of the runs of one function, figure by figure; the texts are those of the last run."""
     every = [run if isinstance(run, list) else [run] for run in runs]
     return [
         Result(
@@ -63,13 +63,13 @@ def results(name: str, runs: Sequence[Row | list[Row]]) -> list[Result]:
 
 
 def failure(name: str, error: Exception) -> Result:
-    """A function that could not measure."""
+    """The result of a function that could not measure."""
     what = f"{type(error).__name__}: {error}"
     return Result(name=name, figure=name, ours=f"failed: {what}", peer="", error=what)
 
 
 def machine() -> dict[str, Any]:
-    """What the figures depend on: processor, commit, versions."""
+    """The facts that the figures depend on: processor, commit, versions."""
     return {
         "processor": _processor(),
         "cores": os.cpu_count(),
@@ -82,13 +82,13 @@ def machine() -> dict[str, Any]:
 
 
 def write(path: Path, found: Sequence[Result], *, short: bool) -> None:
-    """A run as JSON."""
+    """Write a run as JSON."""
     text = json.dumps({"machine": machine(), "short": short, "rows": [asdict(each) for each in found]}, indent=1)
     path.write_text(text + "\n")
 
 
 def read(path: Path) -> tuple[dict[str, Any], list[Result]]:
-    """Machine and rows of a file of `write`. Raises ValueError for what is none."""
+    """Machine and rows of a file of `write`. Raises ValueError for another file."""
     try:
         data = json.loads(path.read_text())
         return data["machine"], [Result(**row) for row in data["rows"]]
@@ -99,10 +99,10 @@ def read(path: Path) -> tuple[dict[str, Any], list[Result]]:
 
 
 def moved(before: Sequence[Result], now: Sequence[Result]) -> list[tuple[str, str, str, str]]:
-    """Figures that have moved beyond their own noise: figure, before, now, and by how much or what else has happened.
+    """Figures that have moved beyond their own noise: figure, value before, value now, and the change in words.
 
     The noise of a figure is the largest deviation of a run from the median of its runs, before and now, as a ratio.
-    Where there was one run only the noise of a figure is not known, and it is said.
+    With one run only, the noise of a figure is not known, and the text says so.
     """
     earlier: Mapping[str, Result] = {each.name: each for each in before}
     lines = []
@@ -118,7 +118,7 @@ def moved(before: Sequence[Result], now: Sequence[Result]) -> list[tuple[str, st
 
 
 def _change(old: Result, new: Result) -> str:
-    """In words; empty where a figure has not moved."""
+    """The change in words; empty where a figure has not moved."""
     if old.value == new.value:
         return ""
     if not (old.value > 0 and new.value > 0 and math.isfinite(old.value) and math.isfinite(new.value)):

@@ -1,4 +1,4 @@
-"""Controllers beside ours: the predictors of pyRTC, and one that is told the disturbance's true state."""
+"""Controllers to compare with ours: the predictors of pyRTC, and one that is given the disturbance's true state."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ PREDICTORS = ("ar_kalman", "least_squares")
 
 
 class _MirrorFollowed:
-    """Knows what the mirror did, by its model and the inputs that it held, all of which it is shown."""
+    """Computes the mirror's motion by its model and the inputs that it held, all of which it gets."""
 
     def __init__(self, rig: Rig) -> None:
         moved, _ = reached(rig.plant)
@@ -88,7 +88,7 @@ class TrueState(_MirrorFollowed):
 def predicted(name: str, centroids: FloatArray) -> ControllerRow:
     """A predictor of pyRTC fitted to the centroids of past exposures with the mirror at rest, (exposures, 1).
 
-    The correction acts from the next exposure on: one frame ahead. All else is as pyRTC has it.
+    The correction acts from the next exposure on: one frame ahead. Everything else is as in pyRTC.
     """
     predictor = make_predictor({"type": name, "horizon": 1}, centroids.shape[1]).fit(centroids)
     for each in centroids:
@@ -99,7 +99,7 @@ def predicted(name: str, centroids: FloatArray) -> ControllerRow:
 
 
 def with_true_state(known: Disturbance) -> ControllerRow:
-    """For a loop whose first fast step has the first row of ``known``."""
+    """The row of the controller for a loop whose first fast step has the first row of ``known``."""
     return ControllerRow(
         name="true-state", summary="the limit", build=lambda rig: TrueState(rig, known), needs_state=False
     )  # fmt: skip

@@ -1,4 +1,4 @@
-"""Which rows there are."""
+"""The list of all rows."""
 
 ROWS = {
     "estimation": (

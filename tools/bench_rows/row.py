@@ -1,4 +1,4 @@
-"""What a benchmark gives: one line of the table."""
+"""The result of a benchmark: one line of the table."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class Effort:
     share: float
 
     def of(self, whole: int, least: int = 1) -> int:
-        """So many runs, exposures or seconds of ``whole``, which is what the row's figure needs."""
+        """The number of runs, exposures or seconds to do; ``whole`` is the number that the row's figure needs."""
         return max(least, round(self.share * whole))
 
 
@@ -29,13 +29,13 @@ SHORT = Effort(0.02)
 
 @dataclass(frozen=True)
 class Row:
-    """One figure: ours, the peer's, and what the ratio should be."""
+    """One figure: ours, the peer's, and the ratio that is required."""
 
     figure: str
     ours: str
     peer: str
     ratio: float
-    """How many times better than the peer or limit."""
+    """Ratio to the peer or limit, above one where ours is better."""
     target: float
 
 

@@ -1,4 +1,4 @@
-"""Pictures blurred by camera shake: PSNR and time beside SCICO, whose parameters the truth chooses."""
+"""Pictures blurred by camera shake: PSNR and time beside SCICO, whose parameters are chosen with the truth."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ _SIZE = 256
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Shaken:
-    """A blurred picture and what it was."""
+    """A blurred picture and its scene."""
 
     image: FloatArray
     scene: FloatArray
     kernel: FloatArray
     circular: bool
-    """Whether the scene goes on with its other side, and both methods are told so."""
+    """Whether the scene is periodic, which both methods are then given."""
 
     @property
     def reach(self) -> int:
@@ -79,7 +79,7 @@ def shaken(effort: Effort) -> list[Row]:
 def _both(case: Shaken, method: str, peer: Solve, parameters: tuple[float, ...]) -> tuple[float, float, float, float]:
     """PSNRs and processor times, ours and the peer's at the best of its parameters."""
     mine, seconds = _timed(lambda: _ours(case, method))
-    peer(case, parameters[0])  # it compiles
+    peer(case, parameters[0])  # the first call compiles
     best = max((psnr(*found), -s) for p in parameters for found, s in [_scored(case, peer, p)])
     return psnr(mine, case.scene), best[0], seconds, -best[1]
 
@@ -96,14 +96,14 @@ def _timed(work: Callable[[], FloatArray]) -> tuple[FloatArray, float]:
 
 def _ours(case: Shaken, method: str) -> FloatArray:
     psf = Psf(values=case.kernel, origin=(case.reach, case.reach))
-    # A scene that goes round is one whose picture is known beyond the frame.
+    # The picture of a periodic scene is known beyond the frame.
     pad = 2 * case.reach if case.circular else 0
     found = restore(np.pad(case.image, pad, mode="wrap"), psf, method=method).image
     return np.asarray(found[pad : len(found) - pad, pad : found.shape[1] - pad])
 
 
 def _scico() -> Any:
-    """SCICO on one thread. Raises ModuleNotFoundError with what installs it."""
+    """SCICO on one thread. Raises ModuleNotFoundError with the command that installs it."""
     os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1")
     try:
         import scico.functional

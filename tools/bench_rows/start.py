@@ -1,4 +1,4 @@
-"""What a command takes from its start on, imports and all: a process of its own each time.
+"""The time that a command takes from its start on, imports included, in a process of its own each time.
 
 Its files are in the cache, and its modules compiled, as they are wherever a package is installed.
 """
@@ -30,7 +30,7 @@ _NOT_COMPILED = shutil.ignore_patterns("__pycache__")
 
 @contextmanager
 def _compiled() -> Iterator[None]:
-    """The processes that are started here keep what they compile, and find it."""
+    """A folder in which the processes started here keep their compiled code."""
     before = dict(os.environ)
     with tempfile.TemporaryDirectory() as folder:
         os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
@@ -57,7 +57,7 @@ def _row(what: str, command: Sequence[str | Path], peer: str, limit_s: float, ef
 
 
 def command_start(effort: Effort) -> list[Row]:
-    """The package and the command alone."""
+    """The start of the package and of the command alone."""
     return [
         _row("import aolink", (sys.executable, "-c", "import aolink"), "pass", 0.3, effort),
         _row("aolink --help", (*_COMMAND, "--help"), "import typer, rich.console", 0.3, effort),
@@ -74,7 +74,7 @@ make_estimator(rig, "profile").step(next(iter(aolink.simulate(rig, 1, seed=1))))
 
 
 def first_profile(_: Effort) -> Row:
-    """In a package that nobody has used yet: its installation compiles, and then the first `profile`."""
+    """The first `profile` in a package that has not been used yet, after its installation has compiled."""
     with tempfile.TemporaryDirectory() as name:
         own = shutil.copytree(Path(aolink.__file__).parent, Path(name) / "aolink", ignore=_NOT_COMPILED)
         where = {"PYTHONPATH": str(own.parent), "PYTHONSAFEPATH": "1"}
@@ -87,7 +87,8 @@ def first_profile(_: Effort) -> Row:
 
 
 def view_start(effort: Effort) -> list[Row]:
-    """From the start of `aolink view` to the file of one exposure, and to the first part of an hour in a web viewer."""
+    """Time from the start of `aolink view` to the file of one exposure, and to the first part of an hour in a web
+    viewer."""
     peer = "import numpy, rerun"
     with tempfile.TemporaryDirectory() as name:
         saved = Path(name) / "one.rrd"

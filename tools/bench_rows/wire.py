@@ -49,7 +49,7 @@ def link_throughput(effort: Effort) -> Row:
         return elapsed
 
     def write_all(descriptor: int, data: bytes) -> None:
-        end_with_parent()  # nobody reads from it any more when that is killed
+        end_with_parent()  # no process reads from it after that one is killed
         view = memoryview(data)
         while view:
             view = view[os.write(descriptor, view[:65536]) :]
@@ -96,7 +96,8 @@ def commands_at_1_khz(effort: Effort) -> Row:
 
 
 def slow_estimator(effort: Effort) -> Row:
-    """A session in real time with an estimator that is slower than the camera, and one without: what else it costs."""
+    """A session in real time with an estimator that is slower than the camera, and one without: what it costs
+    besides."""
     from aolink.jobs.demo import simulated_rig
     from aolink.rig import load_rig, parse_rig
     from aolink.session import record

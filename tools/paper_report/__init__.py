@@ -1,1 +1,1 @@
-"""What `tools/paper` makes: the figures, the numbers and the claims of Mishra & Wen, from our own runs."""
+"""The content of `tools/paper`: the figures, the numbers and the claims of Mishra & Wen, from our own runs."""

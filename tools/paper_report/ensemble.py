@@ -1,4 +1,4 @@
-"""Many independent runs of a rig at once, their errors, and what can be said of those with which certainty."""
+"""Many independent runs of a rig at once, their errors, and the uncertainty of these."""
 
 from __future__ import annotations
 
@@ -121,7 +121,7 @@ class Errors:
     start: FloatArray
     """Squared norm of the error of the state at the exposure's start."""
     end: FloatArray
-    """The same at its end."""
+    """Squared norm of the error of the state at its end."""
 
 
 def errors(exposures: Sequence[Exposure], estimates: Sequence[Estimate], skip: int) -> Errors:
@@ -206,9 +206,9 @@ class Cell:
     path: Measured
     """o3/o1, ratio of the RMSE of the path."""
     start: Measured
-    """The same of the start state's norm."""
+    """The same ratio for the start state's norm."""
     end: Measured
-    """The same of the end state's norm."""
+    """The same ratio for the end state's norm."""
     rmse: Mapping[str, Measured]
     """RMSE of the path by estimator."""
 

@@ -1,7 +1,7 @@
-"""A family of scenes, drawn by seed: plants that nobody tuned an estimator for.
+"""A family of scenes, drawn by seed: plants on which no estimator was tuned.
 
-A scene is a rig, and what is simulated from it: several independent runs side by side, as axes of one rig. Seeds for
-tuning and seeds for reporting are apart (`SEEDS`): figures are those of the second, which nobody looks at before.
+A scene is a rig and a simulation of it: several independent runs side by side, as axes of one rig. Seeds for tuning and
+seeds for reporting are separate (`SEEDS`): figures are those of the second, which are not used before.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from aolink.simulation.model import simulate
 from paper_report.ensemble import SensorRows
 
 SEEDS = {"tuning": range(100_000), "reporting": range(100_000, 200_000)}
-"""By name; each judgement takes the first ones of its range."""
+"""Ranges of seeds by name; each judgement takes the first ones of its range."""
 
 MODES = (1, MOST_MODES)
 SWINGS = (0.05, MOST_SWINGS)
@@ -60,21 +60,23 @@ Geometry = Literal["line", "plane", "plane, one plant"]
 
 @dataclass(frozen=True, kw_only=True)
 class Mode:
-    """One part of a plant, independent of the others."""
+    """One process in a plant, independent of the others."""
 
     kind: Literal["resonance", "Ornstein-Uhlenbeck", "random walk"]
     swings: float
-    """Swings of a resonance in an exposure; of another, 1/(2 pi memory in exposures); of a random walk 0."""
+    """Swings of a resonance in an exposure; for an Ornstein-Uhlenbeck process, 1/(2 pi memory in exposures); for a
+    random walk 0."""
     damping: float
     sd: float
-    """Standard deviation of what it adds to the path, slope units; of a random walk, what it gains in the whole run."""
+    """Standard deviation of its part of the path, slope units; for a random walk, the standard deviation gained in the
+    whole run."""
     direction: float
-    """In which it moves a spot on a plane, if one plant moves it along both axes, rad."""
+    """Direction in which it moves a spot on a plane, if one plant moves it along both axes, rad."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Scene:
-    """One scene, as it was drawn."""
+    """The drawn parameters of one scene."""
 
     seed: int
     geometry: Geometry
@@ -95,17 +97,17 @@ class Scene:
     lost: float
     """Share of frames that are lost."""
     masked: float
-    """Share of a line's pixels that are dead; as many more are missing in a frame now and then. On a plane a pixel that
-    is masked costs the whole spot, so none is dead, and three in ten frames are of no use."""
+    """Share of a line sensor's pixels that are dead; the same share is missing in a frame now and then. On a plane a
+    pixel that is masked costs the whole spot, so none is dead, and three in ten frames are of no use."""
 
     @property
     def swings(self) -> float:
-        """Swings in an exposure of the fastest mode."""
+        """Swings in an exposure of the fastest process."""
         return max(mode.swings for mode in self.modes)
 
     @property
     def path_sd(self) -> float:
-        """Slope units."""
+        """Standard deviation of the path, slope units."""
         return self.path_widths * _KERNEL_SD
 
     def __str__(self) -> str:
@@ -212,7 +214,7 @@ def _dynamics(mode: Mode, steps: int, run_steps: int) -> tuple[FloatArray, Float
 
 
 def rig_of(scene: Scene, runs: int, exposures: int) -> Rig:
-    """The rig whose axes are so many runs of a scene; frames of a line sensor have a row for each run."""
+    """The rig whose axes are the runs of a scene; frames of a line sensor have a row for each run."""
     kernel = Kernel(shape="gaussian", sigma=_KERNEL_SD * math.sqrt(2))
     half = _half_pixels(scene.kernel_pixels, scene.path_widths, scene.command_sd)
     pixel = kernel.sigma / scene.kernel_pixels

@@ -1,4 +1,4 @@
-"""The figures: like the paper's 4 to 7, what remarks 1 and 2 come to, and the map o3/o1."""
+"""The figures: like the paper's 4 to 7, the results of remarks 1 and 2, and the map o3/o1."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ _DASHES: dict[str, str | tuple[int, tuple[int, ...]]] = {"o1": "-", "o2": (0, (5
 _GRID = {"color": "0.9", "linewidth": 0.7}
 
 FIRST_THETA = 0.3
-"""Where the spot starts in figures 4 and 5, while the filters believe in 0 with this standard deviation."""
+"""Start of the spot in figures 4 and 5, while the filters' prior has mean 0 and this standard deviation."""
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,7 @@ def _colour(name: str) -> tuple[float, float, float]:
 
 
 def displaced(rig: Rig) -> tuple[Rig, Rig]:
-    """Section VI prints no x(0): a rig whose spot starts at `FIRST_THETA`, and what the filters believe of it."""
+    """Section VI prints no x(0): a rig whose spot starts at `FIRST_THETA`, and the filters' prior."""
     theta = FIRST_THETA / rig.plant.C[0, 0]
     nothing = np.zeros_like(rig.plant.initial_covariance)
     there = dataclasses.replace(rig.plant, initial_mean=np.array([theta, 0.0]), initial_covariance=nothing)
@@ -202,7 +202,7 @@ def figure_6(path: Path, chosen: Sequence[Scene], dpi: int, first: int = 25, cou
 
 
 def figure_7(path: Path, chosen: Sequence[Scene], dpi: int, exposure: int = 32) -> None:
-    """Inside one exposure: truth and estimates with their bands, and what the camera saw of it."""
+    """Inside one exposure: truth and estimates with their bands, and the camera's frame."""
     with _figure(path, dpi, (7.2, 5.6), 2, len(chosen), height_ratios=[2, 1]) as (figure, axes):
         for (above, below), scene in zip(axes.T, chosen, strict=True):
             series = list(aolink.simulate(scene.rig, exposure + 1, seed=7))
@@ -225,7 +225,7 @@ def figure_7(path: Path, chosen: Sequence[Scene], dpi: int, exposure: int = 32) 
 
 
 def _draw_frame(ax: Axes, rig: Rig, exposure: Exposure) -> None:
-    """The frame as the camera read it, and the truth's own histogram as a range."""
+    """Draw the frame as the camera read it, and the truth's own histogram as a range."""
     sensor = rig.sensor.profile
     density = to_density(sensor, exposure.pixels)[0]
     ax.stairs(density, sensor.edges, color="0.35", fill=True, alpha=0.35, linewidth=0)
@@ -237,7 +237,7 @@ def _draw_frame(ax: Axes, rig: Rig, exposure: Exposure) -> None:
 
 
 def figure_remarks(path: Path, first: Remark1, second: Remark2, dpi: int) -> None:
-    """Remark 1: what the centroid loses. Remark 2: what o2 alone can do, by the offset."""
+    """Draw remark 1: the motion that the centroid loses, and remark 2: the error of o2 alone, by the offset."""
     with _figure(path, dpi, (7.2, 3.1), 1, 2) as (_, axes):
         left, right = axes[0]
         left.plot(first.frequency_hz, np.maximum(first.gain, 1e-9), color="0.6", label=r"$|\bar{C}|$")
@@ -350,5 +350,5 @@ def figure_family(path: Path, given: Sequence[Row], dpi: int) -> None:
 
 
 def _swings(seed: int) -> float:
-    """Swings of the fastest mode in an exposure; for a random walk, which has none, the least of the family."""
+    """Swings of the fastest process in an exposure; for a random walk, which has none, the least of the family."""
     return max(draw(seed).swings, SWINGS[0] / 5)

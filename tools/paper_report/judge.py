@@ -43,7 +43,7 @@ class Size:
     """Runs, the first ones, for `sampled`."""
     particles: int = 2000
     smoothed: bool = False
-    """Whether estimates are scored after all later exposures of their run have corrected them."""
+    """Whether smoothed estimates are scored, which all later exposures of their run have corrected."""
 
     def runs_of(self, name: str) -> int:
         """Runs for an estimator."""
@@ -60,7 +60,7 @@ class Row:
     states: int
     """States of the plant, the degrees of freedom of ``nees``."""
     scored: int
-    """Exposures, of all runs."""
+    """Number of scored exposures, in all runs."""
     path: list[float]
     """Mean squared error of the path, slope units squared."""
     inside: list[float]
@@ -68,7 +68,7 @@ class Row:
     nees: list[float]
     """Mean of the end state's normalised squared error."""
     several: float
-    """Share of exposures with more than one mode, where the estimator looks for them; otherwise 0."""
+    """Share of exposures with more than one mode, where the estimator searches for modes; otherwise 0."""
     statuses: dict[str, int]
     """Exposures by their status."""
     seconds: float
@@ -76,7 +76,7 @@ class Row:
 
 
 def stratified(seeds: Sequence[int], count: int) -> list[int]:
-    """Seeds whose scenes are spread evenly over the number of modes, and over fewer or more swings than one."""
+    """Seeds whose scenes are spread evenly over the number of processes, and over fewer or more swings than one."""
     strata: dict[tuple[int, bool], list[int]] = {}
     for seed in seeds:
         scene = draw(seed)
@@ -175,7 +175,7 @@ class Plan:
     """Which scenes are judged by which estimators."""
 
     scenes: int = 200
-    """By all but the slow ones; the first of the reporting seeds."""
+    """Number of scenes that are judged by all but the slow estimators; the first of the reporting seeds."""
     pixel_scenes: int = 40
     """How many of these scenes are judged by `profile` and `mixture`, stratified."""
     limit_scenes: int = 18
@@ -184,7 +184,7 @@ class Plan:
 
 
 def judge_plan(path: Path, plan: Plan) -> list[Row]:
-    """Judge what a plan says, on reporting seeds; what the file has already is not judged again."""
+    """Judge the scenes of a plan, on reporting seeds; rows that the file has already are not made again."""
     seeds = SEEDS["reporting"][: plan.scenes]
     rows = judge_all(path, seeds, QUICK_NAMES, plan.size)
     for count, names in ((plan.pixel_scenes, PIXEL_NAMES), (plan.limit_scenes, (LIMIT,))):

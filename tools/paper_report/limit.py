@@ -1,4 +1,4 @@
-"""How near each estimator comes to what the pixels hold at all: `sampled`, run twice, is the limit."""
+"""The distance of each estimator from the limit of the pixels' information: `sampled`, run twice, is that limit."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from paper_report.shake import shaken
 
 NAMES = ("open-loop", "o1", "o3", "moments", "profile", "mixture", "sampled")
 BETTER_THAN_O1 = ("moments", "profile", "mixture")
-"""Or as good, which has to hold in every scene."""
+"""Estimators that have to be at least as good as o1 in every scene."""
 
 
 @dataclass(frozen=True)
@@ -46,9 +46,9 @@ class Found:
     distance: float
     """RMS distance of the path from the limit's, in its standard deviations, without the sampler's own noise."""
     time_ms: float
-    """For an axis and exposure."""
+    """Time for an axis and an exposure, ms."""
     single: tuple[float, float, float]
-    """Exposures in which `profile` saw one reading of the blur: their share, the distance and the NEES there."""
+    """Exposures in which `profile` found a single mode: their share, the distance and the NEES there."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ class Scene:
 
 
 def scenes(runs: int, count: int) -> Iterator[tuple[str, Rig, list[Exposure]]]:
-    """Rigs and so many exposures of them; the runs are side by side as axes."""
+    """Rigs and a number of exposures of each; the runs are side by side as axes."""
     printed, lively = load_rig("section-vi"), variant(load_rig("section-vi-lively"), offset=0.0)
     rigs = [("section VI as printed", variant(printed, offset=0.0))]
     rigs += [(f"lively, V = {V:g}", variant(lively, noise_density=V)) for V in (0.1, 0.01, 0.001)]

@@ -1,4 +1,4 @@
-"""What closing the loop is worth: residual slopes over those of the best integrator."""
+"""The benefit of closing the loop: residual slopes over those of the best integrator."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def loop_cells(quick: bool) -> list[Measured]:
 
 
 def loop_section(cells: Sequence[Measured]) -> list[Block]:
-    """A table of all cells, and the goals that were set before with what was found."""
+    """A table of all cells, and the goals that were set before, with the results."""
     seeds = len(next(iter(cells[0].rms.values())))
     rows = [
         [str(each.cell), *(str(each.ratio(name)) if name in each.rms else "-" for name in _COLUMNS),

@@ -1,7 +1,7 @@
-"""Films of spots whose motion we know, through the same door as the film of spheres: what of its figures is luck.
+"""Films of spots whose motion is known, imported like the film of spheres: they show which of its figures are chance.
 
 Six spots walk at random, or shake with a resonance that has about a period in an exposure. The rig file is that of
-`aolink rig --from`; for a resonance, which it does not look for, its [plant] is replaced by the right one, as a user
+`aolink rig --from`; for a resonance, which that does not fit, its [plant] is replaced by the right one, as a user
 who knows the resonance would. Errors are against the path that the film was made with, not the tracker's.
 """
 
@@ -30,13 +30,13 @@ from paper_report.spot_films import random_walk, resonance, spot_film
 
 _SPOTS, _PITCH = 6, 48
 _WALK, _SHAKE = 0.45, 1.5
-"""Pixels rms: of a random walk in a frame, of a vibration."""
+"""Rms motion of a random walk in a frame, and of a vibration, pixels."""
 _LIGHT = {"walk": 20_000.0, "shake": 60_000.0}
 """Counts of a spot; the noise of a pixel is 20."""
 _SKIP_WALK, _SKIP_SHAKE = 2, 4
-"""Exposures that are not scored: nothing is known of the motion before."""
+"""Exposures that are not scored, because the motion before is not known."""
 _FIRST_SEED = 11
-"""Seeds before this one were looked at while the importer was changed."""
+"""First seed used; earlier ones were used while the importer was changed."""
 NAMES = ("o1", "profile", "sampled")
 
 
@@ -45,7 +45,7 @@ class Kind:
     """One kind of film."""
 
     frames: int
-    """In an exposure."""
+    """Frames in an exposure."""
     periods: float = 0.0
     """Periods of the vibration in an exposure; 0: a random walk."""
     lasts: float = 0.0

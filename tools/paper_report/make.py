@@ -1,4 +1,4 @@
-"""From nothing to a folder with the figures, the page and the map's table."""
+"""The making of a folder with the figures, the page and the map's table."""
 
 from __future__ import annotations
 

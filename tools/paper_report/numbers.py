@@ -1,4 +1,4 @@
-"""Every number that the paper prints, beside what follows from its own equations and what our runs give."""
+"""Every number that the paper prints, beside the value that follows from its equations and the value from our runs."""
 
 from __future__ import annotations
 
@@ -46,9 +46,9 @@ class Effort:
     o1_exposures: int = 24
     film_frames: tuple[int, ...] = (8, 12, 24)
     film_exposures: int | None = None
-    """So many exposures of each length; all that the film has if None."""
+    """Number of exposures of each length; all that the film has if None."""
     made_kinds: tuple[int, int] = (0, 11)
-    """Which kinds of made films, from the first to before the second."""
+    """Range of the kinds of made films, from the first number to before the second."""
     made_seeds: int = 5
     made_exposures: int = 14
     family: Plan = field(default_factory=Plan)
@@ -81,9 +81,9 @@ class Row:
     quantity: str
     printed: str
     expected: str
-    """What follows from the equations, in closed form or by quadrature."""
+    """The value that follows from the equations, in closed form or by quadrature."""
     measured: str
-    """What our runs give, with a standard error; empty where there is nothing to measure."""
+    """The value from our runs, with a standard error; empty where there is nothing to measure."""
     verdict: str
 
 
@@ -115,7 +115,7 @@ def moment_noise(rig: Rig, frames: int, position: float = 0.2) -> MomentNoise:
 
 
 def kernel_rows(rig: Rig) -> list[Row]:
-    """Mass and variance of the kernel, by quadrature of what is printed and of what is meant."""
+    """Mass and variance of the kernel, by quadrature of the printed formula and of the corrected one."""
     sigma = rig.sensor.kernel.sigma
     reach = 12 * sigma
 
@@ -138,7 +138,7 @@ def kernel_rows(rig: Rig) -> list[Row]:
 
 
 def noise_rows(rig: Rig, frames: int) -> list[Row]:
-    """2/3 V, 2/5 V and no cross-covariance, by Monte Carlo; and the signal-to-noise ratio."""
+    """Rows for 2/3 V, 2/5 V and no cross-covariance, by Monte Carlo; and for the signal-to-noise ratio."""
     V, D = rig.sensor.noise_density, rig.sensor.pixel_width
     found = moment_noise(rig, frames)
     sd = pixel_noise_sd(rig.sensor)
@@ -165,7 +165,7 @@ def lifted_noise(rig: Rig, runs: int, exposures: int, seed: int = 31) -> tuple[M
 
 
 def plant_rows(rig: Rig, effort: Effort) -> list[Row]:
-    """C, timing and the process noise."""
+    """Rows for C, timing and the process noise."""
     plant, N = rig.plant, rig.timing.exposure_steps
     _, Q = lift(plant, N)
     printed = plant.B_w @ plant.process_noise @ plant.B_w.T
@@ -200,10 +200,10 @@ class Norms:
     """Root mean square of the state itself about its mean, in closed form."""
     state_mean: float
     rms: dict[str, Measured]
-    """By estimator."""
+    """Root mean square of the norms by estimator."""
     mean: dict[str, Measured]
     gain: Measured
-    """o3/o1 of the root mean squares."""
+    """Ratio o3/o1 of the root mean squares."""
 
 
 NORM_NAMES = ("open-loop", "o1", "o2", "o3")
@@ -230,7 +230,7 @@ def table_names(names: Sequence[str]) -> tuple[str, ...]:
 
 
 def norm_readings(rig: Rig, lively: Rig, effort: Effort) -> list[Norms]:
-    """The steady-state norms under several readings of what section VI leaves open."""
+    """The steady-state norms under several interpretations of section VI, which leaves some values open."""
     W = float(rig.plant.process_noise[0, 0])
     _, Q = lift(rig.plant, rig.timing.exposure_steps)
     small = W * float((rig.plant.B_w @ rig.plant.process_noise @ rig.plant.B_w.T)[1, 1]) / Q[1, 1]
@@ -267,7 +267,7 @@ class ErrorRow:
     """RMSE of open loop, by the stationary covariance."""
     rmse: dict[str, Measured]
     gain: Measured
-    """o3/o1."""
+    """Ratio o3/o1."""
 
 
 def error_table(rig: Rig, effort: Effort) -> list[ErrorRow]:
@@ -288,12 +288,12 @@ def error_table(rig: Rig, effort: Effort) -> list[ErrorRow]:
 
 @dataclass(frozen=True)
 class FormRow:
-    """What one printed form costs: RMSE of theta at the exposures' ends."""
+    """The cost of one printed form: RMSE of theta at the exposures' ends."""
 
     form: str
     rmse: Measured
     ratio: Measured
-    """To the corrected form, paired."""
+    """Ratio to the corrected form, paired."""
 
 
 def form_table(rig: Rig, effort: Effort) -> tuple[list[FormRow], Measured]:
@@ -346,11 +346,11 @@ def resonance(rig: Rig, frequency_hz: float, damping: float = 0.0) -> Plant:
 
 @dataclass(frozen=True)
 class Remark1:
-    """What the centroid sees of an undamped mode, by its frequency."""
+    """The observability of an undamped eigenmode by centroids, by its frequency."""
 
     frequency_hz: FloatArray
     gain: FloatArray
-    """|C-bar|, 1 for a spot that rests."""
+    """The gain |C-bar|, which is 1 for a spot at rest."""
     smallest: FloatArray
     """Smallest singular value of [C-bar; C-bar A^N]: 0 where a state is lost."""
     ranks: dict[float, tuple[int, int, int]]
@@ -360,7 +360,7 @@ class Remark1:
 def remark_1(rig: Rig, count: int) -> Remark1:
     """Observability by centroids over frequency (remark 1)."""
     N = rig.timing.exposure_steps
-    # With those where something is lost among them.
+    # The frequencies include those at which a state is lost.
     frequencies = np.union1d(np.linspace(0.5, 20.5, count), np.arange(2.5, 20.5, 2.5))
     gains, smallest = [], []
     for frequency in frequencies:
@@ -377,7 +377,7 @@ def remark_1(rig: Rig, count: int) -> Remark1:
 
 
 def _rank_with_y2(plant: Plant, n_steps: int, exposures: int = 6) -> int:
-    """States that y_1 and y_2 of several exposures tell apart to first order, about a state of no symmetry."""
+    """Number of states that y_1 and y_2 of several exposures determine to first order, about a state of no symmetry."""
     model, x = exposure_model(plant, n_steps), np.array([0.2, 0.1])
     rows, power = [], np.eye(2)
     for _ in range(exposures):
@@ -388,7 +388,7 @@ def _rank_with_y2(plant: Plant, n_steps: int, exposures: int = 6) -> int:
 
 @dataclass(frozen=True)
 class Remark2:
-    """What o2 can do, by the spot's offset: path RMSE over open loop's."""
+    """The performance of o2 by the spot's offset: path RMSE over open loop's."""
 
     offsets: tuple[float, ...]
     o2: list[Measured]
@@ -409,7 +409,8 @@ def remark_2(lively: Rig, effort: Effort) -> Remark2:
 
 @dataclass(frozen=True)
 class Mechanism:
-    """o3 at an offset against o1 on centre, with the V that two readings of the position are worth."""
+    """The error of o3 at an offset against that of o1 on centre, with the V that is equivalent to two measurements of
+    the position."""
 
     offset: float
     noise_density: float
@@ -421,7 +422,7 @@ class Mechanism:
 
 
 def mechanism(lively: Rig, effort: Effort, offset: float = 0.5, noise_density: float = 0.1) -> Mechanism:
-    """Check the mechanism of the map in the linear regime: y_2 as a second reading of the position."""
+    """Check the mechanism of the map in the linear regime: y_2 acts as a second measurement of the position."""
     equivalent = noise_density / (1 + 4 * offset**2 * (2 / 3) / (2 / 5))
 
     def path_rmse(at: float, density: float, name: str) -> Measured:

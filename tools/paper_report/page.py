@@ -1,4 +1,4 @@
-"""The page: every printed number beside ours, the misprints, what follows and what does not."""
+"""The page: every printed number beside ours, the misprints, the claims that follow and those that do not."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class Results:
     """The first is the paper's own reading, the last the lively variant."""
     errors: list[ErrorRow]
     forms: dict[str, tuple[list[FormRow], Measured]]
-    """By the rig's name: o3 under each printed form, and open loop."""
+    """Errors by the rig's name: o3 under each printed form, and open loop."""
     remark_1: Remark1
     remark_2: Remark2
     mechanism: Mechanism

@@ -13,7 +13,7 @@ from aolink.estimation.model.base import ExposureModel, InputResponse
 from aolink.numerics.arrays import FloatArray
 
 _FREQUENCIES = 512
-# The part of the weights that a constant input does not show is at most so many times the part that it does.
+# The part of the weights without effect for a constant input is at most this many times the part with effect.
 _MOST_DIFFERENCE = 10.0
 _PRICE = 1e-9
 
@@ -25,8 +25,8 @@ class PassiveOutput:
     weights: FloatArray
     """alpha and beta, (2,); a constant input moves y_P by as much as itself."""
     index: float
-    """Smallest real part of the transfer from a held input to y_P over all frequencies, one at none: passive where
-    it is not negative, and otherwise short of it by so much feedthrough."""
+    """Smallest real part of the transfer from a held input to y_P over all frequencies, one at none: the output is
+    passive where it is not negative; otherwise it lacks this much feedthrough."""
     expected: FloatArray
     """h_1 and h_2 at the operating point, (2,)."""
 
@@ -54,19 +54,19 @@ def passive_output(model: ExposureModel, inputs: FloatArray, state: FloatArray, 
 
     and the weights are those whose transfer has the largest smallest real part on the unit circle. The
     input acts within the exposure that sees it, so D_p is not zero; with (12) to (15) as printed it would be,
-    and no output of a lifted plant passive. Where both moments say the same (a spot that rests off centre),
-    there is little to combine.
+    and no output of a lifted plant passive. Where both moments carry the same information (a spot that rests off
+    centre), there is little to combine.
 
     Parameters
     ----------
     model:
         Model of a plant with one axis and one output.
     inputs:
-        At the operating point, (n_steps, n_inputs).
+        Inputs at the operating point, (n_steps, n_inputs).
     state:
-        At the operating point, (n_states,).
+        State at the operating point, (n_states,).
     column:
-        Which input is fed back.
+        Number of the input that is fed back.
     """
     response = model.response(inputs)
     h, H = predicted_moments(model, response, state[None], (1, 2))
@@ -80,8 +80,8 @@ def passive_output(model: ExposureModel, inputs: FloatArray, state: FloatArray, 
     gain = lifted_transfer(model, step, H[0], feedthrough, z).real
     constant = gain[0] / (gain[0] @ gain[0])
     across = np.array([-constant[1], constant[0]])
-    # Largest r with constant + (p - q) across at least r everywhere: a linear program in (p, q, r). What is paid
-    # for p and q leaves them at zero where they change nothing.
+    # Largest r with constant + (p - q) across at least r everywhere: a linear program in (p, q, r). The small cost
+    # of p and q leaves them at zero where they change nothing.
     program = optimize.linprog(
         [_PRICE, _PRICE, -1.0],
         A_ub=np.column_stack([-gain @ across, gain @ across, np.ones(len(gain))]),

@@ -1,6 +1,5 @@
-"""The paper's o3 once more, small and apart from the product, as printed and as corrected, to see what each slip costs.
-
-Equations are numbered as in Mishra & Wen. No gate: what diverges may diverge.
+"""A second, small implementation of the paper's o3, independent of aolink's, as printed and as corrected, to measure
+the effect of each misprint. Equations are numbered as in Mishra & Wen. There is no gate: a filter may diverge.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ from aolink.rig import Rig
 
 @dataclass(frozen=True, kw_only=True)
 class Form:
-    """Which of the printed equations are taken as printed."""
+    """The choice of the equations that are used as printed."""
 
     innovation: bool = False
     """(20): H x instead of h(x) as the predicted moments."""
@@ -46,7 +45,8 @@ FORMS: dict[str, Form] = {
 
 
 def _moments(model: ExposureModel, x: FloatArray, c: FloatArray, printed: bool) -> tuple[FloatArray, FloatArray]:
-    """Predicted y_1, y_2, (runs, 2), and their Jacobian, (runs, 2, n); ``c`` (n_steps,) is the inputs' path."""
+    """Predicted y_1, y_2, (runs, 2), and their Jacobian, (runs, 2, n); ``c`` (n_steps,) is the response of the path to
+    the inputs."""
     rows = model.state_rows[0]
     path = x @ rows.T + c
     H = np.stack([np.tile(model.mean_row[0], (len(x), 1)), 2 * path @ rows / len(rows)], axis=1)

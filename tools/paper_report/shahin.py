@@ -1,4 +1,4 @@
-"""Shahin's own example run again: a bright square, blurred along its rows, and what his filters make of it."""
+"""Shahin's own example run again: a bright square, blurred along its rows, and restored by his filters."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from aolink.numerics.arrays import FloatArray
 from aolink.restoration import Psf, Scanner, first_order, largest_zero, restore
 from paper_report.blocks import Block, Heading, Picture, Points, Table, Text, as_html, as_markdown
 
-# What he does not print, and we state: the blur and the noise's variances.
+# Values that he does not print: the blur and the noise's variances.
 BLUR = 5
 NOISE_VARIANCES = (0.01, 0.1, 1.0)
 SHOWN = 0.1
@@ -39,14 +39,14 @@ METHODS = ("predictor", "filter", "lag", "smoother")
 
 
 def scene() -> FloatArray:
-    """32 x 32 pixels of -1 with a square of 12 x 12 of 6.1 in the middle."""
+    """A scene of 32 x 32 pixels of -1 with a square of 12 x 12 of 6.1 in the middle."""
     image = np.full((32, 32), -1.0)
     image[10:22, 10:22] = 6.1
     return image
 
 
 def psf() -> Psf:
-    """Uniform, and causal as his: the first tap stands for no displacement."""
+    """A uniform PSF, causal like his: the first tap stands for no displacement."""
     return Psf(values=np.full(BLUR, 1 / BLUR), origin=(0,))
 
 
@@ -78,7 +78,7 @@ def isnr(blurred: FloatArray, restored: FloatArray, aligned: bool) -> float:
 def restored(
     image: FloatArray, method: str, scanner: Scanner, noise_variance: float, raster: bool = False
 ) -> FloatArray:
-    """By rows, or as one line of 1024 pixels, which is what the fifth-order model is of."""
+    """The picture restored by rows, or as one line of 1024 pixels, which the fifth-order model describes."""
     lines = image.reshape(1, -1) if raster else image
     done = restore(
         lines, psf(), method=method, noise_sd=math.sqrt(noise_variance), scanner=scanner, boundary=-1.0
@@ -94,15 +94,15 @@ class Gain:
     method: str
     noise_variance: float
     image_factor: float
-    """What the filter's image variance was multiplied by."""
+    """Factor of the filter's image variance."""
     noise_factor: float
-    """What the filter's noise variance was multiplied by."""
+    """Factor of the filter's noise variance."""
     aligned: float
     unaligned: float
 
 
 def models() -> dict[str, tuple[Scanner, bool]]:
-    """Name to scanner, and whether it is a raster's."""
+    """Scanners by name, each with whether it is a raster's."""
     variance = float(scene().var())
     return {
         "first order, α = 0.873": (first_order(first_order_correlation(), variance), False),
@@ -112,7 +112,7 @@ def models() -> dict[str, tuple[Scanner, bool]]:
 
 
 def gain(model: str, method: str, noise_variance: float, factors: tuple[float, float], runs: int) -> Gain:
-    """Over several noises."""
+    """The gain of a method over several noises."""
     scanner, raster = models()[model]
     scaled = Scanner(alpha=scanner.alpha, noise=factors[0] * scanner.noise, gamma=scanner.gamma)
     pairs = []
@@ -139,7 +139,7 @@ def _draw(path: Path, pictures: list[tuple[str, FloatArray]], columns: int) -> N
 
 
 def draw(out: Path) -> dict[str, str]:
-    """Figures like his 1 to 7; file to caption."""
+    """Draw figures like his 1 to 7; gives the caption of each file."""
     first, fifth = (models()[name][0] for name in ("first order, α = 0.873", "fifth order, raster"))
     clean, noisy = degraded(0.0, 0), degraded(SHOWN, 0)
     back = [restore(clean, psf(), method="inverse", boundary=b).image for b in (-1.0, 0.0)]

@@ -1,4 +1,5 @@
-"""A shake faster than the frames: where the blur tells what centroids cannot, and whether `moments` knows how much."""
+"""A shake faster than the frames, where the blur shows motion that centroids cannot, and the consistency of `moments`
+there."""
 
 from __future__ import annotations
 
@@ -26,7 +27,7 @@ _COUNTS_PER_DENSITY = 1500.0
 
 @dataclass(frozen=True)
 class ShakeRow:
-    """One frequency and noise."""
+    """The row of one frequency and noise."""
 
     frequency_hz: float
     noise_density: float
@@ -34,11 +35,12 @@ class ShakeRow:
     """RMSE of the path."""
     moments: Measured
     ratio: Measured
-    """moments/o1, paired."""
+    """Ratio moments/o1, paired."""
     nees: Measured
     """NEES of the end state by `moments`; 2 where its covariance is right."""
     nees_open_loop: Measured
-    """The same by prediction alone, whose covariance is right: how far 2 is to be trusted in so many runs."""
+    """The same by prediction alone, whose covariance is right: it shows the scatter about 2 with this number of
+    runs."""
 
 
 def shaken(rig: Rig, frequency_hz: float, noise_density: float) -> Rig:
@@ -79,7 +81,7 @@ def shake_table(rig: Rig, effort: Effort) -> list[ShakeRow]:
 
 
 def shake_section(rows: Sequence[ShakeRow], effort: Effort) -> list[Block]:
-    """The table with what it says."""
+    """The table with its interpretation."""
     table = [
         [f"{r.frequency_hz:g}", f"{r.noise_density:g}", str(r.o1), str(r.moments), r.ratio.interval, str(r.nees),
          str(r.nees_open_loop)]

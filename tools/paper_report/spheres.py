@@ -1,9 +1,9 @@
-"""Real motion blur: a film of spheres that diffuse in water, through the door that `aolink import` is.
+"""Real motion blur: a film of spheres that diffuse in water, imported as by `aolink import`.
 
-The mean of K frames is an exposure of K fast steps whose path the single frames tell. The rig file is the one that
-`aolink rig --from` writes: kernel, noise and random walk of the single frames. Beside the estimators stands what a user
-would do instead: the centroid of each blurred picture, held for the exposure, or interpolated from one to the next.
-Exposures of a sphere that `aolink import` says to have other light beside it do not count, but in one table.
+The mean of K frames is an exposure of K fast steps whose path is measured in the single frames. The rig file is the one
+that `aolink rig --from` writes: kernel, noise and random walk of the single frames. Beside the estimators stands what a
+user would do instead: the centroid of each blurred picture, held for the exposure, or interpolated from one to the
+next. Exposures of a sphere that has other light beside it, as `aolink import` reports, count in one table only.
 """
 
 import tempfile
@@ -35,11 +35,11 @@ from paper_report.numbers import Effort
 FILE = Path(__file__).parents[2] / "tests" / "data" / "diffusing_spheres.npz"
 _RATE_HZ = 24.0
 _SKIP = 1
-"""Exposures that are not scored: nothing is known of the spheres before."""
+"""Exposures that are not scored, because the spheres' motion before is not known."""
 
 
 def places() -> tuple[tuple[float, float], ...]:
-    """Where the six spheres are in the first frame, their films side by side, pixels."""
+    """Positions of the six spheres in the first frame, their films side by side, pixels."""
     data = np.load(FILE)
     width = data["frames"].shape[3]
     return tuple((float(x) + k * width, float(y)) for k, (x, y) in enumerate(data["tracked_xy"][:, 0]))
@@ -96,12 +96,12 @@ class Film:
     path: dict[str, Measured]
     """RMSE of the path, pixels, over the twelve axes."""
     over_held: dict[str, Measured]
-    """The same over that of the centroid, held."""
+    """RMSE of the path over that of the centroid, held."""
     smoothed: dict[str, Measured]
     over_interpolated: dict[str, Measured]
     """RMSE of the smoothed path over that of the interpolated centroid, which uses the future as well."""
     coverage: dict[str, float]
-    """Share of the path inside the estimate's 95 % intervals, with the error of the truth in the account."""
+    """Share of the path inside the estimate's 95 % intervals, with the error of the truth included."""
     crowded: int
     """Exposures of one sphere that do not count, of ``scored``: other light is beside it."""
     scored: int

@@ -1,4 +1,4 @@
-"""Films of Gaussian spots that move as we say, so that everything about them is known."""
+"""Films of Gaussian spots with a given motion, so that everything about them is known."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from aolink.optics.kernel import pixel_masses
 
 @dataclass(frozen=True, eq=False)
 class SpotFilm:
-    """Frames and what is true of them."""
+    """Frames and their true motion."""
 
     frames: NDArray[np.uint16]
     """(frames, rows, columns)"""
@@ -30,7 +30,7 @@ def random_walk(rng: np.random.Generator, frames: int, spots: int, step: float, 
 def resonance(
     rng: np.random.Generator, frames: int, spots: int, rms: float, period: float, lasts: float = 50.0, fine: int = 8
 ) -> FloatArray:
-    """A vibration with periods of so many frames, whose amplitude is forgotten after ``lasts`` periods (to 1/e); as
+    """A vibration with a period in frames, whose amplitude decays to 1/e after ``lasts`` periods; shapes are as of
     `random_walk`."""
     a = np.exp((-1 / lasts + 2j * np.pi) / (period * fine))
     x = np.zeros((frames * fine, spots, 2), dtype=np.complex128)

@@ -1,4 +1,4 @@
-"""What rows of the judgement come to: quantiles over the family, and whether its goals are held."""
+"""The evaluation of the judgement's rows: quantiles over the family, and whether its goals are held."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from paper_report.family import SEEDS
 from paper_report.judge import LIMIT, NAMES, Row
 
 Rows = Mapping[str, Mapping[int, Row]]
-"""By estimator and seed."""
+"""Rows by estimator and seed."""
 
 JUDGED = ("moments", "profile", "mixture")
 REFERENCES = ("o1", "open-loop")
 NEAR_LIMIT = (1.05, 1.15)
-"""Most that mixture's path RMSE may be of sampled's, in the median and at the 95th percentile."""
+"""Largest ratio of mixture's path RMSE to sampled's, in the median and at the 95th percentile."""
 MEDIAN_INSIDE = (0.93, 0.97)
 SCENE_INSIDE = (0.90, 0.99)
 SHARE_INSIDE = 0.95
@@ -31,11 +31,12 @@ MOST_RATIO = 1.02
 """Upper bound of the family's ratio to a reference."""
 _RESAMPLES = 1000
 _LIMIT_INSIDE = 0.8
-"""Coverage of sampled's own intervals below which its particles were too few for a scene: it is no limit there."""
+"""Coverage of sampled's own intervals below which its particles were too few for a scene, so that it is not the limit
+there."""
 _FEWEST_SCENES = 20
-"""Scenes from which a goal is said to be held: a 95th percentile of fewer is the largest of them."""
+"""Fewest scenes with which a goal counts as held: a 95th percentile of fewer is the largest of them."""
 _FEWEST_RUNS = 4
-"""Runs from which anything is said of a scene alone."""
+"""Fewest runs for a statement about a single scene."""
 
 
 def by_estimator(rows: Sequence[Row]) -> Rows:
@@ -57,7 +58,8 @@ def squares(rows: Rows, name: str, reference: str) -> dict[int, tuple[FloatArray
 
 
 def ratios(rows: Rows, name: str, reference: str) -> dict[int, float]:
-    """Ratio of the path's RMSE to a reference's by seed; to the limit's where it is one."""
+    """Ratio of the path's RMSE to a reference's by seed; scenes in which `sampled` is not the limit are left out of its
+    ratios."""
     pairs = squares(rows, name, reference)
     if reference == LIMIT:
         pairs = {seed: each for seed, each in pairs.items() if np.mean(rows[LIMIT][seed].inside) >= _LIMIT_INSIDE}
@@ -120,12 +122,12 @@ def nees_inside(row: Row) -> bool:
 
 
 def told_of_nees(row: Row) -> bool:
-    """Whether there are enough runs to say anything of the NEES."""
+    """Whether there are enough runs for a statement about the NEES."""
     return len(row.nees) >= _FEWEST_RUNS
 
 
 def share_of_nees(rows: Sequence[Row]) -> float:
-    """Share of scenes with `nees_inside`, of those with enough runs to tell; NaN if there is none."""
+    """Share of scenes with `nees_inside` among those with enough runs; NaN if there is none."""
     told = [nees_inside(row) for row in rows if told_of_nees(row)]
     return float(np.mean(told)) if told else math.nan
 
@@ -141,7 +143,7 @@ class Goal:
 
     @property
     def verdict(self) -> str:
-        """Held or not, of so many scenes; of few, only that it is not."""
+        """Whether the goal is held, and in how many scenes; with few scenes only a goal that is not held is stated."""
         if self.held and self.scenes < _FEWEST_SCENES:
             return f"too few scenes to tell ({self.scenes})"
         return f"{'held' if self.held else 'not held'} ({self.scenes} scenes)"

@@ -1,1 +1,1 @@
-"""What the command line prints: facts and tables, by subject."""
+"""The facts and tables that the command line prints, by subject."""

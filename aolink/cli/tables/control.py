@@ -1,4 +1,4 @@
-"""What a controller would have done in a recorded session."""
+"""Tables about what a controller would have commanded in a recorded session."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ if TYPE_CHECKING:
 
 
 def replayed_as_json(result: Replayed) -> dict[str, Any]:
-    """What `replayed` says, for scripts."""
+    """The content of `replayed` as JSON, for scripts."""
     return dict(without_nan(asdict(result)))
 
 
 def replayed(result: Replayed) -> Table:
-    """What a controller would have commanded, and what would have come of it."""
+    """The commands of a controller in a recorded session, and the slopes that it would have left."""
     table = Table(box=None, show_header=False, pad_edge=False)
     served = f" with {result.estimator}" if result.estimator else ""
     table.add_row("controller", f"{result.controller}{served}: {result.stability}")
@@ -29,7 +29,7 @@ def replayed(result: Replayed) -> Table:
         f" {result.input_rms:.4g} rms, which differ by {result.difference_rms:.4g} rms from what the mirror held",
     )
     if result.seed is None:
-        table.add_row("residual", "what would have come of it is not known: the recording is not of a simulated rig")
+        table.add_row("residual", "the slopes that it would have left are unknown: the rig is not simulated")
     else:
         table.add_row(
             "residual",

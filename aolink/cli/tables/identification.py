@@ -1,4 +1,4 @@
-"""What was identified, for people."""
+"""Tables of identified models, for people."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 def found(one: Found) -> Iterator[Table]:
-    """How well each model foretold, where several were tried; and the parameters of the one that was taken."""
+    """The prediction scores of the models, where several were tried; and the parameters of the chosen one."""
     if one.tried:
         best = max(each.score for each in one.tried)
         table = Table(
@@ -35,7 +35,8 @@ def found(one: Found) -> Iterator[Table]:
 
 
 def offer_lines(offer: Offer) -> Iterator[str]:
-    """What is offered in the place of what, and how much likelier it makes exposures that it was not fitted to."""
+    """The offered model and the one that it replaces, with the gain in log-likelihood on exposures that neither was
+    fitted to."""
     (first, last), (held_first, held_last) = offer.fitted, offer.held_out
     yield (
         f"{offer.path.name} is offered: log-likelihood {offer.log_likelihood:.1f} nats against {offer.before:.1f} of"

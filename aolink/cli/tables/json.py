@@ -1,4 +1,4 @@
-"""Values as JSON takes them."""
+"""Values in a form that JSON can have."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 
 
 def without_nan(value: Any) -> Any:
-    """The same with null for every number that is none."""
+    """The same values with None for every number that is NaN or infinite."""
     if isinstance(value, dict):
         return {key: without_nan(each) for key, each in value.items()}
     if isinstance(value, list):

@@ -1,4 +1,4 @@
-"""What recordings hold, how two of them compare, and what came of many."""
+"""Tables about recordings: the content of one, the differences of two, the results of many."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def _unused(estimates: Mapping[str, Any]) -> list[str]:
 
 
 def batch(rows: Sequence[Mapping[str, Any]]) -> Table:
-    """What came of many recordings and models, a row each."""
+    """The results of many recordings and models, a row each."""
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
     columns = ("recording", "model", "estimator", "exposures", "path_rmse", "end_rmse", "nis", "end_nees", "not_ok")
     for name in columns:
@@ -74,7 +74,7 @@ def batch(rows: Sequence[Mapping[str, Any]]) -> Table:
 
 
 def comparison(found: Mapping[str, TopicComparison]) -> Table:
-    """Topic by topic: how many messages were compared, and what differs first."""
+    """The comparison topic by topic: how many messages were compared, and the first difference."""
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
     for name in ("topic", "field"):
         table.add_column(name, no_wrap=True)
@@ -100,6 +100,6 @@ def comparison(found: Mapping[str, TopicComparison]) -> Table:
 
 
 def comparison_as_json(found: Mapping[str, TopicComparison], *, same_rig: bool) -> dict[str, Any]:
-    """The same for scripts; a difference without a size is null."""
+    """The comparison as JSON, for scripts; a difference without a size is null."""
     same = same_rig and all(each.same for each in found.values())
     return dict(without_nan({"same": same, "same_rig": same_rig, "topics": {k: asdict(v) for k, v in found.items()}}))

@@ -1,4 +1,4 @@
-"""What was measured of a rig, and what may be expected of it."""
+"""Tables about a rig: measured values, and the errors to expect."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def _number(value: float | None, form: str) -> str:
 def _calibration_facts(result: Calibrated) -> list[str]:
     found = result.calibration
     lines = [
-        "pull: what the file says less what was measured, in standard deviations",
+        "pull: the file's value less the measured one, in standard deviations",
         f"read noise {found.read_noise.value:.4g} counts (sd {found.read_noise.sd:.2g})",
     ]
     if found.gain is not None:
@@ -65,7 +65,7 @@ def _calibration_facts(result: Calibrated) -> list[str]:
 
 
 def calibration_as_json(result: Calibrated) -> dict[str, Any]:
-    """The same for scripts; what is not known is null."""
+    """The calibration as JSON, for scripts; unknown values are null."""
     from aolink.calibration.rig_text import written  # with scipy.stats, half of what `aolink info` took to start
 
     found, sensor = result.calibration, result.rig.sensor
@@ -103,7 +103,7 @@ def calibration_as_json(result: Calibrated) -> dict[str, Any]:
 
 
 def slopes_as_json(result: FrameSlopes) -> dict[str, Any]:
-    """What `aolink slopes` says of a frame."""
+    """The results of `aolink slopes` for a frame, as JSON."""
     lattice, reference = result.lattice, result.reference
     return {
         "grid": reference.kind,
@@ -155,7 +155,7 @@ def slopes(result: FrameSlopes) -> Table:
 
 
 def exposure_scan(rig: Rig, errors: Sequence[ExpectedError]) -> Table:
-    """What `aolink rig --exposure-scan` says; the rig's own exposure time is marked."""
+    """The table of `aolink rig --exposure-scan`; the rig's own exposure time is marked."""
     table = Table(box=box.SIMPLE_HEAD)
     for title in ("exposure steps", "s", "RMSE path", "RMSE output at end", "centroid noise"):
         table.add_column(title, justify="right")

@@ -1,4 +1,4 @@
-"""How good estimates are."""
+"""Tables of how good estimates are."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _MOST_REASONS = 3
 
 
 def scores(by_name: Mapping[str, Score]) -> Table:
-    """RMSE against truth, NIS and NEES with their 95 % bounds; what is outside its bounds is marked.
+    """RMSE against truth, NIS and NEES with their 95 % bounds; a mean outside its bounds is marked.
 
     Where any exposure was gated, a column says how many.
     """
@@ -52,7 +52,8 @@ def scores(by_name: Mapping[str, Score]) -> Table:
 
 
 def unused_lines(by_name: Mapping[str, Score]) -> list[str]:
-    """How many exposures each estimator could not use and why, in words; empty where all used all."""
+    """The number of exposures that each estimator could not use, and why, in words; empty where every estimator used
+    all."""
     lines = []
     for name, each in by_name.items():
         lines += [f"{name}: {unused.text(each.estimated)}" for unused in each.unused[:_MOST_REASONS]]
@@ -80,5 +81,5 @@ def _bounds(by_name: Mapping[str, Score]) -> str:
 
 
 def scores_as_json(by_name: Mapping[str, Score]) -> dict[str, Any]:
-    """The same for scripts; what is not known is null."""
+    """The scores as JSON, for scripts; unknown values are null."""
     return {name: without_nan(asdict(each)) for name, each in by_name.items()}

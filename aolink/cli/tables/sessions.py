@@ -1,4 +1,4 @@
-"""What came of a session, of restored pictures and of the demo."""
+"""Tables of the results of a session, of restored pictures and of the demo."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _LATENCY_STEPS = (
 
 
 def session_as_json(report: Report) -> dict[str, Any]:
-    """What `session` says, for scripts."""
+    """The content of `session` as JSON, for scripts."""
     facts = asdict(replace(report, latencies=[], control=None))
     del facts["latencies"]
     if (control := report.control) is not None:
@@ -134,7 +134,7 @@ def _latency_ms(latencies: Sequence[pb.Latency], since: str, until: str) -> list
 
 
 def deblurred(summary: Summary) -> dict[str, Any]:
-    """What came of restored pictures; PSNRs are means over the scenes, None where the true scene is not known."""
+    """The results for restored pictures; PSNRs are means over the scenes, None where the true scene is not known."""
     blurred, restored = summary.psnr_blurred, summary.psnr_restored
     return {
         "exposures": summary.exposures,
@@ -148,7 +148,7 @@ def deblurred(summary: Summary) -> dict[str, Any]:
 
 
 def deblurred_lines(summary: Summary, estimator: str, method: str) -> list[str]:
-    """The same in words."""
+    """The results for restored pictures, in words."""
     facts = deblurred(summary)
     scenes = f"{facts['scenes_restored']} scenes" if facts["scenes_restored"] else "spots"
     lines = [f"{scenes} of {facts['exposures']} exposures restored with the path of {estimator}, {method}"]
@@ -162,7 +162,7 @@ def deblurred_lines(summary: Summary, estimator: str, method: str) -> list[str]:
 
 
 def demo_summary(result: DemoResult, command: str) -> list[str]:
-    """What came of the demo, and what to run next with ``command``."""
+    """The results of the demo, and what to run next with ``command``."""
     if result.rrd is None:
         return [f"interrupted; what was recorded is in {result.recording}"]
     if result.differences:

@@ -1,7 +1,7 @@
 """GenICam cameras, GigE Vision above all, by the library Aravis 0.8.
 
 Aravis takes a camera's packets on a thread of its own and puts them together in memory that this driver gives it. A
-picture whose counts take two bytes goes to the session as it lies there, without a copy.
+picture whose counts take two bytes is passed to the session in that memory, without a copy.
 """
 
 from __future__ import annotations
@@ -23,16 +23,18 @@ from aolink.errors import DeviceError, RigError
 from aolink.rig import Rig
 
 _PACKET_OVERHEAD, _PACKET_OVERHEAD_EXTENDED = 36, 48
-"""Bytes of a packet that are not of the picture, with frame ids of 16 and of 64 bits: headers of IP, UDP and GVSP."""
+"""Bytes of a packet that do not belong to the picture, with frame ids of 16 and of 64 bits: headers of IP, UDP and
+GVSP."""
 _ID_PERIOD = 65535
 """A 16-bit frame id goes from 65535 to 1: 0 is not valid."""
 _RATE_TOLERANCE = 0.01
 _TIMESTAMP_CONTROL, _TIMESTAMP_LATCH, _TIMESTAMP_VALUE = 0x0944, 2, 0x0948
-"""Registers that GigE Vision lays down: what is written to latch the clock, and where its latched value lies."""
+"""Registers that GigE Vision specifies: the value that is written to latch the clock, and the address of the latched
+value."""
 _UNSURE_S = 1.0
-"""How much later than others a frame may come whose arrival stands for its time."""
+"""The most by which a frame may be later than others when its arrival is used as its time, s."""
 _RELEASE_S = 2.0
-"""How long a camera that no longer answers is waited for: Aravis asks it again for many seconds."""
+"""How long to wait for a camera that no longer answers, s: Aravis asks it again for many seconds."""
 
 
 def discover() -> list[tuple[str, str]]:
@@ -61,19 +63,21 @@ class AravisCamera:
     address:
         Its IP address, its name as Aravis has it (``Vendor-Model-Serial``), or empty for the only camera that answers.
     pixel_format:
-        By GenICam's name; empty for one of as many bits as the rig file's sensor has, packed if the camera can.
+        GenICam's name of the format; empty for one of as many bits as the rig file's sensor has, packed if the camera
+        can.
     trigger:
-        The camera's input whose rising edge starts each exposure, such as ``Line1``; empty: it runs freely, at the rig
-        file's rate.
+        The camera's input whose rising edge starts each exposure, such as ``Line1``; if empty, the camera runs freely,
+        at the rig file's rate.
     stamp_at:
         What the camera's time stamp marks of an exposure, its ``start`` or its ``end``: its manual says which.
     corner:
         Upper row and left column of the picture on the camera's sensor; None for the middle.
     resend:
-        Whether packets that were lost are asked for again. A frame that stays incomplete then comes a tenth of a
-        second late, and without it when the next one begins.
+        Whether lost packets are requested again. A frame that stays incomplete then comes a tenth of a second late;
+        without ``resend`` it comes when the next one begins.
     packet_size:
-        Bytes of a packet, headers included; 0 for what the camera has, or fewer where the network cannot carry those.
+        Bytes of a packet, headers included; 0 for the camera's own setting, or fewer bytes where the network cannot
+        carry that.
     features:
         Other GenICam features to set, before all else.
 
@@ -110,7 +114,7 @@ class AravisCamera:
         self._camera = None
         self._requests = Requests("aolink-aravis")
         self._asked: Future[ClockAnswer] | None = None
-        """The clock's answer that is under way."""
+        """The answer of the clock that is being awaited."""
         self._running = False
         self._start_ns = 0
         self._before: tuple[int, int, int] | None = None
@@ -120,7 +124,7 @@ class AravisCamera:
             self._device = self._aravis("arv_camera_get_device", self._camera)
             self._is_gige = bool(self._aravis("arv_camera_is_gv_device", self._camera))
             self._check_control("is used by another program: end that, or wait some seconds for the camera to notice")
-            for what in ("access", "range"):  # else Aravis sends whatever it is given
+            for what in ("access", "range"):  # otherwise Aravis sends any value that it is given
                 self._aravis(f"arv_camera_set_{what}_check_policy", self._camera, 1)
             for feature, value in (features or {}).items():
                 self._set_feature(feature, value)
@@ -152,7 +156,7 @@ class AravisCamera:
 
     def start(self, start_ns: int, exposures: int) -> None:
         for _ in self._stream.pictures():
-            pass  # what is left from before
+            pass  # frames that are left from before
         self._start_ns, self._before = start_ns, None
         # After an answer that is under way: Aravis does not say that features may be used by two threads at once.
         self._requests.send(lambda: self._do("arv_camera_start_acquisition", self._camera, to="be started")).result()
@@ -174,7 +178,7 @@ class AravisCamera:
             try:
                 stopping.result(_RELEASE_S)
             except TimeoutError:
-                raise DeviceError(f"the camera {self._address} does not answer when it is told to stop") from None
+                raise DeviceError(f"the camera {self._address} does not answer when it is asked to stop") from None
 
     def statistics(self) -> dict[str, int]:
         """Counts of its packets by the fields of ``LinkStatistics``, empty for a camera that is not on a network.
@@ -203,7 +207,8 @@ class AravisCamera:
     # Opening
 
     def _do(self, name: str, *arguments: Any, to: str) -> Any:
-        """Call a function of Aravis that may fail. Raises DeviceError with ``to``, what the camera was asked to do."""
+        """Call a function of Aravis that may fail. Raises DeviceError with ``to``, the action that the camera was asked
+        for."""
         try:
             return self._aravis(name, *arguments)
         except Refused as refused:

@@ -102,7 +102,7 @@ G_TYPE_INT = 6 << 2
 
 
 class Refused(Exception):
-    """What Aravis says went wrong."""
+    """An error that Aravis reports."""
 
 
 class Aravis:

@@ -1,4 +1,4 @@
-"""Pictures from a stream of Aravis: the memory that it writes them to, and what of each has arrived."""
+"""Pictures from a stream of Aravis: the memory that it writes them to, and the parts of each that have arrived."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _SUCCESS, _TIMEOUT, _MISSING_PACKETS = 0, 2, 3
 _MARK = 16
 """Bytes of memory that are marked before a packet is written over them."""
 _BUFFERED_S = 0.5
-"""How much of the stream is kept while the session is busy."""
+"""Length of the stream that is kept while the session is busy, s."""
 _FEWEST_BUFFERS, _MOST_BYTES = 16, 256 << 20
 _SOCKET_BYTES = 4 << 20
 
@@ -31,11 +31,11 @@ class Picture:
     """A picture as it arrived."""
 
     frame_id: int
-    """As the camera counts, not zero."""
+    """The camera's own count, never zero."""
     stamp_ns: int
-    """On the camera's clock."""
+    """The camera's time stamp, on its own clock."""
     leader_ns: int
-    """When its first packet arrived, ns since 1970."""
+    """The time at which its first packet arrived, ns since 1970."""
     pixels: NDArray[np.uint16]
     """Counts (rows, columns), zero where nothing arrived."""
     mask: NDArray[np.bool_] | None
@@ -68,7 +68,7 @@ class PictureStream:
         self._aravis, self._stream, self._name = aravis, stream, name
         self._shape, self._format, self._payload, self._block = shape, pixel_format, payload, block
         self._memory: dict[int, NDArray[np.uint8]] = {}
-        """What the buffers that Aravis has may write to, by buffer."""
+        """The memory that Aravis's buffers may write to, by buffer."""
         self._chunks_lost = 0
         self._marked = self._blocks = np.zeros(0, dtype=np.intp)
         if block:
@@ -84,7 +84,7 @@ class PictureStream:
             self._offer()
 
     def set_resend(self, resend: bool) -> None:
-        """Whether packets that are lost are asked for again."""
+        """Set whether lost packets are requested again."""
         self._set(
             "packet-resend", self._aravis("arv_gv_stream_packet_resend_get_type"), "g_value_set_enum", int(resend)
         )
@@ -102,7 +102,7 @@ class PictureStream:
                 yield picture
 
     def counts(self) -> dict[str, int]:
-        """Packets of a network, by the fields of ``LinkStatistics``."""
+        """Counts of a network's packets, by the fields of ``LinkStatistics``."""
         names = {"packets_received": "n_received_packets", "bytes_received": "n_transferred_bytes",
                  "duplicates": "n_duplicated_packets", "retransmits": "n_resent_packets"}  # fmt: skip
         counts = {
@@ -125,8 +125,8 @@ class PictureStream:
     def _offer(self) -> None:
         """Give Aravis memory for another picture.
 
-        It does not say which packets of a picture came. So where each packet will be written a mark lies before, of
-        random bytes: where it still lies afterwards, no packet came.
+        Aravis does not say which packets of a picture came. So a mark of random bytes is put where each packet will be
+        written: where the mark is still there afterwards, no packet came.
         """
         memory = np.empty(self._payload, dtype=np.uint8)
         memory[self._marked] = self._mark

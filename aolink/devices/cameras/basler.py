@@ -19,10 +19,11 @@ _CLOCKS = (
     ("TimestampLatch", "TimestampLatchValue"),
     ("GevTimestampControlLatch", "GevTimestampValue"),
 )
-"""Features that note the camera's clock and tell it: of newer cameras, and of GigE cameras."""
+"""Pairs of features that latch the camera's clock and give its value: those of newer cameras, then those of GigE
+cameras."""
 _RATES = ("ResultingFrameRate", "BslResultingAcquisitionFrameRate", "ResultingFrameRateAbs")
 _RATE_MARGIN = 0.05
-"""How far the camera's frame rate may be from the rig file's."""
+"""The most by which the camera's frame rate may differ from the rig file's, as a fraction."""
 _BUFFERS = 32
 _NO_BLOCK_ID = (1 << 64) - 1
 _WRAPS_AT = 65_535
@@ -45,8 +46,8 @@ class BaslerCamera:
     Raises
     ------
     DeviceError
-        pypylon is not installed, there is no such camera or somebody else uses it, or it cannot do what the rig file
-        says.
+        pypylon is not installed, there is no such camera or another program uses it, or it cannot do what the rig file
+        asks for.
     """
 
     lacks: tuple[Lacks, ...] = (Lacks.TRIGGER,)
@@ -90,7 +91,7 @@ class BaslerCamera:
         return None
 
     def start(self, start_ns: int, exposures: int) -> None:
-        """Take frames until stopped; those that begin before ``start_ns`` are not of the session."""
+        """Take frames until stopped; those that begin before ``start_ns`` do not belong to the session."""
         self._camera.StartGrabbing(
             self._pylon.GrabStrategy_OneByOne, self._pylon.GrabLoop_ProvidedByInstantCamera
         )  # fmt: skip
@@ -110,7 +111,7 @@ class BaslerCamera:
         self._camera.Close()
 
     def _set_up(self, row: int, column: int, features: dict[str, bool | int | float | str]) -> None:
-        """Set the features that follow from the rig file, but for those that are given. Raises DeviceError."""
+        """Set the features that follow from the rig file, except those that the user has given. Raises DeviceError."""
         timing, sensor = self._rig.timing, self._rig.sensor
         for name, value in features.items():
             self._set(name, value)
@@ -157,7 +158,7 @@ class BaslerCamera:
         )  # fmt: skip
 
     def _frame(self, result: Any, arrived_ns: int) -> None:
-        """Take what pylon's thread gives; a grab that failed leaves a gap in the numbers."""
+        """Take a result of pylon's thread; a grab that failed leaves a gap in the numbers."""
         block_id = int(result.BlockID)
         self._number = int(result.ImageNumber) if block_id == _NO_BLOCK_ID else unwrapped(self._number, block_id)
         if not result.GrabSucceeded():
@@ -184,7 +185,7 @@ class BaslerCamera:
         return node if node is not None and self._genicam.IsAvailable(node) else None
 
     def _first(self, names: Sequence[str]) -> str:
-        """The first of these features that the camera has: they have had several names. Empty for none."""
+        """The first of these features that the camera has: a feature may have several names. Empty for none."""
         return next((name for name in names if self._node(name) is not None), "")
 
     def _value(self, name: str) -> Any:
@@ -192,7 +193,7 @@ class BaslerCamera:
         return None if node is None else node.Value
 
     def _set(self, name: str, value: bool | int | float | str) -> None:
-        """Set a feature that need not change where it is right already. Raises DeviceError."""
+        """Set a feature, unless it has the right value already. Raises DeviceError."""
         node = self._node(name)
         if node is None:
             raise DeviceError(f"{self._name} has no feature {name} in this state: correct devices.camera.features")
@@ -240,19 +241,19 @@ def _choose(found: Sequence[Any], serial: str) -> Any:
 
 
 def _listener(pylon: Any, arrived: Arrived, take: Callable[[Any, int], None]) -> Any:
-    """What pylon calls on its own thread for each frame: it notes when that is, before anything else."""
+    """An object that pylon calls on its own thread for each frame: it notes the time before anything else."""
 
     class Listener(pylon.ImageEventHandler):  # type: ignore[misc] # pypylon is imported where it is used
         def OnImageGrabbed(self, camera: Any, result: Any) -> None:
             arrived_ns = time.monotonic_ns()
             try:
                 take(result, arrived_ns)
-            except Exception as failure:  # the session is told when it asks for frames next
+            except Exception as failure:  # the session gets the error when it asks for frames next
                 arrived.fail(failure)
 
     return Listener()
 
 
 def _reason(error: Exception) -> str:
-    """What a GenICam exception says, without where in the library it was raised."""
+    """The message of a GenICam exception, without the place in the library where it was raised."""
     return re.split(r" : \w+ thrown ", " ".join(str(error).split()))[0]

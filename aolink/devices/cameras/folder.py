@@ -1,4 +1,4 @@
-"""A folder of pictures, or any other film that `aolink import` reads, played as a camera for trying things out."""
+"""A folder of pictures, or any other film that `aolink import` reads, played as a camera for experiments."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class FolderCamera(ThreadCamera):
     path:
         A folder of pictures, in the order of their names, or a film in one file; relative to the rig file.
     repeat:
-        Whether to begin again after the last picture; otherwise a session that asks for more ends there.
+        Whether to begin again after the last picture; otherwise a session that asks for more pictures ends there.
     corner:
         Row and column of the pictures at which the sensor begins; None where the sensor is the whole picture.
 
@@ -53,7 +53,7 @@ class FolderCamera(ThreadCamera):
         return time.monotonic_ns()
 
     def start(self, start_ns: int, exposures: int) -> None:
-        """Play ``exposures`` pictures (0: until stopped), the first as exposed from ``start_ns`` on."""
+        """Play ``exposures`` pictures (0: until stopped), the first one as if exposed from ``start_ns`` on."""
         self._thread = FrameThread(lambda stopped: self._play(start_ns, exposures, stopped))
 
     def _play(self, start_ns: int, exposures: int, stopped: threading.Event) -> Iterator[SimpleFrame]:

@@ -24,16 +24,16 @@ from aolink.importing.film import grey
 from aolink.rig import Rig
 
 _RATE_MARGIN = 0.05
-"""How far the camera's frame rate may be from the rig file's."""
+"""The most by which the camera's frame rate may differ from the rig file's, as a fraction."""
 _V4L2_MANUAL, _V4L2_UNIT_S = 1, 1e-4
-"""Video4Linux's word for exposures that the program sets, and its unit of their length."""
+"""Video4Linux's value for exposure times that the program sets, and its unit of them."""
 _DEVICES = Path("/sys/class/video4linux")
 
 
 class OpenCVCamera(ThreadCamera):
-    """Whatever ``cv2.VideoCapture`` opens, 8 bits a colour, its colours averaged.
+    """Any source that ``cv2.VideoCapture`` opens, 8 bits a colour, its colours averaged.
 
-    It tells no time and does not count, so frames have the time of their arrival. A thread reads it and notes that
+    It reports no time and does not count, so frames have the time of their arrival. A thread reads it and notes that
     time. Light is not proportional to counts unless the camera's gamma and white balance are off.
 
     Parameters
@@ -58,7 +58,7 @@ class OpenCVCamera(ThreadCamera):
         beside = rig.path_of(str(source), "devices.camera.source")
         opened = int(source) if str(source).isdecimal() else str(beside) if beside.exists() else source
         self._name = f"camera {source}" if isinstance(opened, int) else str(source)
-        said = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # the error below says it better
+        said = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # the error below is clearer
         self._capture: Any = cv2.VideoCapture(opened)
         cv2.utils.logging.setLogLevel(said)
         if not self._capture.isOpened():
@@ -83,7 +83,7 @@ class OpenCVCamera(ThreadCamera):
         """OpenCV gives no time of the camera's."""
 
     def start(self, start_ns: int, exposures: int) -> None:
-        """Read frames until stopped: a file's from ``start_ns`` on, others as they come, before it as well."""
+        """Read frames until stopped: those of a file from ``start_ns`` on, others as they come, also before it."""
         self._thread = FrameThread(lambda stopped: self._read(start_ns, stopped))
 
     def close(self) -> None:
@@ -111,7 +111,7 @@ class OpenCVCamera(ThreadCamera):
         size = tuple(int(self._capture.get(p)) for p in (cv2.CAP_PROP_FRAME_HEIGHT, cv2.CAP_PROP_FRAME_WIDTH))
         check_within((size[0], size[1]), self._rig.sensor.shape, self._corner, self._name)
         if not (self._is_file or self._capture.getBackendName() == "V4L2"):
-            return  # of a stream OpenCV guesses the rate
+            return  # OpenCV only guesses the rate of a stream
         rate = self._capture.get(cv2.CAP_PROP_FPS)
         if rate > 0 and abs(rate / self._rate - 1) > _RATE_MARGIN:
             raise DeviceError(
@@ -121,7 +121,8 @@ class OpenCVCamera(ThreadCamera):
         self._rate = rate if rate > 0 else self._rate
 
     def _read(self, begin_ns: int, stopped: threading.Event) -> Iterator[SimpleFrame]:
-        """Frames as they come, a file's when they are due. The capture belongs to the thread that reads it."""
+        """Give frames as they come, those of a file when they are due. The capture belongs to the thread that reads
+        it."""
         number = 0
         try:
             while not stopped.is_set():

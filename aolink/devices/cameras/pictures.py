@@ -1,4 +1,4 @@
-"""What drivers of cameras share: frames that come on a thread of their own, and pictures that become counts."""
+"""Code that drivers of cameras share: frames that come on a thread of their own, and pictures that become counts."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from aolink.devices.simple import SimpleFrame
 from aolink.errors import DeviceError
 
 _MOST_WAITING = 64
-"""Frames that wait to be taken: where there are more, the oldest are dropped, and count as lost."""
+"""The most frames that wait to be taken: where there are more, the oldest are dropped, and count as lost."""
 _JOIN_S = 2.0
 """How long closing a camera waits for its thread, which may be waiting for a frame."""
 
@@ -30,11 +30,11 @@ class Arrived:
         self._frames.append(frame)
 
     def fail(self, failure: Exception) -> None:
-        """Have ``failure`` raised as soon as the frames before it are taken."""
+        """Make `take` raise ``failure`` as soon as the frames before it are taken."""
         self._failure = failure
 
     def take(self) -> list[SimpleFrame]:
-        """The frames since the last call, in order. Raises what was given to `fail`."""
+        """The frames since the last call, in order. Raises the error that was given to `fail`."""
         frames = [self._frames.popleft() for _ in range(len(self._frames))]
         if not frames and self._failure is not None:
             raise self._failure
@@ -62,12 +62,12 @@ class FrameThread(Arrived):
         try:
             for frame in self._frames_until(self._stopped):
                 self.give(frame)
-        except Exception as failure:  # the session is told when it asks for frames next
+        except Exception as failure:  # the session gets the error when it asks for frames next
             self.fail(failure)
 
 
 class ThreadCamera:
-    """What cameras have in common whose frames come from a thread, which begins when they are started."""
+    """The common part of cameras whose frames come from a thread, which begins when they are started."""
 
     _thread: FrameThread | None = None
 

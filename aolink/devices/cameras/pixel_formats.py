@@ -28,11 +28,11 @@ class PixelFormat:
         return self.stored_bits not in (8, 16)
 
     def size(self, n_pixels: int) -> int:
-        """Bytes of so many pixels."""
+        """Bytes that a number of pixels takes."""
         return -(-n_pixels * self.stored_bits // 8)
 
     def counts(self, data: NDArray[np.uint8], shape: tuple[int, int]) -> NDArray[np.uint16]:
-        """Counts (rows, columns) from bytes: a view of ``data`` where each takes two bytes, else new."""
+        """Counts (rows, columns) from bytes: a view of ``data`` where each takes two bytes, otherwise a new array."""
         n_pixels = shape[0] * shape[1]
         data = data[: self.size(n_pixels)]
         if not self.packed:
@@ -45,7 +45,7 @@ class PixelFormat:
         return counts.ravel()[:n_pixels].reshape(shape)
 
     def whole(self, arrived: NDArray[np.bool_], shape: tuple[int, int]) -> NDArray[np.bool_]:
-        """Pixels (rows, columns) of which all bytes ``arrived``, which has one element for each byte."""
+        """Mask (rows, columns) of the pixels whose bytes have all ``arrived``, which has one element for each byte."""
         n_pixels = shape[0] * shape[1]
         arrived = arrived[: self.size(n_pixels)]
         if self.packed:
@@ -81,4 +81,4 @@ PIXEL_FORMATS = {
         PixelFormat("Mono16", 0x01100007, 16, 16),
     )
 }
-"""Pixel formats that a driver may ask a camera for, by name, packed ones before others of as many bits."""
+"""Pixel formats that a driver may ask a camera for, by name, packed ones before others with the same number of bits."""

@@ -17,13 +17,13 @@ class Requests:
         threading.Thread(target=self._run, name=name, daemon=True).start()
 
     def send(self, request: Callable[[], Any]) -> Future[Any]:
-        """Have ``request`` called; the future has its result, or what it raised."""
+        """Queue ``request``; the future has its result, or the exception that it raised."""
         future: Future[Any] = Future()
         self._waiting.put((future, request))
         return future
 
     def end(self) -> None:
-        """Take no more requests: those before are still called."""
+        """Accept no more requests: those queued before are still called."""
         self._waiting.put(None)
 
     def _run(self) -> None:
@@ -31,5 +31,5 @@ class Requests:
             future, request = each
             try:
                 future.set_result(request())
-            except BaseException as error:  # whoever asks for the result is told
+            except BaseException as error:  # the future hands it to whoever asks for the result
                 future.set_exception(error)

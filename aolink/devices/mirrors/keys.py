@@ -24,7 +24,7 @@ def per_input(name: str, value: Any, n_inputs: int) -> NDArray[np.float64]:
 
 
 def scale_per_input(name: str, value: Any, n_inputs: int) -> NDArray[np.float64]:
-    """The same for a factor, which must not be zero."""
+    """A factor for each input, as `per_input`; it must not be zero."""
     scale = per_input(name, value, n_inputs)
     if not scale.all():
         raise RigError(f"devices.mirror.{name}: expected a number that is not zero, found {value!r}")
@@ -32,7 +32,7 @@ def scale_per_input(name: str, value: Any, n_inputs: int) -> NDArray[np.float64]
 
 
 def text(name: str, value: Any) -> str:
-    """A text. Raises RigError."""
+    """A key whose value is a text. Raises RigError."""
     if not isinstance(value, str):
         raise RigError(f"devices.mirror.{name}: expected a text, found {value!r}")
     return value

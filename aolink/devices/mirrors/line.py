@@ -1,4 +1,4 @@
-"""A line to a device that answers requests, for drivers that speak its maker's own protocol."""
+"""A serial line to a device that answers requests, for drivers that speak the maker's own protocol."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from aolink.wire.port import SerialPort, wait_readable
 TIMEOUT_S = 1.0
 """How long a device may take for an answer, unless a request says otherwise."""
 _LONGEST = 65_536
-"""Bytes without the expected end after which no answer is waited for: the device talks of something else."""
+"""Bytes without the expected end after which the driver stops waiting: the device is sending something else."""
 _SHOWN = 48
 """Bytes of a request or an answer that an error message shows."""
 
@@ -40,12 +40,12 @@ class Line:
         self._device, self._baud_rate = device, baud_rate
         self._port = SerialPort(url, baud_rate)
         self._read = bytearray()
-        """What came and was not taken."""
+        """Bytes that came and were not taken."""
         self._asked = b""
         """The latest request, for the errors."""
 
     def tell(self, request: bytes) -> None:
-        """Send what is not answered."""
+        """Send a command that the device does not answer."""
         self._asked = request
         self._port.write(request)
 
@@ -80,7 +80,8 @@ class Line:
         return self._take(n)
 
     def drain(self, quiet_s: float = 0.0) -> bytes:
-        """Throw away, and give, what has come; with ``quiet_s``, until nothing has come for so long, 1 s at most."""
+        """Throw away, and return, the bytes that have come; with ``quiet_s``, go on until nothing has come for that
+        long, for 1 s at most."""
         deadline = time.monotonic() + TIMEOUT_S
         quiet = not quiet_s
         while time.monotonic() < deadline:
@@ -104,7 +105,7 @@ class Line:
         return taken
 
     def _receive(self, deadline: float) -> None:
-        """Wait for more. Raises DeviceError at ``deadline``."""
+        """Wait for more bytes. Raises DeviceError at ``deadline``."""
         if data := self._port.read_some():
             self._read += data
         elif (left_s := deadline - time.monotonic()) > 0:

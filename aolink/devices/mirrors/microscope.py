@@ -16,7 +16,7 @@ from aolink.rig import Rig
 
 
 class MicroscopeMirror:
-    """A `DirectMirror` of as many inputs as the device has actuators.
+    """A `DirectMirror` with one input for each of the device's actuators.
 
     The device takes numbers from 0 to 1 for each actuator, which are the vendor's full range.
 
@@ -27,8 +27,8 @@ class MicroscopeMirror:
     settings:
         The arguments that the class is made with, such as ``serial_number``.
     unit, zero:
-        Part of the range for an input of one, and that at an input of zero; numbers, or lists of one for each input.
-        By default inputs from -1 to 1 are the whole range.
+        The part of the range that an input of one moves by, and the part at an input of zero; numbers, or lists of one
+        for each input. By default inputs from -1 to 1 are the whole range.
 
     Raises
     ------
@@ -36,7 +36,7 @@ class MicroscopeMirror:
         The extra ``microscope`` or the vendor's library is missing, there is no such device, or it has another number
         of actuators; or the rig's limits go beyond its range.
     RigError
-        A key is not what it should be.
+        A key has a value of the wrong kind.
     """
 
     lacks: ClassVar[tuple[Lacks, ...]] = (Lacks.READ_BACK, Lacks.WATCHDOG)
@@ -55,7 +55,7 @@ class MicroscopeMirror:
         make = _class_of(text("device", device))
         try:
             self._device = make(**(settings or {}))
-        except Exception as error:  # whatever a vendor's library does
+        except Exception as error:  # a vendor's library may raise anything
             raise DeviceError(f"{device} cannot be opened with {settings or 'no settings'}: {error!r}") from error
         self._park, self.description = rig.mirror.park, f"{device} {settings or ''}".strip()
         try:
@@ -84,7 +84,7 @@ class MicroscopeMirror:
 
 
 def _class_of(path: str) -> Any:
-    """Raises DeviceError, or RigError for what names no deformable mirror."""
+    """The class of this name. Raises DeviceError, or RigError for a name that is not that of a deformable mirror."""
     with needs_extra("microscope", DeviceError):
         from microscope.abc import DeformableMirror
     module, _, name = path.rpartition(".")

@@ -24,7 +24,7 @@ from aolink.rig import Rig
 
 _BAUD_RATE = 256_000
 _USB_ID = 0x0483, 0xA31E
-"""The maker's Python package looks for an MR-E-2 by it."""
+"""USB vendor and product ids, by which the maker's Python package finds an MR-E-2."""
 NOT_LISTED = "no device found by the USB id of the MR-E-2 (0483:a31e): if yours has another, give devices.mirror.port"
 _LIMIT_DEG = 50.0
 _LIMIT = math.tan(math.radians(_LIMIT_DEG))
@@ -32,20 +32,20 @@ _LIMIT = math.tan(math.radians(_LIMIT_DEG))
 _DECIMALS = 6
 """Decimals of a coordinate: a step of a millionth of the range, below what the mirror repeats."""
 _LEAVE_PRO_MODE = bytes.fromhex("7e 00 06 02 0000 0000 7e") + b"\r\n"
-"""A frame of the Pro mode, where the maker's programs leave the driver: go to the Simple mode. A driver that is there
-already takes it for a command that it does not know."""
+"""A frame of the Pro mode, where the maker's programs leave the driver: go to the Simple mode. A driver that is in it
+already treats this as a command that it does not know."""
 _FIRST_ANSWER_S = 0.3
 _QUIET_S = 0.05
-"""A line on which nothing has come for so long has no late answers on it."""
+"""After this time without a byte no late answer is on the line, s."""
 _STATUS_S = 1.0
-"""How often it is asked for its status while inputs are sent."""
+"""The time between two status queries while inputs are sent, s."""
 _TROUBLE = {
     0: "no mirror is connected to it",
     1: "the mirror's electronics are too hot",
     2: "the mirror is too hot",
     3: "the mirror's memory cannot be read",
 }
-"""Bits of its status with which it moves nothing, or not as commanded. They stay set until the status is read."""
+"""Status bits with which the driver moves nothing, or not as commanded. They stay set until the status is read."""
 _REFUSED = {
     "NO": "it does not take commands in its present state; Optotune Cockpit shows what is wrong",
     "OL": "it went to its lower limit instead; make the rig's limits smaller",

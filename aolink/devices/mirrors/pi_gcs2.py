@@ -1,6 +1,6 @@
 """Tip/tilt platforms on a controller of Physik Instrumente (PI) that speaks the General Command Set, version 2.
 
-GCS answers questions only. A command that fails leaves an error number, which ``ERR?`` tells and clears, so each
+GCS answers questions only. A command that fails leaves an error number, which ``ERR?`` returns and clears, so each
 ``MOV`` is sent together with an ``ERR?``. Its answer is read when the next input is to be sent, at the latest: the
 line's round trip takes place during the fast step, and an error is known one step later. No more than one answer is
 ever awaited, so a controller that is slower than the fast rate makes steps late, and fills no buffer with old inputs.
@@ -42,9 +42,9 @@ SETTLING_S = 5.0
 """How long the stage may take to its safe position when it is opened."""
 _POLL_S = 0.02
 _MOST_LINES = 100
-"""Lines of an answer, or left of earlier answers, after which it is none."""
+"""The most lines of an answer, or of earlier answers still waiting; more of them are not an answer."""
 _QUIET_S = 0.05
-"""A line on which nothing has come for so long has no late answers on it."""
+"""After this time without a byte no late answer is on the line, s."""
 _DECIMALS = 6
 """Decimals of a position: below what the stages resolve, in micrometres, microradians and milliradians."""
 
@@ -57,7 +57,7 @@ class PiMirror:
     port:
         A serial port, or ``socket://HOST:50000`` for a controller in the network.
     axes:
-        The controller's axes for the inputs, in their order. Nothing else is moved, and no other servo switched on: on
+        The controller's axes for the inputs, in their order. No other axis is moved, and no other servo switched on: on
         some stages that does harm (the third axis of an S-335).
     scale, offset:
         Position for an input of one, less the position for zero, and the latter; in the controller's units. One number,
@@ -102,8 +102,8 @@ class PiMirror:
         return (positions - self._offset) / self._scale
 
     def park(self) -> None:
-        """Stop whatever moves, also what the controller plays by itself, and go to the safe input."""
-        # Answers to what was asked before may still come: those after the identity belong to what follows it. All is
+        """Stop all motion, including motion that the controller generates by itself, and go to the safe input."""
+        # Answers to earlier questions may still come: those after the identity belong to the questions after it. All is
         # sent before the first of them is awaited, for a controller that hears and does not answer.
         self._unanswered = ""
         self._line.tell(b"STP\n*IDN?\nERR?\n")
@@ -124,7 +124,7 @@ class PiMirror:
             self._check(command, self._error_number(command, self._next_line()))
 
     def _command(self, command: str) -> None:
-        """Send a command and wait until it is taken. Raises DeviceError where it is not."""
+        """Send a command and wait until it is accepted. Raises DeviceError where it is not."""
         self._send(command)
         self._take_answer()
 
@@ -133,15 +133,15 @@ class PiMirror:
         self._line.tell(f"{command}\nERR?\n".encode())
 
     def _identify(self) -> str:
-        """Raises DeviceError for what is no controller of PI with GCS 2."""
+        """Check the identity. Raises DeviceError for a device that is not a controller of PI with GCS 2."""
         self._line.drain(_QUIET_S)
         identity = self._answer("*IDN?")
         if "physik instrumente" not in identity.lower():
             raise DeviceError(
-                f"what is at {self._line.url} says that it is {identity!r}, not a controller of Physik Instrumente:"
-                " `aolink devices` lists the ports of this machine"
+                f"the device at {self._line.url} identifies itself as {identity!r}, not as a controller of Physik"
+                " Instrumente: `aolink devices` lists the ports of this machine"
             )
-        self._answer("ERR?")  # what others have left
+        self._answer("ERR?")  # errors that other programs have left
         version = self._answer("CSV?")
         try:
             number = float(version)
@@ -166,7 +166,7 @@ class PiMirror:
             )
 
     def _check_limits(self, rig: Rig) -> None:
-        """The rig's limits must lie within the controller's, where it tells them."""
+        """Check that the rig's limits lie within the controller's, where it reports them."""
         ends = self._offset + self._scale * np.array([rig.mirror.input_min, rig.mirror.input_max])
         low, high = ends.min(axis=0), ends.max(axis=0)
         lowest, highest = self._numbers("TMN?"), self._numbers("TMX?")

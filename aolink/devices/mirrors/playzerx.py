@@ -1,7 +1,7 @@
 """Mirrorcle PlayzerX: a mirror of two axes behind a queue of samples, one for each fast step.
 
 The commands are those of the maker's page "PlayzerX USB Serial Protocol" (12 bits for each axis, 0 to 4095 for -1 to
-1); what the device answers is as the maker's own library (PlayzerX.cpp, version 2.1) reads it.
+1); the answers are read as the maker's own library (PlayzerX.cpp, version 2.1) does.
 """
 
 from __future__ import annotations
@@ -34,25 +34,25 @@ _COLOURS = {"XYM": 1, "XYRGB": 3}
 _HALF = 2047.5
 """Converter steps from the origin to the end of the range."""
 _PERIOD_S = 0.01
-"""About how often the queue is filled and counted, at most."""
+"""The shortest time, roughly, between two fillings and counts of the queue, s."""
 _GOLDEN = 0.618034
 """The pauses between two counts follow this ratio, so that they fall into all phases of a sample."""
 _WARM_UP = 30
-"""Counts before the first step is told: enough to know the phase of the samples."""
+"""Counts before the first step is reported: enough to know the phase of the samples."""
 _SLOW_NS = 3_000_000
-"""An answer that takes longer says that something was held up, but not on which side."""
+"""An answer that takes longer shows that something was held up, but not on which side."""
 _TRIES = 3
-"""A machine that is held up right at the beginning is given another chance."""
+"""Number of attempts, for a machine that is held up right at the beginning."""
 _QUIET_S = 0.05
 _INFO_S = 0.3
-"""How long older firmware is waited for to say its data format."""
+"""How long to wait for older firmware to report its data format, s."""
 
 Codes = NDArray[np.uint16]
 """Positions as the converter takes them, (n_samples, 2)."""
 
 
 def command(code: str, data: bytes = b"") -> bytes:
-    """A command: prefix, code, its whole length, data, end."""
+    """The bytes of a command: prefix, code, its whole length, data, end."""
     return b"pl" + code.encode() + bytes([5 + len(data)]) + data + b"\n"
 
 
@@ -104,7 +104,7 @@ class PlayzerX:
     The device takes a sample from its queue in each fast step, and the driver keeps the samples of the next ``ahead_s``
     in it, from opening to closing: commands, and the safe input where there is none. So the host may be held up for
     that long; a command must come as much earlier than its first step, and cannot be replaced after that. The queue can
-    be emptied, but then nobody knows at which sample: this is done when the device is closed, no earlier.
+    be emptied, but it is not known at which sample this happens, so it is done only when the device is closed.
 
     If the host is held up for longer, the queue runs dry: the mirror holds the last sample meanwhile, steps that were
     commanded count as late, and the driver finds out from the next counts which sample belongs to which step.
@@ -121,7 +121,7 @@ class PlayzerX:
     Raises
     ------
     DeviceError
-        The rig file asks for what the device cannot do, or it does not answer as a PlayzerX does.
+        The rig file asks for something that the device cannot do, or the device does not answer as a PlayzerX does.
     PortError
         The port cannot be opened.
     """
@@ -148,17 +148,18 @@ class PlayzerX:
             self._clock = SampleClock(self._step_ns)
             self._pauses = (min(_PERIOD_S, ahead_s / 10) * (0.5 + k * _GOLDEN % 1) for k in count())
             self._commands: dict[int, Codes] = {}
-            """By fast step, (2,); those that have not been handed over."""
+            """Commands by fast step, (2,); only those that have not been handed over."""
             self._next = 0
             """The first step whose sample has not been handed over."""
             self._steps: list[tuple[Codes, bool]] = []
-            """What is held in the steps before ``_next`` that were not told, and whether its command came too late."""
+            """The positions held in the steps before ``_next`` that were not yet reported, and whether each command
+            came too late."""
             self._handed = self._offset = 0
             """Samples handed over, and the difference of a step's number from its sample's."""
             self._taken = 0
             """The step that the mirror was in at the latest count."""
             self._batch = 0
-            """The first step of what was handed over last."""
+            """The first step of the samples that were handed over last."""
             self._changed = threading.Lock()
             self._closing = threading.Event()
             self._failed: Exception | None = None
@@ -218,7 +219,7 @@ class PlayzerX:
         try:
             self._leave_safe()
         except AolinkError:
-            if self._failed is None:  # else the session has heard of it
+            if self._failed is None:  # otherwise the session knows of it already
                 raise
         finally:
             self._line.close()
@@ -228,8 +229,9 @@ class PlayzerX:
         self._count()
 
     def _identify(self) -> tuple[str, str]:
-        """Description and data format. Raises DeviceError."""
-        # The first command ends what another program may have left half sent; the second one stops what it asked for.
+        """Ask for the device's description and data format. Raises DeviceError."""
+        # The first command ends a command that another program may have left half sent; the second one stops what that
+        # program started.
         self._line.tell(NO_UPDATES + NO_UPDATES)
         self._line.drain(_QUIET_S)
         for request, expected in ((PING, b"pl-ok"), (INFO, b"pl-info")):
@@ -264,13 +266,13 @@ class PlayzerX:
         try:
             while not self._closing.wait(next(self._pauses)):
                 self._serve()
-        except Exception as error:  # the session is told when it asks next
+        except Exception as error:  # the session gets the error when it asks next
             with self._changed:
                 self._failed = error
 
     def _serve(self) -> None:
         """Count the samples, and fill the queue."""
-        # A slow answer does not tell whether the queue ran dry meanwhile, nor before which samples. The next one does,
+        # A slow answer does not show whether the queue ran dry meanwhile, nor before which samples. The next one does,
         # as long as nothing more was handed over.
         for _ in range(_TRIES):
             asked_ns = time.monotonic_ns()
@@ -289,23 +291,26 @@ class PlayzerX:
         self._hand_over(self._step_at(time.monotonic_ns()) + 1 + self._ahead - self._next)
 
     def _count(self) -> int:
-        """Samples in the queue. The question follows all samples on the line, so that they are counted."""
+        """Ask for the number of samples in the queue. The question follows all samples on the line, so that they are
+        counted."""
         self._line.drain()
         self._line.tell(REMAINING)
         return remaining(self._line.read_exactly(_ANSWER))
 
     def _take_count(self, taken: int, asked_ns: int, answered_ns: int) -> None:
-        """``taken`` of the samples handed over were taken from the queue, and the last of them is being held."""
+        """Use a count: ``taken`` of the samples handed over were taken from the queue, and the last of them is being
+        held."""
         slip = self._clock.add(taken + self._offset, asked_ns, answered_ns)
         if slip > 0 and self._taken < self._batch <= taken + self._offset:
-            # Behind, but everything before what was handed over last was taken: that came when the queue had run dry.
+            # The device is behind, but has taken all samples before the last batch: that batch came when the queue had
+            # run dry.
             now = self._step_at((asked_ns + answered_ns) // 2)
             self._delay(self._batch, max(now + 1 - (taken + self._offset), 1))
             self._clock.doubt(self._step_ns + answered_ns - asked_ns)
         elif slip:
             raise DeviceError(
                 f"the PlayzerX's count of samples is off by {slip:.1f}: its line loses bytes, or it does not play"
-                f" {1e9 / self._step_ns:g} samples a second as it was told to"
+                f" {1e9 / self._step_ns:g} samples a second as it was asked to"
             )
         self._taken = max(self._taken, taken - 1 + self._offset)
 
@@ -313,7 +318,7 @@ class PlayzerX:
         return self._clock.time_ns(host_ns) // self._step_ns
 
     def _delay(self, step: int, n_steps: int) -> None:
-        """The queue had run dry: from ``step`` on, what was handed over is held ``n_steps`` later."""
+        """Note that the queue had run dry: from ``step`` on, the samples handed over are held ``n_steps`` later."""
         if n_steps > 0:
             at = step - (self._next - len(self._steps))
             before, _ = self._steps[at - 1]
@@ -338,7 +343,7 @@ class PlayzerX:
 
 
 def _checked_rate(rig: Rig) -> int:
-    """Samples a second. Raises DeviceError."""
+    """The sample rate, samples a second. Raises DeviceError."""
     rate = round(1e9 / rig.timing.fast_step_ns)
     if rate not in RATES or rate * rig.timing.fast_step_ns != 1_000_000_000:
         raise DeviceError(
@@ -349,7 +354,7 @@ def _checked_rate(rig: Rig) -> int:
 
 
 def _check(rig: Rig, laser: int, ahead: int) -> None:
-    """Raises DeviceError where the rig file or a key asks for what the device cannot do."""
+    """Check the rig file and the keys. Raises DeviceError where they ask for something that the device cannot do."""
     mirror = rig.mirror
     if rig.n_inputs > 2 or (mirror.input_min < -1).any() or (mirror.input_max > 1).any():
         raise DeviceError(

@@ -1,4 +1,5 @@
-"""Whether a rig file's converter is as coarse as the device's own, so that what was held can be compared with it."""
+"""The check that a rig file's converter is as coarse as the device's own, so that held inputs can be compared with
+commanded ones."""
 
 from __future__ import annotations
 
@@ -21,7 +22,7 @@ def check_resolution(mirror: MirrorDriver, step: float | NDArray[np.float64], de
     Raises
     ------
     DeviceError
-        It is finer: what the device holds would count as another input than the one commanded.
+        It is finer: the input that the device holds would count as another input than the one commanded.
     """
     if (converter_margin(mirror) < step).any():
         bits = int(np.log2(((mirror.input_max - mirror.input_min) / step).min() * (1 + 1e-9) + 1))

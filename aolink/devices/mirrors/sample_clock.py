@@ -7,18 +7,18 @@ import math
 _DRIFT = 200e-6
 """No crystal drifts from the host's clock by more, as a part of the time that passes."""
 _SETTLING_S = 2.0
-"""The time told follows what the counts say within some such time, so that it never jumps."""
+"""The reported time follows the counts with about this time constant, s, so that it never jumps."""
 _TOLERANCE = 0.05
-"""A count that contradicts the earlier ones by more than this part of a sample is no matter of drift."""
+"""A count that contradicts the earlier ones by more than this part of a sample cannot be explained by drift."""
 
 
 class SampleClock:
-    """When sample 0 was put out, by the counts of samples that came after.
+    """The time at which sample 0 was put out, from later counts of samples.
 
     A count of n, true at some time between its question and its answer, says that sample n - 1 was being put out then:
     sample 0 began n sample periods before at the earliest, and n - 1 at the latest. All counts together leave an
-    interval for that, the narrower the more phases of a sample they were asked in; it widens with time, for the host's
-    clock and the device's drift apart.
+    interval for that time, which is narrower the more phases of a sample they were asked in; it widens with time,
+    because the host's clock and the device's drift apart.
 
     Parameters
     ----------
@@ -32,13 +32,13 @@ class SampleClock:
         """Earliest and latest host time at which sample 0 can have begun, less ``_base_ns``, ns."""
         self._base_ns = self._at_ns = 0
         self._told_ns = self._rate = 0.0
-        """The host time told for it, less ``_base_ns``, and by how much of the time that passes it moves."""
+        """The host time reported for it, less ``_base_ns``, ns, and its rate of change against the time that passes."""
 
     def add(self, taken: int, asked_ns: int, answered_ns: int) -> float:
         """Take a count into account, which was true at some time between two host times.
 
-        Gives 0, or the samples by which the device is behind what the counts before say (above 0) or ahead of it: such
-        a count is not taken into account.
+        Gives 0, or the samples by which the device is behind the earlier counts (above 0) or ahead of them: such a
+        count is not used.
         """
         if self._zero is None:
             self._base_ns = asked_ns - taken * self._period_ns
@@ -61,7 +61,7 @@ class SampleClock:
         return 0.0
 
     def doubt(self, by_ns: int) -> None:
-        """The device has stood still meanwhile: what is known of its samples may be wrong by so much."""
+        """Widen the interval because the device has stood still: the times of its samples may be wrong by this much."""
         assert self._zero is not None, "add a count first"
         self._zero = self._zero[0] - by_ns, self._zero[1] + by_ns
 
@@ -73,21 +73,21 @@ class SampleClock:
 
     @property
     def sigma_ns(self) -> float:
-        """Standard deviation of the time told, ns: that of the interval which the counts leave, and how far it is off.
-
-        The line's asymmetry, at most half a round trip, does not show in the counts.
+        """Standard deviation of the reported time, ns: that of the interval which the counts leave, and the distance of
+        the reported time from it. The line's asymmetry, at most half a round trip, does not show in the counts.
         """
         assert self._zero is not None, "add a count first"
         earliest, latest = self._zero
         return math.hypot((latest - earliest) / math.sqrt(12), self._told_ns - (earliest + latest) / 2)
 
     def settle(self) -> None:
-        """Tell from now on what the counts say, without regard to what was told: for before anybody has asked."""
+        """Report from now on exactly the time that the counts give, even if it jumps: for use before any time was
+        reported."""
         assert self._zero is not None, "add a count first"
         self._told_ns = sum(self._zero) / 2
 
     def _follow(self, middle_ns: float, elapsed_ns: int) -> None:
-        """A phase-locked loop of second order, critically damped: without a lag where the drift is constant."""
+        """Advance a phase-locked loop of second order, critically damped: it has no lag where the drift is constant."""
         step = min(elapsed_ns / (_SETTLING_S * 1e9), 0.5)
         self._told_ns += self._rate * elapsed_ns
         apart = middle_ns - self._told_ns

@@ -29,11 +29,11 @@ _CHANNEL = 1
 _FULL_SCALE = 32_767
 _OPEN_LOOP, _CLOSED_LOOP = 1, 2
 _CUBE_VOLTS = {1: 75.0, 2: 100.0, 3: 150.0}
-"""What the voltage limit of a cube means."""
+"""Volts of full scale, by a cube's code for its voltage limit."""
 _ALIGNER_VOLTS = 10.0
 _ALIGNER_OPEN_LOOP = 2
 _ALIGNER_OUTPUTS = 0x0D
-"""The part of the aligner's parameters that its outputs are."""
+"""The group of the aligner's parameters that holds its outputs."""
 _ALIGNER_GET, _CODEC_ALIGNER_GET = 0x0872, 0x0870
 """The aligner's answer, and the number under which version 29 of the codec reads it: that of the command."""
 _QUIET_S = 0.05
@@ -41,7 +41,7 @@ _LONGEST = 255
 
 
 class AptUnit:
-    """A unit at the end of a line: messages to it and from it.
+    """A unit at the end of a serial line: messages to it and from it.
 
     Parameters
     ----------
@@ -70,7 +70,7 @@ class AptUnit:
         """Send a request, and give the fields of the message that answers it.
 
         Other messages may come before it: they are thrown away. Raises DeviceError where it does not come in time, or
-        the unit says that something is wrong.
+        the unit reports an error.
         """
         self.tell(name, *values)
         deadline = time.monotonic() + TIMEOUT_S
@@ -86,7 +86,7 @@ class AptUnit:
                 return fields
 
     def drain(self) -> None:
-        """Throw away what is on its way from the unit."""
+        """Throw away the bytes that are on their way from the unit."""
         self._line.drain(_QUIET_S)
 
     def description(self) -> str:
@@ -120,10 +120,10 @@ class _Output(NamedTuple):
     unit: AptUnit
     closed_loop: bool
     most: float
-    """Volts of full scale, or micrometres in closed loop."""
+    """Full scale: volts, or micrometres in closed loop."""
 
     def put(self, value: float) -> float:
-        """Put out volts or micrometres; gives what the unit took."""
+        """Put out volts or micrometres; gives the value that the unit took."""
         code = int(np.clip(round(value / self.most * _FULL_SCALE), 0, _FULL_SCALE))
         if self.closed_loop:
             self.unit.tell("pz_set_outputpos", _CHANNEL, code)
@@ -143,7 +143,7 @@ class ThorlabsPiezo:
     """A `DirectMirror`: an input is a voltage, or in closed loop a position.
 
     In open loop the unit is asked for its output after each input. In closed loop it is asked for the position, as a
-    sign of life; what counts as held is the position commanded, for the sensor's noise is no input.
+    sign of life; the commanded position counts as held, because the sensor's noise is not an input.
 
     Parameters
     ----------
@@ -211,13 +211,13 @@ class ThorlabsPiezo:
 
     def close(self) -> None:
         """Give the units back, at the safe input."""
-        with suppress(AolinkError):  # one that is lost has said so before
+        with suppress(AolinkError):  # a lost one has raised its error before
             self.park()
         for line in self._lines.values():
             line.close()
 
     def _prepare(self, apt: AptUnit) -> float:
-        """Set the loop and what the output follows; gives the volts or micrometres of full scale."""
+        """Set the control mode and the input source; gives the volts or micrometres of full scale."""
         unit = "um" if self._closed_loop else "V"
         apt.tell("pz_set_inputvoltssrc", _CHANNEL, 0)  # the host alone: no knob, no other input
         mode = _CLOSED_LOOP if self._closed_loop else _OPEN_LOOP
@@ -331,7 +331,7 @@ def _places(port: str | list[str], bays: list[int] | None, n_inputs: int) -> lis
 
 
 def _greeted(line: Line, apt: AptUnit) -> str:
-    """Have a unit say nothing but answers; gives its description. Raises DeviceError."""
+    """Make a unit send nothing but answers; gives its description. Raises DeviceError."""
     apt.tell("hw_no_flash_programming")
     apt.tell("hw_stop_updatemsgs")
     line.drain(_QUIET_S)

@@ -1,4 +1,5 @@
-"""Loops over axes, components and pixels, compiled by Numba: of line sensors, of spots, and of many spots of one plant.
+"""Loops over axes, components and pixels, compiled by Numba, for line sensors, for spots, and for many spots of one
+plant.
 
 Whole-array calls for thousands of axes run through memory again and again; these loops keep one axis in the
 processor's cache (rows `profile_of_many_axes`, `mixture_of_many_axes` and `membrane_in_real_time` of tools/bench).
@@ -39,9 +40,9 @@ compiles_itself = False
 
 
 def make_ready(folder: Path = _FOLDER, program: str = _COMPILE) -> None:
-    """Have the loops compiled by a process of its own, once for this version and processor; all others load them.
+    """Compile the loops in a process of its own, once for this version and processor; all other processes load them.
 
-    A process that compiles them for itself computes with other machine code than one that loads what was kept, so the
+    A process that compiles them for itself computes with other machine code than one that loads the kept code, so the
     last bits of estimates online and offline might differ. Where nothing can be kept, each process compiles for itself.
     """
     if compiles_itself:
@@ -54,7 +55,7 @@ def make_ready(folder: Path = _FOLDER, program: str = _COMPILE) -> None:
             return
         kept.mkdir(exist_ok=True)
         with open(kept / "compiling.lock", "w") as lock:
-            fcntl.flock(lock, fcntl.LOCK_EX)  # another process may be at it
+            fcntl.flock(lock, fcntl.LOCK_EX)  # another process may be compiling
             if ready.exists() and ready.stat().st_mtime >= changed:
                 return
             if subprocess.run([sys.executable, "-c", program], stdin=subprocess.DEVNULL).returncode == 0:
@@ -62,7 +63,7 @@ def make_ready(folder: Path = _FOLDER, program: str = _COMPILE) -> None:
 
 
 def _machine() -> str:
-    """What compiled code depends on, as Numba sees it: Numba's version, the processor and its features."""
+    """The facts that compiled code depends on for Numba: Numba's version, the processor and its features."""
     import numba
     from numba.core.registry import cpu_target
 
@@ -75,7 +76,7 @@ def forget_stale(folder: Path) -> None:
 
     Numba checks a function's own file only, but its machine code contains the functions of other files that it calls.
     """
-    with suppress(OSError, ValueError):  # nothing kept, or not to be removed by this user
+    with suppress(OSError, ValueError):  # there is no kept code, or this user may not remove it
         changed = max(source.stat().st_mtime for source in folder.glob("*.py"))
         for kept in (folder / "__pycache__").glob("*.nbi"):
             if kept.stat().st_mtime < changed:

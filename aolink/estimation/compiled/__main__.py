@@ -1,4 +1,5 @@
-"""``python -m aolink.estimation.compiled``: what estimators would compile when they are first used, as of now."""
+"""``python -m aolink.estimation.compiled``: compile now the code that estimators would compile when they are first
+used."""
 
 from aolink.estimation.compiled import make_ready
 

@@ -16,9 +16,8 @@ from aolink.numerics.arrays import BoolArray, FloatArray, Indices
 
 @compiled
 def informed(information: FloatArray, patterns: FloatArray, course_of: Indices, course: int, out: FloatArray) -> None:
-    """A spot's information (spots, 2, m, 2, m) between one course and the patterns (outputs, size).
-
-    ``out``, (outputs, k), is that between the course of each output and the first k coefficients.
+    """Information between the course of each output and the first k coefficients, ``out`` (outputs, k), from each
+    spot's information (spots, 2, m, 2, m) and the patterns (outputs, size).
     """
     for s in range(len(information)):
         for d in range(2):

@@ -19,14 +19,14 @@ LARGE = 1e200
 
 
 class Line(NamedTuple):
-    """Frames of a line sensor and what is needed to predict them, one row for each axis and start."""
+    """Frames of a line sensor and the data needed to predict them, one row for each axis and start."""
 
     y: FloatArray
     """Densities, (rows, pixels)."""
     usable: BoolArray
     """(rows, pixels)"""
     inputs: FloatArray
-    """What inputs add to the path at its nodes, (rows, nodes)."""
+    """Response of the path to the inputs at its nodes, (rows, nodes)."""
     basis: FloatArray
     """The exposure basis at the nodes, transposed since the inner loops are over nodes, (n, nodes)."""
     weights: FloatArray
@@ -34,7 +34,7 @@ class Line(NamedTuple):
     table: FloatArray
     """Taylor coefficients of the light about points of a pixel, in pixels, (points, 4, reach)."""
     low: float
-    """Where the first pixel begins."""
+    """Edge at which the first pixel begins, slope units."""
     high: float
     pixel: float
     """Width of a pixel, slope units."""
@@ -43,7 +43,7 @@ class Line(NamedTuple):
     read_noise: float
     """Variance of a pixel's density."""
     gain: float
-    """Shot noise: by how much that variance grows with the density."""
+    """Shot noise: increase of that variance with the density."""
     kernel_variance: float
     """Variance of the sensor's kernel, without the path's variance about the nodes, slope units squared."""
 
@@ -80,7 +80,8 @@ def expected_light(line: Line, path: FloatArray, f: FloatArray) -> None:
 
 @inlined
 def linearised_light(line: Line, path: FloatArray, basis: FloatArray, f: FloatArray, J: FloatArray) -> None:
-    """The same, and its Jacobian J (n, padded pixels) by the coefficients of a basis (n, nodes)."""
+    """The densities of `expected_light`, and their Jacobian J (n, padded pixels) by the coefficients of a basis (n,
+    nodes)."""
     f[:] = 0.0
     J[:] = 0.0
     points, _, reach = line.table.shape
@@ -105,7 +106,7 @@ def linearised_light(line: Line, path: FloatArray, basis: FloatArray, f: FloatAr
 
 @inlined
 def log_likelihood_of(y: FloatArray, usable: BoolArray, f: FloatArray, read_noise: float, gain: float) -> float:
-    """Log-likelihood of pixels of which f is expected, all (pixels,)."""
+    """Log-likelihood of pixels with expected densities f, all (pixels,)."""
     total, product, quiet = 0.0, 1.0, 1.0 / read_noise
     for p in range(len(y)):
         if usable[p]:
@@ -113,7 +114,7 @@ def log_likelihood_of(y: FloatArray, usable: BoolArray, f: FloatArray, read_nois
             if gain and f[p] > 0.0:
                 R = read_noise + gain * f[p]
                 total += e * e / R
-                # One logarithm of a product: one for each pixel would take longer than all else here.
+                # One logarithm of a product is taken: one for each pixel would take longer than everything else here.
                 product *= R * quiet
                 if product > LARGE:
                     total += math.log(product)

@@ -90,7 +90,7 @@ def innovations_of_lines(
             for i in range(n):
                 moved += vectors[d, i] * s[i]
                 told += vectors[d, i] * pull[i]
-            # Nothing is new in a direction in which the pixels do not tell anything.
+            # The innovation is zero in a direction about which the pixels have no information.
             along = told / math.sqrt(size) if size > tells_nothing * values[0] else 0.0
             value[row, d] = along + math.sqrt(size) * moved
             information[row, d] = size

@@ -16,14 +16,14 @@ from aolink.numerics.arrays import BoolArray, FloatArray
 
 
 class Plane(NamedTuple):
-    """Frames of spots and what is needed to predict them, one row for each axis of the plant."""
+    """Frames of spots and the data needed to predict them, one row for each axis of the plant."""
 
     y: FloatArray
     """Densities, (rows, spots, side, side), the last one along x."""
     usable: BoolArray
-    """The same shape."""
+    """Mask of the usable pixels, of the same shape."""
     inputs: FloatArray
-    """What inputs add to the path at its nodes, (rows, outputs, nodes): x and y of each spot in turn."""
+    """Response of the path to the inputs at its nodes, (rows, outputs, nodes): x and y of each spot in turn."""
     basis: FloatArray
     """The exposure basis at the nodes, (outputs, n, nodes)."""
     weights: FloatArray
@@ -31,17 +31,17 @@ class Plane(NamedTuple):
     across: FloatArray
     """Taylor coefficients of the densities of columns of pixels about points of a pixel, (terms, points, 4, reach)."""
     down: FloatArray
-    """The same of rows of pixels."""
+    """The same coefficients for rows of pixels."""
     terms: FloatArray
     """Factors of the products, (terms,)."""
     low: float
-    """Where the first pixel begins, in both directions."""
+    """Edge at which the first pixel begins, in both directions, slope units."""
     per_unit: float
     """Pixels in a slope unit."""
     read_noise: float
     """Variance of a pixel's density."""
     gain: float
-    """Shot noise: by how much that variance grows with the density."""
+    """Shot noise: increase of that variance with the density."""
 
 
 @compiled

@@ -25,12 +25,14 @@ def inlined(function: Callable[..., Any]) -> Any:
 
 
 def compiled_sums(function: Callable[..., Any]) -> Any:
-    """The same for a function with long sums whose order does not matter: several terms are added at a time."""
+    """Decorator as `compiled`, for a function with long sums whose order does not matter: several terms are added at a
+    time."""
     return _compiled(function, {"contract", "arcp", "reassoc", "nsz"})
 
 
 def compiled_exactly(function: Callable[..., Any]) -> Any:
-    """The same for a function that gives the bits that the interpreter gives: no product is fused with a sum."""
+    """Decorator as `compiled`, for a function with the same bits as in the interpreter: no product is fused with a
+    sum."""
     return _compiled(function, set())
 
 

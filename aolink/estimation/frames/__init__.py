@@ -1,1 +1,1 @@
-"""What is measured of a frame: its moments, its profiles or the windows about its spots, with their noise."""
+"""Measurements of a frame: its moments, its profiles or the windows about its spots, with their noise."""

@@ -12,7 +12,7 @@ from aolink.rig import Rig
 
 
 def centroid_covariance(rig: Rig) -> FloatArray:
-    """Covariance of the centroids, read-out and shot noise, of a spot where the plant's prior has it.
+    """Covariance of the centroids by read-out and shot noise, for spots where the plant's prior expects them.
 
     Returns
     -------

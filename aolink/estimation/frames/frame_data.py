@@ -1,4 +1,4 @@
-"""What can be measured of a frame (moments, profiles, windows), and how an estimator says what it needs."""
+"""Kinds of measurements of a frame (moments, profiles, windows), and an estimator's statement of its needs."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ on a plant with hundreds of states."""
 
 @dataclass(frozen=True, kw_only=True)
 class Needs:
-    """What an estimator takes of each frame, and how much of the frame must be usable."""
+    """The measurements that an estimator takes of each frame, and the part of the frame that must be usable."""
 
     what: Literal["moments", "profile", "windows"]
     """"moments": a `Measurement`; "profile": a `Profile`; "windows": `SpotWindows`, only where one copy of the plant
     moves whole spots."""
     orders: tuple[int, ...] = ()
-    """Which moments, from 1."""
+    """Orders of the moments, from 1."""
     flux: Flux = "known"
-    """"known": the light of a frame sums to one; "measured": moments are divided by the light that is measured."""
+    """"known": the light of a frame sums to one; "measured": moments are divided by the measured light."""
     least_usable: float = 1.0
     """Share of a spot's pixels that must be usable. Moments need all of them: whole spots."""
     least_spots: float = 1.0
@@ -37,7 +37,7 @@ class Needs:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Measurement:
-    """What was measured in one exposure, with Gaussian noise."""
+    """The measurements in one exposure, with Gaussian noise."""
 
     value: FloatArray
     """(axes, n_measurements)"""

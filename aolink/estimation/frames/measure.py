@@ -1,4 +1,5 @@
-"""Measures exposures for an estimator: their moments, profiles or windows, each whatever came before."""
+"""The measurement of exposures for an estimator: their moments, profiles or windows, each independent of earlier
+exposures."""
 
 from __future__ import annotations
 
@@ -19,7 +20,7 @@ from aolink.optics.sensor import BaseSensor, Sensor, SpotSensor
 from aolink.rig import Rig
 
 Measured = tuple[FrameData | None, str]
-"""What was measured of an exposure, or None; and a remark about what could not be used, or an empty text."""
+"""The measurements of an exposure, or None; and a remark about unusable parts, or an empty text."""
 
 
 class Measurements:
@@ -63,7 +64,7 @@ class Measurements:
                 self.rows[whole[k]] = row
 
     def __getitem__(self, k: int) -> Measured:
-        """What was measured of exposure k, or None; and a remark."""
+        """The measurements of exposure k, or None; and a remark."""
         row = self.rows[k]
         if self.moments is None or row < 0:
             return measure(self._rig, self._exposures[k], self._needs)
@@ -92,7 +93,7 @@ def _moments_of_lines(sensor: Sensor, pixels: NDArray[np.uint16], needs: Needs) 
 
 
 def measure(rig: Rig, exposure: Exposure, needs: Needs | None) -> Measured:
-    """What an estimator needs of an exposure, or None; and a remark about what could not be used."""
+    """The measurements that an estimator needs of an exposure, or None; and a remark about unusable parts."""
     if needs is None:
         return None, ""
     if exposure.slopes is not None:

@@ -1,8 +1,8 @@
 """Spatial moments of an exposure: measured from counts, with the covariance of their noise.
 
 The p-th moment is sum omega^p Y D over the pixels, with omega the pixel's centre, Y its density and D its
-width. The kernel and the pixels' width add to it as independent variables do; that is taken out, so
-that E[y_p] = mean(theta^p). Mishra & Wen (7) to (11).
+width. The kernel and the pixels' width add to it as independent variables do; their contribution is removed, so that
+E[y_p] = mean(theta^p). Mishra & Wen (7) to (11).
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ def measured_flux_covariance(
 
 
 def without_kernel(kernel: FloatArray, highest: int) -> FloatArray:
-    """The matrix that takes the kernel out of moments 0 .. highest, (highest + 1, highest + 1).
+    """The matrix that removes the kernel from moments 0 .. highest, (highest + 1, highest + 1).
 
     The moments found are M_p = sum_k binom(p, k) kernel_k m_(p-k); this is the inverse of that map.
     """
@@ -103,7 +103,7 @@ def measure_moments(
     counts:
         One row for each axis, (axes, pixels), none missing or saturated.
     orders:
-        Which moments, from 1.
+        Orders of the moments, from 1.
     flux:
         "known": the total is one, as Mishra & Wen (9) to (11) take it; "measured": divide by it, as (7) does.
     light:
@@ -135,7 +135,7 @@ def with_shot_noise(
     read:
         The same by read-out noise alone, (2 highest + 1,).
     sums:
-        What shot noise adds, from counts above the black level (axes, pixels).
+        Contribution of shot noise, from counts above the black level (axes, pixels).
     """
     light = counts.astype(np.float64) - black_level
     noise = read + sums(light)
@@ -201,7 +201,7 @@ def moments_from_sums(
 
 
 def spot_significance(sensor: Sensor, density: FloatArray) -> FloatArray:
-    """By how many standard deviations the light of each row's brightest stretch stands out, over several lengths.
+    """Light of each row's brightest stretch in standard deviations of its noise, over several lengths.
 
     Densities (n, pixels) -> (n,).
     """
@@ -224,9 +224,9 @@ def significance_scale(sensor: Sensor) -> float:
 def least_significance(sensor: Sensor, light: FloatArray | float = 1.0) -> FloatArray:
     """The least `spot_significance` of a frame that has a spot, however widely it is smeared.
 
-    Light as wide as the field stands out by its total over the total's noise, one less by chance. Where that is
-    large, a frame without a spot hardly ever reaches it; where it is small, most do, but their moments' covariance is
-    large. ``light`` is the spot's as a share of a whole one's.
+    The significance of light as wide as the field is its total over the total's noise, one less by chance. Where that
+    is large, a frame without a spot hardly ever reaches it; where it is small, most do, but their moments' covariance
+    is large. ``light`` is the spot's as a share of a whole one's.
     """
     total = light / math.sqrt(effective_noise_density(sensor) * (sensor.field[1] - sensor.field[0]))
     return np.clip(total - 1, _LEAST, _ENOUGH)

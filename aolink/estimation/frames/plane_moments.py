@@ -50,7 +50,7 @@ def measure_moments_2d(
     light:
         Light of each spot as a share of a whole one's, (axes,); one where None.
     photoelectrons:
-        Photoelectrons of a whole spot; 0 where shot noise does not matter.
+        Photoelectrons of a whole spot; 0 where shot noise is negligible.
 
     Returns
     -------

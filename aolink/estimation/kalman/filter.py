@@ -1,4 +1,5 @@
-"""The recursion from exposure to exposure: measurements in, states out. It knows no pixels and no clock."""
+"""The recursion of the Kalman filters from exposure to exposure: it takes measurements and gives states. It knows no
+pixels and no clock."""
 
 from __future__ import annotations
 
@@ -21,18 +22,18 @@ from aolink.numerics import batched
 from aolink.numerics.arrays import BoolArray, FloatArray, IntArray
 from aolink.rig import Plant
 
-# A measurement that chi-square makes less likely than this is not used. It is wide: the paper's filters leave the
-# process noise inside an exposure out, and have every right to innovations larger than they expect.
+# A measurement with a smaller chi-square tail probability than this is not used. The gate is wide: the paper's filters
+# leave the process noise inside an exposure out, so their innovations may be larger than they expect.
 GATE_PROBABILITY = 1e-9
 PATIENCE = 3
-"""After so many gated measurements in a row a filter starts again from the prediction without any."""
-# Relative change of a covariance that is rounding.
+"""After this many gated measurements in a row a filter starts again from the prediction without any measurement."""
+# Relative change of a covariance that counts as rounding.
 _SETTLED = 1e-13
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Posterior:
-    """The posterior of one exposure, and what became of its measurement."""
+    """The posterior of one exposure, and the use of its measurement."""
 
     coefficients: Gaussian
     """Coefficients of the exposure basis; the start state comes first."""
@@ -46,15 +47,15 @@ class Posterior:
     nis: FloatArray
     """(axes,)"""
     several: BoolArray | None = None
-    """Whether several modes of the posterior were found (the blur has more than one reading), (axes,); None where they
-    are not searched."""
+    """Whether several modes of the posterior were found (more than one path explains the blur), (axes,); None where
+    they are not searched for."""
     remark: str = ""
-    """What the filter had to do on some axes, for the estimate's reason; otherwise empty."""
+    """A note for the estimate's reason about unusual steps of the filter on some axes; otherwise empty."""
     components: Components | None = None
-    """Where the posterior is a mixture."""
+    """The mixture's components, where the posterior is a mixture."""
     log_evidence: FloatArray | None = None
-    """Log-likelihood of what was measured, up to what is the same for all plants and cameras, (axes,), NaN where
-    nothing was; None where innovation and covariance say it."""
+    """Log-likelihood of the measurement, up to a constant that is the same for all plants and cameras, (axes,), NaN
+    without a measurement; None where it follows from innovation and covariance."""
 
     @property
     def start(self) -> Gaussian:
@@ -77,12 +78,12 @@ class Run:
 
 
 class Filter(ABC):
-    """A recursive filter for one rig: it is given what it needs of each exposure and gives that one's posterior."""
+    """A recursive filter for one rig: it takes the measurements of each exposure and gives its posterior."""
 
     @property
     @abstractmethod
     def needs(self) -> Needs | None:
-        """What it needs of each frame; None if it takes no measurements."""
+        """The measurements that it needs of each frame; None if it takes none."""
 
     @abstractmethod
     def bridge(self, inputs: FloatArray) -> None:
@@ -90,10 +91,10 @@ class Filter(ABC):
 
     @abstractmethod
     def step(self, model: ExposureModel, response: InputResponse, measured: Any | None) -> Posterior:
-        """Predict over one exposure and update with what was measured of it; only predict where that is None."""
+        """Predict over one exposure and update with its measurements; only predict where these are None."""
 
     def run(self, model: ExposureModel, responses: InputResponse, measured: Measurement) -> Run | None:
-        """`step` for several exposures at once where the filter can, otherwise None."""
+        """The posteriors of `step` for several exposures at once, where the filter can do so; otherwise None."""
         return None
 
 
@@ -106,13 +107,13 @@ class BlurFilter(Filter):
     Parameters
     ----------
     observation:
-        What it measures of an exposure, and the update with that; None for prediction only.
+        The measurement of an exposure, and the update with it; None for prediction only.
     process_noise:
-        Covariance that one exposure adds: "lifted", what N fast steps do, or "printed", the paper's B_w W B_w'.
+        Covariance that one exposure adds: "lifted", that of N fast steps, or "printed", the paper's B_w W B_w'.
     gate:
         Whether measurements that are too far from their prediction are left out.
     predictor:
-        Another engine's prediction in the place of `predict`.
+        Another engine's prediction instead of `predict`.
     """
 
     def __init__(
@@ -213,9 +214,9 @@ def gate_status(used: BoolArray, lost: BoolArray, missed: IntArray) -> tuple[Int
     used:
         Whether the measurement passed the gate.
     lost:
-        Whether so many before it were gated that the filter started again.
+        Whether enough measurements before it were gated for the filter to start again.
     missed:
-        How many in a row before it were gated.
+        Number of measurements in a row before it that were gated.
     """
     now = np.where(used, 0, np.where(lost, 1, missed + 1))
     passed = np.where(lost, Status.REINITIALISED, Status.OK)
@@ -224,7 +225,8 @@ def gate_status(used: BoolArray, lost: BoolArray, missed: IntArray) -> tuple[Int
 
 
 class TwoStateFilter(BlurFilter):
-    """o3 of plants with two states and one output: a series of exposures is one compiled loop, to the same bits."""
+    """The filter o3 for plants with two states and one output: a series of exposures is one compiled loop, with the
+    same bits."""
 
     @staticmethod
     def suits(plant: Plant) -> bool:
@@ -313,7 +315,7 @@ def _kept(covariance: FloatArray) -> FloatArray:
 
 
 def _numbers(values: FloatArray) -> FloatArray:
-    """Zero for what is not a number, the largest one for what is too large."""
+    """The numbers with zero for NaN, and the largest double for infinite ones."""
     return values if _has_finite_sum(values) else np.nan_to_num(values)
 
 
@@ -322,7 +324,7 @@ def _has_finite_sum(values: FloatArray) -> bool:
 
 
 def _where(chosen: BoolArray, first: Gaussian, second: Gaussian) -> Gaussian:
-    """Axis by axis, the first Gaussian where chosen."""
+    """Axis by axis, the first Gaussian where chosen, otherwise the second."""
     which = np.flatnonzero(chosen)
     if not len(which):
         return second

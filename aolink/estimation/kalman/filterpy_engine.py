@@ -1,6 +1,5 @@
-"""The paper's filters on filterpy, for one axis: to check ours against, and for users to start their own from.
-
-filterpy takes a second to import and does one axis at a time, so it is imported only where it is asked for.
+"""The paper's filters on filterpy, for one axis: a check of ours, and a start for users' own filters. filterpy takes a
+second to import and computes one axis at a time, so it is imported only where it is asked for.
 """
 
 from __future__ import annotations

@@ -73,8 +73,8 @@ def _updated(
 def stepped_gain(A: FloatArray, H: FloatArray, Q: FloatArray, R: FloatArray) -> FloatArray | None:
     """The gain that a Kalman filter settles at, (n_states, m); None where it does not settle.
 
-    The Riccati equation stepped from exposure to exposure: a second for 288 states of a plant that forgets within a few
-    exposures what it is not shown.
+    The Riccati equation stepped from exposure to exposure: a second for 288 states of a plant that forgets its state
+    within a few exposures.
 
     Parameters
     ----------

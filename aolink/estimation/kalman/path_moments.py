@@ -26,7 +26,7 @@ Data = TypeVar("Data", contravariant=True)
 
 
 class Observation(Protocol[Data]):
-    """What a filter measures of an exposure, and its update with that."""
+    """The measurement that a filter takes of an exposure, and its update with it."""
 
     needs: Needs
     models_noise: bool
@@ -34,7 +34,7 @@ class Observation(Protocol[Data]):
     n_measurements: int
 
     def update(self, model: ExposureModel, response: InputResponse, prior: Gaussian, measured: Data) -> Update:
-        """Update the prior of the exposure's coefficients with what was measured."""
+        """Update the prior of the exposure's coefficients with the measurement."""
 
 
 class PathMoments:
@@ -110,7 +110,8 @@ class PathMoments:
 
 
 class SecondOrderMoments(PathMoments):
-    """`PathMoments` that allow for what their linearisation leaves out: the second-order extended Kalman filter.
+    """`PathMoments` with the second-order terms that their linearisation leaves out: the second-order extended Kalman
+    filter.
 
     The second moment is quadratic in the start state: with x ~ N(m, P) its mean is h_2(m) + tr(M P), and its covariance
     with that of another output H_2 P H_2' + 2 tr(M P M' P), both exactly. Athans, Wishner, Bertolini, IEEE Trans.

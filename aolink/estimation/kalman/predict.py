@@ -19,7 +19,7 @@ Predict = Callable[[Gaussian, FloatArray, FloatArray, FloatArray], Gaussian]
 
 
 def added_noise(model: ExposureModel, kind: Noise) -> FloatArray:
-    """Q, what the process noise of one exposure adds to the state's covariance, (n_states, n_states)."""
+    """Q, the contribution of one exposure's process noise to the state's covariance, (n_states, n_states)."""
     plant = model.plant
     return model.process_noise if kind == "lifted" else plant.B_w @ plant.process_noise @ plant.B_w.T
 

@@ -15,7 +15,7 @@ def steady_gain(model: ExposureModel, Q: FloatArray, R: FloatArray) -> FloatArra
     """Steady-state gain of the centroid filter on the lifted plant (A^N, C-bar), (n_states, n_outputs).
 
     It corrects the state at the start of the exposure with that exposure's centroid. None where the
-    Riccati equation has no stabilising solution: the centroid loses a mode that does not die out.
+    Riccati equation has no stabilising solution: the centroid does not observe an eigenmode that does not decay.
 
     Parameters
     ----------
@@ -36,7 +36,8 @@ def steady_gain(model: ExposureModel, Q: FloatArray, R: FloatArray) -> FloatArra
 
 
 def _compressed_gain(model: ExposureModel, Q: FloatArray, R: FloatArray) -> FloatArray | None:
-    """`steady_gain` for more outputs than states: of whitened ones, no more than there are states tell anything."""
+    """The gain of `steady_gain` for more outputs than states: of the whitened outputs only as many as there are states
+    carry information."""
     root = np.linalg.cholesky(R)
     blocks, size, _ = R.shape
     white = np.linalg.solve(root, model.mean_row.reshape(blocks, size, -1)).reshape(blocks * size, -1)

@@ -1,4 +1,4 @@
-"""The update of a Kalman filter, in the forms that it is computed in. They are one update, to rounding.
+"""The update of a Kalman filter, in the forms in which it is computed. They agree to rounding.
 
 `aolink.estimation.kalman.path_moments` chooses between them when an observation is made. Rows of tools/bench that need
 each: entry by entry `o3_step`, in blocks `spots_under_turbulence`, in information form
@@ -30,7 +30,7 @@ def joseph_update(
     R:
         Covariance of the measurement, (axes or 1, n_measurements, n_measurements).
     gain:
-        Used in the place of the optimal gain, (n, n_measurements): the covariance is that which it really gives.
+        A gain to use instead of the optimal one, (n, n_measurements): the covariance is the true one with this gain.
     """
     R = batched.batch_last(R)
     PH = batched.matmul(prior.covariance, batched.transpose(H))

@@ -8,8 +8,8 @@ Every estimator is an update of z; they differ in what they observe, and in whet
 
 Where the plant says so (`UnmodelledSlopes`), xi begins with one coefficient for each output: the mean over the exposure
 of the slopes v that the plant does not make, in their standard deviations. It moves the output for the whole exposure
-and leaves the end state alone. What v does about its mean has no coefficient; it widens spots by its variance, and the
-standard deviation of a path contains it.
+and leaves the end state alone. The variation of v about its mean has no coefficient; it widens spots by its variance,
+and the standard deviation of a path contains it.
 
 The spot rests at theta(k) for the whole of fast step k, as in the sum of Mishra & Wen (12). An exposure that starts a
 part f of a step late loses that part of its first step and gains the same part of the one after its last: a mean over
@@ -46,7 +46,7 @@ class InputResponse:
     square: FloatArray
     """s, mean of c squared, (axes, n_outputs)."""
     whole: Callable[[], FloatArray]
-    """What gives c: the paper's estimators need no more of it than its means."""
+    """A function that gives c: the paper's estimators need only its means."""
 
     @cached_property
     def path(self) -> FloatArray:
@@ -64,7 +64,7 @@ class InputResponse:
 class ExposureModel(ABC):
     """The joint Gaussian of one exposure of a plant, precomputed; it holds no state.
 
-    `exposure_model` makes one: dense, or factored where the plant is many alike systems.
+    `exposure_model` makes one: dense, or factored where the plant consists of many equal systems.
     """
 
     def __init__(self, plant: Plant, n_steps: int, mean_row: FloatArray) -> None:
@@ -96,7 +96,8 @@ class ExposureModel(ABC):
     @property
     @abstractmethod
     def factors(self) -> tuple[FloatArray | None, FloatArray]:
-        """The basis as recordings keep it: a matrix that mixes outputs, where there is one, and what it mixes."""
+        """The basis in the form of recordings: a matrix from factors to outputs, where there is one, and the
+        factors."""
 
     @property
     @abstractmethod
@@ -106,7 +107,7 @@ class ExposureModel(ABC):
     @property
     @abstractmethod
     def end_remainder(self) -> FloatArray:
-        """Covariance of what the noise coefficients leave out of the end state, (n_states, n_states)."""
+        """Covariance of the part of the end state that the noise coefficients leave out, (n_states, n_states)."""
 
     @abstractmethod
     def mixed_rows(self, weights: FloatArray, count: int) -> FloatArray:
@@ -117,7 +118,8 @@ class ExposureModel(ABC):
 
     @abstractmethod
     def responses(self, inputs: FloatArray) -> InputResponse:
-        """`response` for many exposures, inputs (exposures, n_steps, axes * n_inputs), in a fraction of the calls.
+        """The responses of `response` for many exposures, inputs (exposures, n_steps, axes * n_inputs), in a fraction
+        of the calls.
 
         Inputs are numbers, as `numbers` gives them.
         The first axis has all axes of the first exposure, then of the second, with the same bits as for each alone.
@@ -136,7 +138,7 @@ class ExposureModel(ABC):
         """Standard deviation of the path, (axes, n_outputs, n_steps), from (axes, n_coefficients, n_coefficients)."""
 
     def starting(self, offset: float) -> Self:
-        """The same for exposures that start ``offset`` of a fast step into their first one, 0 <= offset < 1."""
+        """The model for exposures that start ``offset`` of a fast step into their first one, 0 <= offset < 1."""
         if not 0 <= offset < 1:
             raise ValueError(f"an exposure starts from 0 to 1 fast step into its first one, not {offset:g}")
         _ = self.factors, self.end_rows  # made once, for all offsets

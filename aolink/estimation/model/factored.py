@@ -1,4 +1,4 @@
-"""The exposure model of a plant of many alike systems, such as a membrane's actuators, without its dense arrays.
+"""The exposure model of a plant of many equal systems, such as a membrane's actuators, without its dense arrays.
 
 Column j of the basis is a pattern over the outputs times a course in time: path[o, k] = sum_j P[o, j] z[j] f[k, j].
 Start states have the pattern of their actuator and one of few courses, C_1 A_1^k. The path of all actuators' noise is
@@ -30,7 +30,7 @@ from aolink.rig import Plant
 
 NOISE_LEFT_OUT = 0.05
 """Largest share of the noise path (rms) that a factored basis leaves out."""
-# Cosines in which the noise of one actuator is looked for.
+# Number of cosines in which the noise of one actuator is expanded.
 _COSINES = 64
 
 
@@ -41,7 +41,7 @@ class NoiseFactors:
     patterns: FloatArray
     """(n_outputs, k)"""
     course_of: Indices
-    """Which of the courses each coefficient has, (k,)."""
+    """Number of each coefficient's course, (k,)."""
     courses: FloatArray
     """Paths of one system, (n_steps, m)."""
     after: FloatArray
@@ -95,7 +95,7 @@ def noise_factors(systems: AlikeSystems, n_steps: int) -> NoiseFactors:
 
 
 class FactoredModel(ExposureModel):
-    """`ExposureModel` of alike systems side by side."""
+    """The `ExposureModel` of equal systems side by side."""
 
     def __init__(self, plant: Plant, n_steps: int, systems: AlikeSystems) -> None:
         self.systems = systems
@@ -112,12 +112,12 @@ class FactoredModel(ExposureModel):
 
     @property
     def state_rows(self) -> FloatArray:
-        """Dense, for whoever asks."""
+        """The dense array, computed where it is asked for."""
         return self.basis[..., : self.plant.n_states]
 
     @property
     def basis(self) -> FloatArray:
-        """Dense, for whoever asks."""
+        """The dense array, computed where it is asked for."""
         return np.asarray(self.patterns[:, None] * self.courses)
 
     @property

@@ -5,8 +5,8 @@ courses in it. So the Jacobian of its pixels is small, (pixels, 2 m), and the in
 on all coefficients is a sum over spots of small blocks between the rows of two patterns: nothing is as large as pixels
 times coefficients.
 
-The noise coefficients are ordered, the largest first. Those are kept that move the spots visibly, given the width of
-the kernel, as in `aolink.estimation.pixels.likelihood`; the rest widens the kernel.
+The noise coefficients are ordered, the largest first. Those that move the spots visibly, given the width of the kernel,
+are kept, as in `aolink.estimation.pixels.likelihood`; the remaining ones widen the kernel.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class JointPaths:
         enough = np.flatnonzero(rest <= LEFT_OUT**2 * variance * model.plant.n_outputs)
         kept = int(enough[0]) if len(enough) else len(energy)
         self.widening = float(rest[kept]) / model.plant.n_outputs + model.unmodelled_rest
-        """Mean variance of the path that is left out, which the kernel is to be widened by."""
+        """Mean variance of the part of the path that is left out, by which the kernel is widened."""
         self.size = n + kept
         """Number of coefficients."""
         course_of = model.course_of[: self.size]
@@ -77,7 +77,7 @@ class JointPaths:
         """The response to the inputs, (n_outputs, nodes)."""
 
     def _resolution(self, variance: float, sensor: SpotSensor) -> Resolution:
-        """How many nodes there are; the same whenever in a step an exposure starts."""
+        """Number of nodes, which does not depend on where in a step an exposure starts."""
         if not self.model.moved:
             return resolution(self._unseen(), variance, sensor.profile)
         model = exposure_model(self.model.plant, self.model.n_steps)
@@ -127,7 +127,7 @@ class JointPaths:
         return np.asarray(np.add.reduceat(self._patterns * t[self.order], self._starts[:-1], axis=1))
 
     def positions(self, t: FloatArray) -> FloatArray:
-        """Where the spots are at the nodes, (spots, 2, nodes)."""
+        """Positions of the spots at the nodes, (spots, 2, nodes)."""
         path = matmul_one_thread(self.shares(t), np.ascontiguousarray(self.functions.T)) + self.inputs
         return path.reshape(self.spots, 2, -1)
 
@@ -194,7 +194,7 @@ class JointPaths:
 
 @lru_cache(maxsize=1)
 def compiled_loops() -> ModuleType:
-    """The compiled loops, loaded at the first plant of many alike systems: Numba alone takes half a second."""
+    """The compiled loops, loaded at the first plant of many equal systems: Numba alone takes half a second."""
     from aolink.estimation.compiled import joint
 
     return joint

@@ -1,11 +1,10 @@
-"""Few points in time, with weights, in the place of an exposure's fast steps.
-
-Blur is a mean over the steps, and paths are smooth: so it is a mean over few nodes as well. For a spot that moves
-little, the nodes are those of Gauss's quadrature for a sum over equal steps, exact for polynomials in time of degree
-2 n - 1 (zeros of Gram's polynomials: Golub & Welsch, Calculation of Gauss quadrature rules, Math. Comp. 23 (1969));
-between two steps the path is a straight line. For a spot that goes back and forth, the nodes are means over equal
-blocks of steps. There are enough nodes for the light of the plant's typical paths to be right to a share of the
-camera's noise; and more for an axis whose predicted path moves further between two nodes than a spot is wide.
+"""Quadrature in time: a few nodes with weights instead of an exposure's fast steps. Blur is a mean over the steps, and
+paths are smooth, so a weighted mean over a few nodes is enough. For a spot that moves little, the nodes are those of
+Gauss's quadrature for a sum over equal steps, exact for polynomials in time of degree 2 n - 1 (zeros of Gram's
+polynomials: Golub & Welsch, Calculation of Gauss quadrature rules, Math. Comp. 23 (1969)); between two steps the path
+is a straight line. For a spot that goes back and forth, the nodes are means over equal blocks of steps. There are
+enough nodes for the light of the plant's typical paths to be right to a share of the camera's noise; and more for an
+axis whose predicted path moves further between two nodes than a spot is wide.
 """
 
 from __future__ import annotations
@@ -29,7 +28,7 @@ _LEAST = 3
 # For a spot that swings by ten widths of the kernel, more nodes than these bring the path no nearer to that of all
 # steps.
 _MOST = 100
-# Paths whose light is seen in the mean by less than this say nothing of how many there should be.
+# Paths whose light differs from the mean by less than this are not used to choose the number of nodes.
 _LEAST_LIGHT = 0.01
 # Longest way of the predicted path from node to node, in standard deviations of kernel and pixel: a mean over Gaussians
 # at such distances has hardly any ripple, exp(-2 pi^2 / 1.2^2).
@@ -110,12 +109,12 @@ def quadrature_paths(model: ExposureModel, response: InputResponse, q: Quadratur
 
 @dataclass(frozen=True, eq=False)
 class Resolution:
-    """Quadrature rules for an exposure, and which of them a path needs: the more it moves, the more nodes."""
+    """Quadrature rules for an exposure, and the choice among them: the more a path moves, the more nodes it needs."""
 
     levels: tuple[QuadratureRule, ...]
     """From the rule for typical paths of the plant at rest up to all steps."""
     stride: float
-    """Longest way of a path from node to node, slope units."""
+    """Longest distance that a path may move from node to node, slope units."""
 
     def of(self, path: FloatArray) -> Indices:
         """The level of each axis for its predicted path, (axes, n_outputs, n_steps) -> (axes,)."""

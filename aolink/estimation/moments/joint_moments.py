@@ -1,10 +1,10 @@
 """Windowed moments of all spots of one large plant, in information form.
 
 Each spot by itself is treated as by `WindowedSpots`, with the courses' shares of its two paths as coefficients. The
-information on these is summed over spots (`JointPaths.information`). The remainders of the spots' regressions are taken
-as independent: spots that move alike have errors alike, which the dense form includes and this one does not, since it
-would take seconds a frame. Where the dense form is affordable, 36 actuators before 16 lenslets, there is no difference:
-path RMSE 0.119 here and 0.121 there, NEES 73 and 74 for 72 states.
+information on these is summed over spots (`JointPaths.information`). The remainders of the spots' regressions are
+treated as independent: spots that move alike have correlated errors, which the dense form includes and this one does
+not, since it would take seconds a frame. Where the dense form is affordable, 36 actuators before 16 lenslets, there is
+no difference: path RMSE 0.119 here and 0.121 there, NEES 73 and 74 for 72 states.
 """
 
 from __future__ import annotations
@@ -94,7 +94,8 @@ class JointMoments(JointObservation):
         nodes = paths.of_one_spot()
         precision = paths.prior_information(prior.covariance)
         wide = paths.prior_covariance(prior.covariance)
-        # Frames say hardly anything about some of hundreds of states, whose errors last as long as the plant remembers.
+        # Frames have hardly any information about some of hundreds of states, whose errors last for the plant's own
+        # memory.
         memory = error_memory(slowest(paths.model.transition_of_one[None]))[0]
         t, P, lit = prior.mean, wide, windows.mask.any(axis=(1, 2, 3))
         spread = first = paths.spread(wide)

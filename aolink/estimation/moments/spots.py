@@ -6,8 +6,8 @@ it, and E[a(X) b(Y)] is, by Mehler's series, the sum over j of c^j / j! E[a^(j)(
 a kernel that couples the two directions is one that adds to c. Each factor is in closed form, as
 for a line sensor; so are the regression on the coefficients and what it leaves out.
 
-All sums of all spots of one copy are one observation. The cross moment y_11 belongs to it: it tells motion along
-one diagonal from motion along the other, which the moments of the two directions by themselves do not.
+All sums of all spots of one copy are one observation. The cross moment y_11 belongs to it: it distinguishes motion
+along one diagonal from motion along the other, which the moments of the two directions by themselves do not.
 """
 
 from __future__ import annotations

@@ -11,11 +11,11 @@ window drawn tighter each time.
 
 Omega depends on the state, which hardly changes from frame to frame on a plant that remembers: its errors
 do not average out as independent ones would. It is therefore weighted with (1 + rho)/(1 - rho), as the
-variance of a mean of errors that are correlated by rho. Without that, a filter that follows a resonance
-believes in one of several phases that the blur cannot tell apart. What correlates them is the plant, the
-largest eigenvalue of A^N, where the frames say little; where they say much an error goes on by A^N (I - K H) only,
-as far as that is linear. rho is the geometric mean of both: the first alone wastes what frames say, the
-second is too sure where the blur has several readings.
+variance of a mean of errors that are correlated by rho. Without that, a filter that follows a resonance trusts one of
+several phases that the blur cannot distinguish. Where the frames carry little information, the plant correlates the
+errors, by the largest eigenvalue of A^N; where they carry much, an error is passed on by A^N (I - K H) only, as far as
+that is linear. rho is the geometric mean of both: the first alone wastes the frames' information, the second gives too
+small a covariance where several paths explain the blur.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ class Regression:
 
 
 class Windowed(ABC, Generic[Data]):
-    """Iterated statistical linearisation: what line sensors and spots on a plane have in common.
+    """Iterated statistical linearisation: the common part for line sensors and spots on a plane.
 
     Parameters
     ----------
@@ -151,7 +151,7 @@ class Windowed(ABC, Generic[Data]):
         """
         sd = np.sqrt(np.maximum(variance, 0.0))
         margin = KERNEL_REACH * math.sqrt(kernel + sensor.pixel_width**2 / 12)
-        # A window needs room on the sensor, wherever the path is believed to be.
+        # A window needs room on the sensor, wherever the path is expected.
         room = max(margin, 2 * sensor.pixel_width)
         low = np.minimum((mean - PATH_REACH * sd).min(axis=1) - margin, sensor.field[1] - room)
         high = np.maximum((mean + PATH_REACH * sd).max(axis=1) + margin, sensor.field[0] + room)
@@ -170,7 +170,7 @@ class Windowed(ABC, Generic[Data]):
         return np.asarray(np.polynomial.legendre.legval(u, np.eye(order + 1)[order]))
 
     def ratios(self, y: FloatArray, noise: FloatArray, fit: Regression) -> tuple[FloatArray, FloatArray, Regression]:
-        """Everything divided by the light that belongs to it, to first order."""
+        """All sums divided by the light that belongs to each, to first order."""
         kept = [k for k in range(y.shape[1]) if k not in self._lights]
         lights = self._light_of[kept]
 
@@ -196,7 +196,7 @@ class WindowedMoments(Windowed[Profile]):
     Parameters
     ----------
     orders:
-        Which functions of the basis; 0 is the light in the window.
+        Orders of the basis functions; 0 is the light in the window.
     basis, flux:
         As in `Windowed`.
     """

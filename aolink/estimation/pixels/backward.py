@@ -1,7 +1,6 @@
-"""Backward simulation over Gaussian mixtures: what later exposures say of the path in an earlier one.
-
-Given the start state x of the next exposure, nothing that came later says more of this one. Under component c of its
-posterior, coefficients z and x are jointly Gaussian, so x moves them by a gain G_c, and weighs the components:
+"""Backward simulation over Gaussian mixtures: later exposures correct the path in an earlier one. Given the start state
+x of the next exposure, this one is independent of all later measurements. Under component c of its posterior,
+coefficients z and x are jointly Gaussian, so x moves them by a gain G_c, and reweights the components:
 
     w_c(x) ~ a_c N(x; x_c, S_c),    z | x, c ~ N(z_c + G_c (x - x_c), P_c - G_c S_c G_c').
 
@@ -11,8 +10,9 @@ nonlinear time series, J. Am. Stat. Assoc. 99 (2004)). Mean and covariance of an
 w_c(x) of all draws, not of draws of z. The draws of its start state are moved and scaled to the same mean and
 covariance: where all posteriors are Gaussian, the result is that of Rauch, Tung and Striebel, without any chance in it.
 
-As in the filter, a thousandth of what is expected of x is the prediction without any measurement, and there x says
-nothing of z: where a filter has lost the state and found it again, the past stays as the filter left it.
+As in the filter, the density of x has a share of one thousandth from the prediction without any measurement, under
+which x carries no information about z: where a filter has lost the state and found it again, the past stays as the
+filter left it.
 """
 
 from __future__ import annotations
@@ -46,14 +46,14 @@ class Next:
     kick: FloatArray
     """Response to the inputs in between, (axes, n_states)."""
     unseen: Gaussian
-    """Its prediction without any measurement."""
+    """Prediction of the next start state without any measurement."""
     draws: FloatArray
-    """Drawn with all later exposures, (axes, draws, n_states)."""
+    """Draws given all later exposures, (axes, draws, n_states)."""
 
 
 @dataclass(frozen=True, eq=False)
 class Smoothed:
-    """One exposure, with all later ones."""
+    """One exposure, smoothed with all later ones."""
 
     joint: Gaussian
     """Coefficients and end state together, (axes, n_coefficients + n_states)."""
@@ -90,7 +90,7 @@ def _of_axis(
         G = P[:, :, size:] @ A.T @ batched.transpose(inverse) @ inverse
         away = x - expected.mean[0][:, None]
         given = P - G @ expected.covariance[0] @ batched.transpose(G)
-        # Each component a second time, where x says nothing of it.
+        # Each component a second time, with x independent of it.
         unseen = single(after.unseen.part(slice(axis, axis + 1))).log_density(x[None])
         logs = expected.component_log_densities(x[None])[0] + math.log1p(-_DOUBT)
         logs = np.concatenate([logs, log_weight[:, None] + unseen + math.log(_DOUBT)])

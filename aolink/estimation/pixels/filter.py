@@ -66,7 +66,7 @@ class MixtureUpdate:
     log_evidence: FloatArray
     """Log-likelihood of the pixels by Laplace's method, (axes,)."""
     several: BoolArray
-    """Whether the posterior has several modes (the blur has more than one reading), (axes,)."""
+    """Whether the posterior has several modes (more than one path explains the blur), (axes,)."""
     poor: BoolArray
     """Whether importance sampling was not enough for it, (axes,)."""
 
@@ -75,7 +75,7 @@ class MixtureUpdater(Protocol):
     """A way to update a mixture with the pixels of an exposure."""
 
     def when_poor(self, reduced: Reduction) -> str:
-        """What it does on axes of which an update says `MixtureUpdate.poor`, for the estimate's reason."""
+        """Its action on axes with `MixtureUpdate.poor`, in words, for the estimate's reason."""
 
     def reduction(self, model: ExposureModel, sensor: BaseSensor) -> Reduction:
         """The coefficients that it works with."""
@@ -138,7 +138,8 @@ class MixtureFilter(Filter):
             self.prior, self._unseen = _moved(self.prior, *over), self._unwatched(*over)
 
     def _unwatched(self, transition: FloatArray, noise: FloatArray, kick: FloatArray) -> Gaussian:
-        """The prediction of `_unseen`; on an unstable plant it stops where it is so wide that it says nothing."""
+        """The prediction of `_unseen`; on an unstable plant it stops once it is so wide that it carries no
+        information."""
         now, later = self._unseen, predict(self._unseen, transition, noise, kick)
         widest = _WIDEST * (np.trace(self.plant.initial_covariance) + np.trace(noise))
         grows = np.isfinite(later.mean).all(axis=1) & (np.einsum("aii->a", later.covariance) <= widest)

@@ -40,7 +40,7 @@ class GaussianMixture:
         return GaussianMixture(*(np.array(each, order="C") for each in (self.log_weight, self.mean, self.covariance)))
 
     def weighted(self, share: float) -> GaussianMixture:
-        """The same as that share of a mixture."""
+        """The mixture with its weights multiplied by a share."""
         return replace(self, log_weight=self.log_weight + math.log(share))
 
     @property
@@ -86,18 +86,17 @@ class GaussianMixture:
         )
 
     def reduced(self, most: int, free: float = 0.0) -> GaussianMixture:
-        """The same with ``most`` components, or fewer if mergers cost less than ``free``.
-
-        Again and again, the two components are merged that cost least. The cost is Runnalls' bound on the
-        Kullback-Leibler divergence, in nats; a merger keeps mean and covariance. Runnalls, Kullback-Leibler approach
-        to Gaussian mixture reduction, IEEE Trans. AES 43 (2007), (21).
+        """The mixture reduced to ``most`` components, or fewer if mergers cost less than ``free``. Repeatedly, the two
+        components whose merger costs least are merged. The cost is Runnalls' bound on the Kullback-Leibler divergence,
+        in nats; a merger keeps mean and covariance. Runnalls, Kullback-Leibler approach to Gaussian mixture reduction,
+        IEEE Trans. AES 43 (2007), (21).
         """
         merged = self.copy()
         compiled_mixtures.merge(*merged.contiguous, most, free)
         return merged.ordered(most)
 
     def with_components(self, count: int) -> GaussianMixture:
-        """The same with ``count`` components, those after its own of weight zero."""
+        """The mixture with ``count`` components, those after its own with weight zero."""
         more = count - self.mean.shape[1]
         if more <= 0:
             return self
@@ -109,7 +108,7 @@ class GaussianMixture:
         return GaussianMixture(log_weight, mean, covariance)
 
     def replaced(self, axes: Indices, by: GaussianMixture) -> GaussianMixture:
-        """The same with these axes' mixtures replaced."""
+        """The mixtures with those of these axes replaced."""
         count = max(self.mean.shape[1], by.mean.shape[1])
         old, new = self.with_components(count), by.with_components(count)
         out = old.copy()
@@ -117,7 +116,7 @@ class GaussianMixture:
         return out
 
     def ordered(self, most: int | None = None) -> GaussianMixture:
-        """The same with the heaviest components first, and without columns in which all weights are zero."""
+        """The mixture with the heaviest components first, and without columns in which all weights are zero."""
         order = np.argsort(-self.log_weight, axis=1, kind="stable")[:, :most]
         rows = np.arange(len(order))[:, None]
         kept = self.log_weight[rows, order]

@@ -6,10 +6,10 @@ points of all rounds are weighted against all their densities together (Veach's 
 et al., Adaptive multiple importance sampling, Scand. J. Stat. 39 (2012)). The points are quasi-random (Sobol) and the
 same for every axis and frame.
 
-No such mixture comes near some posteriors. Where a spot hardly moves and there is little noise, the blur fixes the sum
-of many squares, and the posterior is a shell. Where several vibrations are free in phase, one search finds few of the
-modes, and the effective sample size of points about those says nothing of the others: what is left uncertain by the
-windowed moments decides (`scattered`). In both cases tempered sequential Monte Carlo draws the points
+Some posteriors cannot be approximated by such a mixture. Where a spot hardly moves and there is little noise, the blur
+fixes the sum of many squares, and the posterior is a shell. Where several vibrations are free in phase, one search
+finds few of the modes, and the effective sample size of points about those does not show the others: the uncertainty
+that the windowed moments leave decides (`scattered`). In both cases tempered sequential Monte Carlo draws the points
 (`aolink.estimation.pixels.tempering`).
 """
 
@@ -96,7 +96,8 @@ def posterior(
 
 
 def tempered(view: PixelView, prior: GaussianMixture, count: int, number: int) -> tuple[GaussianMixture, FloatArray]:
-    """The same by so many tempered points, in the exposure of this number; and the most likely point, (axes, 1, n)."""
+    """The mixture by a number of tempered points, in the exposure of this number; and the most likely point, (axes, 1,
+    n)."""
     points = tempered_points(view, prior, count, [(number, axis) for axis in view.axes.tolist()])
     best = np.argmax(with_noise(prior, points) + view.log_likelihoods(points), axis=1)
     rows = view.reduced.end_rows
@@ -105,9 +106,8 @@ def tempered(view: PixelView, prior: GaussianMixture, count: int, number: int) -
 
 
 def scattered(view: PixelView, wide: GaussianMixture) -> BoolArray:
-    """Where a search about the windowed moments' Gaussians finds too few of the modes, (axes,).
-
-    Light ones do not count.
+    """Whether a search about the windowed moments' Gaussians finds too few of the modes, (axes,). Components of small
+    weight do not count.
     """
     variance = np.einsum("ij,acij->ac", view.gram, wide.covariance) / view.outputs
     heavy = wide.log_weight > math.log(_HEAVY)

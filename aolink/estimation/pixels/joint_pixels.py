@@ -12,7 +12,7 @@ many modes, and one of them says little: there, as in the first exposures of a r
 (`JointMoments`) are taken instead, whose covariance includes what the blur leaves ambiguous.
 
 36 actuators before 16 lenslets are few enough for the dense `profile` with all its starts: path RMSE 0.090 there, 0.088
-here; 3 s a frame there, 20 ms here. The covariance at a mode is a little small: NEES of the start state 330 for 288
+here; 3 s a frame there, 20 ms here. The covariance at a mode is slightly too small: NEES of the start state 330 for 288
 states, of the end state 285, and no better with more coefficients or nodes.
 """
 
@@ -138,7 +138,7 @@ def find_mode(
         H = precision + paths.information(near.information)
         return Points(np.array([objective]), (paths.score(near.score) - pull)[None], H[None], kept)
 
-    # What a step would gain says when it is at a mode, before the pixels are linearised again.
+    # The expected gain of a step shows when the search is at a mode, before the pixels are linearised again.
     (t,), found = minimise(at, start[None], passes - 1, CONVERGED, foreseen=CONVERGED, solve=_solve)
     assert found.linearised is not None
     return Mode(t, found.hessian[0], float(found.objective[0]), found.linearised[0])

@@ -1,8 +1,8 @@
-"""Levenberg and Marquardt's method, for all searches for a mode but the compiled one (`compiled.modes`, its twin).
+"""Levenberg and Marquardt's method, for all searches for a mode except the compiled one (`compiled.modes`, its twin).
 
 A step solves (H + damping diag H) step = g, where g is minus the objective's gradient and H is its Hessian, or Fisher's
-information in the place of that. A step that makes the objective smaller is taken and the damping falls; else the
-damping grows. Marquardt, J. SIAM 11 (1963) 431.
+information instead. A step that makes the objective smaller is taken and the damping falls; else the damping grows.
+Marquardt, J. SIAM 11 (1963) 431.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ FIRST_DAMPING = 0.01
 LARGEST_DAMPING = 1e6
 """With more than this no step makes the objective smaller: the search is over."""
 FREE_DAMPING = 0.1
-"""Up to this damping a short step means that a mode is near; with more it is the damping that makes it short."""
+"""Up to this damping a short step means that a mode is near; with more damping, the damping makes it short."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,14 +35,14 @@ class Points:
     hessian: FloatArray
     """Positive definite, (points, n, n)."""
     linearised: NDArray[Any] | None = None
-    """What the caller wants to keep of each point, (points,)."""
+    """Data that the caller keeps for each point, (points,)."""
 
 
 def minimise(
     at: Callable[[FloatArray, Indices], Points], starts: FloatArray, passes: int, converged: float, *,
     foreseen: float = 0.0, solve: Callable[[FloatArray, FloatArray], FloatArray] = batched.solve,
 ) -> tuple[FloatArray, Points]:  # fmt: skip
-    """Where each of many starts leads; each one's way does not depend on the others.
+    """The minimum that each of many starts leads to; the search from one start does not depend on the others.
 
     Parameters
     ----------

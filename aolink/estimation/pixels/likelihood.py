@@ -3,9 +3,9 @@
 A pixel is E[Y | path] = (1/N) sum_k (kernel integrated over it, the spot resting at theta_k) / D, and theta is linear
 in the coefficients z = (x(k0), xi) of the exposure. Only as many directions of xi are kept as move the spot visibly:
 the first singular vectors of the noise path, until the rest is a tenth of the kernel's standard deviation, rms, and, as
-far as twelve coefficients do it, no more than the pixels can hardly see. What is left out keeps its prior and widens
-the kernel by its variance. Pixels that see more than that of it would take it for a motion that it is not. Start states
-are kept whole.
+far as twelve coefficients do it, no more than the pixels can hardly see. The directions that are left out keep their
+prior and widen the kernel by their variance. If the pixels could resolve them, the estimate would show a false motion
+instead. Start states are kept whole.
 
 The mean over the fast steps is taken by quadrature with few nodes (`aolink.estimation.model.quadrature`).
 """
@@ -63,7 +63,7 @@ class Reduction:
     end_remainder: FloatArray
     """Covariance of the end state that t leaves out, (n_states, n_states)."""
     widening: float
-    """Mean variance of the path that t leaves out, which the kernel is to be widened by."""
+    """Mean variance of the part of the path that t leaves out, by which the kernel is widened."""
     resolution: quadrature.Resolution
 
     @property
@@ -145,7 +145,7 @@ def _paths(model: ExposureModel, expand: FloatArray) -> FloatArray:
 class PixelView:
     """The pixels of one frame as a function of the reduced coefficients t of each axis: prediction and likelihood.
 
-    What compiled code does for a line sensor is here for spots on a plane only.
+    The functions that compiled code has for a line sensor are here for spots on a plane only.
 
     Points of each axis lie along the second dimension of every argument, (axes, k, ...). ``level`` is that
     of the reduction's resolution.
@@ -167,7 +167,7 @@ class PixelView:
         """Densities of all pixels of an axis, (axes, pixels)."""
         self.mask = measured.mask.reshape(axes, -1)
         self.axes = np.arange(axes)
-        """Which axes of the plant these are, (axes,)."""
+        """Numbers of these axes of the plant, (axes,)."""
         self.read_noise = effective_noise_density(self.optics) / self.optics.pixel_size
         self.gain = shot_gain(self.optics)
         self.kernel = sensor.kernel.covariance + reduced.widening * np.eye(2)
@@ -294,7 +294,7 @@ class PixelView:
     def information(self, f: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Score and Fisher information of each pixel by its expected density f, all (axes, k, pixels).
 
-        The variance grows with f (shot noise), which is information of its own.
+        The variance grows with f (shot noise), which adds information of its own.
         """
         R = self._variance(f)
         e = self.y[:, None] - f

@@ -175,7 +175,7 @@ def _at(rows: PixelView, m: FloatArray, L: FloatArray, s: FloatArray) -> Points:
 
 
 def without_repeats(modes: Modes) -> Modes:
-    """The same without modes that an earlier start has led to; modes that remain come first."""
+    """The modes without those that an earlier start has led to; the remaining ones come first."""
     mean, covariance, *rest = kept = [each.copy() for each in modes.arrays]
     most = compiled_modes.drop_repeats(mean, covariance, _APART, *rest)
     return Modes(*(each[:, : max(most, 1)] for each in kept))
@@ -227,15 +227,15 @@ def spread_starts(view: PixelView, prior: Gaussian, wide: Gaussian) -> tuple[Flo
 
 
 def precision_of_reversal(view: PixelView) -> float:
-    """How firmly a path that is looked for is held to the reversal of another, one over slope units squared."""
+    """Precision with which a path is fitted to the reversal of another, one over slope units squared."""
     return 1 / (_REVERSED_TO**2 * view.kernel_variance)
 
 
 def reversed_starts(view: PixelView, prior: Gaussian, points: FloatArray) -> FloatArray:
     """Whitened coordinates of paths with the same blur as those of points, (axes, k, n) -> (axes, 3 k, n).
 
-    Run backwards, which gives the same blur; mirrored about their mean, which gives the same where the blur is
-    symmetric, as that of a vibration is; and both.
+    The paths are reversed in time, which gives the same blur; mirrored about their mean, which gives the same blur
+    where it is symmetric, as that of a vibration is; and both.
     """
     L, m = cholesky(prior.covariance), prior.mean
     nodes, outputs = view.whole_nodes, view.outputs
@@ -306,7 +306,7 @@ def _innovations(
     values, V = np.linalg.eigh(batched.matmul(batched.transpose(A), A))
     values, V = np.maximum(values[:, ::-1][:, :k], 0.0), V[:, :, ::-1][:, :, :k]
     S = np.sqrt(values)
-    # Nothing is new in a direction in which the pixels do not tell anything.
+    # The innovation is zero in a direction about which the pixels have no information.
     tells = values > _TELLS_NOTHING * values[:, :1]
     pull = batched.matvec(batched.transpose(batched.matmul(A, V)), e)
     u = np.where(tells, pull / np.where(tells, S, 1.0), 0.0) + S * batched.matvec(batched.transpose(V), s)

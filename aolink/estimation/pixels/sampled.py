@@ -1,4 +1,5 @@
-"""The estimator `sampled`: tempered sequential Monte Carlo. Slow, for offline use; the limit of all other estimators.
+"""The estimator `sampled`: tempered sequential Monte Carlo. It is slow, for offline use; the limit of all other
+estimators.
 
 Less of the path is left out than for the others; the nodes in time are those of `profile`.
 """
@@ -28,13 +29,14 @@ _COMPONENTS = 8
 
 @dataclass(frozen=True, eq=False)
 class TemperedUpdater:
-    """Particles of one axis after another; a mixture of Gaussians is fitted to their end states."""
+    """An updater that draws the particles of one axis after another; a mixture of Gaussians is fitted to their end
+    states."""
 
     particles: int = 2000
     seed: int = 0
 
     def when_poor(self, reduced: Reduction) -> str:
-        """Nothing is said: it is never poor."""
+        """An empty text: its updates are never poor."""
         return ""
 
     def reduction(self, model: ExposureModel, sensor: BaseSensor) -> Reduction:

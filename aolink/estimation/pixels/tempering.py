@@ -26,7 +26,7 @@ _EFFECTIVE = 0.5
 _EM_PASSES = 25
 # Least covariance of a component of the fit, as a share of that of all particles.
 _LEAST_SPREAD = 1e-3
-# Every fourth move takes a difference in full, which leads from one mode to another.
+# Every fourth move takes the full difference of two particles, which leads from one mode to another.
 _WHOLE = 4
 
 
@@ -69,7 +69,8 @@ def _of_axis(view: PixelView, prior: GaussianMixture, count: int, key: tuple[int
             gain = its_prior - log_prior + power * (its_likelihood - log_likelihood)
             taken = np.log(rng.random(count)) < gain
             t[taken], log_prior[taken], log_likelihood[taken] = there[taken], its_prior[taken], its_likelihood[taken]
-            # Towards an acceptance rate of one quarter. The sizes are kept: what the next power needs is hardly less.
+            # Towards an acceptance rate of one quarter. The step sizes are kept: the next power needs hardly smaller
+            # ones.
             change = math.exp(2 * (taken.mean() - 0.25))
             if move % 2:
                 walk *= change
@@ -137,7 +138,7 @@ def _drawn(prior: GaussianMixture, rng: np.random.Generator, count: int, n: int)
 
 
 def _next_power(log_likelihood: FloatArray, power: float) -> float:
-    """The largest power up to 1 that leaves the effective sample size that is wanted."""
+    """The largest power up to 1 that leaves the required effective sample size."""
     away = log_likelihood - log_likelihood.max()
 
     def excess(more: float) -> float:

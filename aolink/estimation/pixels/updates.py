@@ -1,16 +1,18 @@
-"""The estimators `profile` and `mixture`: the posterior of the pixels as a Gaussian mixture that is carried on.
+"""The estimators `profile` and `mixture`: the posterior of the pixels is a Gaussian mixture, which is carried from
+exposure to exposure.
 
-Modes are not Gaussian: the blur fixes how much a path moves and leaves open which way, and such a posterior is
-bent. So the modes, and the wide Gaussians of windowed moments about them, only make the proposal density; the
+Modes are not Gaussian: the blur determines how much a path moves but not in which direction, and such a posterior is
+curved. So the modes, and the wide Gaussians of windowed moments about them, only make the proposal density; the
 posterior comes from importance weights (`aolink.estimation.pixels.importance`).
 
 Where that is not enough (`aolink.estimation.pixels.importance`), points are tempered, as many for an axis as ``points``
 says. If that is none, the fit stays as wide as its few effective points make it. Some hundred points miss modes as
-well, the more coefficients there are the more: so a share of the posterior stays what the windowed moments say, which
-are uncertain enough. With as many points as pairs of coefficients, or fewer, that is all of it, and none is tempered.
+well, and more of them the more coefficients there are. So a share of the posterior remains the Gaussians of the
+windowed moments, whose covariance is wide enough. With as many points as pairs of coefficients, or fewer, this share is
+one, and no point is tempered.
 
 A mode that was lost is found again: a thousandth of the prior is the prediction without any measurement. Its modes are
-searched where the NIS is larger than chance makes it.
+searched for where the NIS is larger than chance explains.
 """
 
 from __future__ import annotations
@@ -40,7 +42,8 @@ from aolink.estimation.pixels.modes import (
 from aolink.numerics.arrays import BoolArray
 from aolink.optics.sensor import BaseSensor
 
-# Share of the prior that is the prediction without any measurement; and how rarely chance makes it searched.
+# Share of the prior that is the prediction without any measurement; and the probability by chance of searching its
+# modes.
 _DOUBT = 1e-3
 _DOUBTED = 1e-3
 # A posterior has several modes if a second one has this share of it. From a tenth of that many points are drawn, since
@@ -60,7 +63,7 @@ class ImportanceUpdater:
     share: float
     """Share of the usual number of points, and of the usual effective sample size, where the posterior has one mode.
 
-    Where it has several all are taken: what chance makes of their weights would add up from exposure to exposure.
+    Where it has several all are taken: random errors of their weights would add up from exposure to exposure.
     """
 
     points: int
@@ -71,7 +74,7 @@ class ImportanceUpdater:
         return self if points is None else replace(self, points=points)
 
     def when_poor(self, reduced: Reduction) -> str:
-        """What it does where importance sampling is not enough, for the estimate's reason."""
+        """Its action where importance sampling is not enough, in words, for the estimate's reason."""
         missed = self._missed(reduced)
         if not self.points:
             what = "the estimate is wide"
@@ -82,7 +85,8 @@ class ImportanceUpdater:
         return f"too few importance weights count: {what}"
 
     def _missed(self, reduced: Reduction) -> float:
-        """The share of a posterior that tempered points may have missed: pairs of coefficients to a point."""
+        """The share of a posterior that tempered points may have missed: the number of pairs of coefficients for each
+        point."""
         return reduced.size**2 / self.points if self.points else 1.0
 
     def reduction(self, model: ExposureModel, sensor: BaseSensor) -> Reduction:
@@ -168,9 +172,8 @@ def _wide_part(proposal: GaussianMixture, prior: GaussianMixture) -> GaussianMix
 
 
 def _by_share_of(points: GaussianMixture, wide: GaussianMixture) -> GaussianMixture:
-    """The wide Gaussians, each with the share of the points' mixture that lies nearest to it.
-
-    For axes whose prior is doubted: some of the wide Gaussians are about that prior, which the frame may rule out.
+    """The wide Gaussians, each weighted by the share of the points' mixture that lies nearest to it. This is for axes
+    whose prior is in doubt: some of the wide Gaussians are about that prior, which the frame may rule out.
     """
     there = np.isfinite(wide.log_weight)
     covariance = np.where(there[..., None, None], wide.covariance, np.eye(wide.mean.shape[2]))

@@ -17,7 +17,7 @@ NAMED = r"(Optotune mirror driver|PI controller|PlayzerX|Thorlabs (unit|aligner)
         (Faults(late_s=1.3), "does not answer .* as it should, .*: is it switched on, is this its port"),
         (Faults(silent_from=0), "does not answer .* nothing came: is it switched on, is this its port"),
         (Faults(silent_from=5), "does not answer .* nothing came: is it switched on, is this its port"),
-        (Faults(garbled=frozenset(range(100))), "answers|sends|says that it is"),
+        (Faults(garbled=frozenset(range(100))), "answers|sends|identifies itself as"),
         (Faults(unplugged_at=3), r"lost /dev/pts/\d+: .*is the device still there\?"),
     ],
     ids=["late", "silent", "silent later", "garbled", "unplugged"],

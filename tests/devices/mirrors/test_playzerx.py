@@ -267,7 +267,7 @@ def test_a_whole_session(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
         ({"ping": b"MR-E-3\n"}, "answers 'MR-E-3', expected 'pl-ok': it is no"),
         ({"data_format": "XYZ"}, "takes samples of 'XYZ', this driver knows XYM and XYRGB only"),
         ({"loses": 320}, "off by -.*: its line loses bytes"),
-        ({"slowest": 700}, "off by -.*or it does not play 500 samples a second as it was told to"),
+        ({"slowest": 700}, "off by -.*or it does not play 500 samples a second as it was asked to"),
         ({"capacity": 0}, "none of 250 samples remain as soon as it is sent them: it does not take them"),
     ],
 )

@@ -44,7 +44,7 @@ def test_a_mirror_whose_power_failed_for_a_moment_ends_the_session(session: Sess
     """It is as it was switched on: PI's axes without servos, the PlayzerX with its analog input."""
 
     def check(name: str) -> None:
-        what = r"its error 5 \(an axis has its servo off|off by .*samples a second as it was told to"
+        what = r"its error 5 \(an axis has its servo off|off by .*samples a second as it was asked to"
         with MIRRORS[name].make(faults=Faults(reset_at=4, after_moves=UNDER_WAY)) as device:
             with pytest.raises(AolinkError, match=what):
                 session(name, device, report := Report())

@@ -23,7 +23,7 @@ class Mirror:
 
     def __init__(self, rig):
         self._electronics, self._step_ns = rig.mirror, rig.timing.fast_step_ns
-        self._queue, self._told = {}, 0
+        self._queue, self._reported = {}, 0
         light.zero_ns, light.held = time.monotonic_ns(), []
 
     def time_ns(self):
@@ -37,8 +37,8 @@ class Mirror:
 
     def applied(self):
         self._play()
-        first, self._told = self._told, len(light.held)
-        return [(first, np.array(light.held[first:]))] if self._told > first else []
+        first, self._reported = self._reported, len(light.held)
+        return [(first, np.array(light.held[first:]))] if self._reported > first else []
 
     def park(self):
         self._play()
