@@ -147,7 +147,7 @@ def test_ratio_covariance_by_finite_differences():
         down[k] -= h
         J[:, k] = (up[1:] / up[0] - down[1:] / down[0]) / (2 * h)
     expected = J @ known_flux_covariance(0.01, integrals, (0, 1, 2)) @ J.T
-    ours = measured_flux_covariance(0.01, integrals, orders, (M[1:] / M[0])[None], M[:1])
+    ours = measured_flux_covariance(0.01 * integrals, orders, (M[1:] / M[0])[None], M[:1])
     np.testing.assert_allclose(ours[0], expected, rtol=1e-6)
 
 
@@ -158,7 +158,7 @@ def test_taking_the_kernel_out_undoes_the_binomial():
     weights = np.array([0.2, 0.6, 0.2])  # a kernel of three points with those moments
     assert (weights @ blur**2, weights @ blur**4) == pytest.approx((0.02, 0.001))
     both = [np.mean([weights @ (t + blur) ** p for t in path]) for p in range(5)]
-    np.testing.assert_allclose(without_kernel(kernel, 4) @ both, [np.mean(path**p) for p in range(5)], atol=1e-12)
+    np.testing.assert_allclose(without_kernel(kernel) @ both, [np.mean(path**p) for p in range(5)], atol=1e-12)
 
 
 def test_a_flux_that_its_noise_drowns_is_not_divided_by():
