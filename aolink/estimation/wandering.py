@@ -226,11 +226,9 @@ def _in_basis(nominal: Estimate, other: Estimate, tolerance: float) -> tuple[Flo
     M = np.zeros((n + size, basis.shape[1]))
     M[:n, :n] = np.eye(n)
     M[n:] = solve @ (basis - np.pad(own[:, :n], ((0, 0), (0, basis.shape[1] - n))))
-    change = (theirs.response(other.inputs).path - model.response(nominal.inputs).path).reshape(
-        len(other.end_state), -1
-    )
     z = batched.matvec(M, other.coefficients)
-    z[:, n:] += change @ solve.T
+    change = theirs.response(other.inputs).path - model.response(nominal.inputs).path
+    z[:, n:] += change.reshape(len(z), -1) @ solve.T
     return z, batched.symmetric(batched.congruence(M, other.coefficient_covariance))
 
 

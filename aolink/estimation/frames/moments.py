@@ -47,15 +47,12 @@ def raw_moments(sensor: Sensor, counts: Counts, highest: int) -> FloatArray:
 
 
 def noise_integrals(sensor: Sensor, highest: int) -> FloatArray:
-    """I(n), integral of omega^n over the field, for n = 0 .. highest, (highest + 1,)."""
+    """I(n), integral of omega^n over the field, for n = 0 .. highest, (highest + 1,).
+
+    With the flux known, Cov(M_p, M_q) = V I(p + q): on [-1, 1], 2/3 V and 2/5 V for orders 1 and 2, and 0 between. (11)
+    """
     low, high = sensor.field
     return np.array([(high ** (n + 1) - low ** (n + 1)) / (n + 1) for n in range(highest + 1)])
-
-
-def known_flux_covariance(noise_density: float, integrals: FloatArray, orders: Sequence[int]) -> FloatArray:
-    """Cov(M_p, M_q) = V I(p + q); on [-1, 1]: 2/3 V and 2/5 V for orders 1 and 2, and nothing between them. (11)"""
-    p = np.asarray(orders)
-    return np.asarray(noise_density * integrals[p[:, None] + p])
 
 
 def measured_flux_covariance(

@@ -146,7 +146,7 @@ def _moment_entries(
 def many_moments(
     model: ExposureModel, response: InputResponse, state: FloatArray, orders: Sequence[int]
 ) -> tuple[FloatArray, FloatArray]:
-    """`predicted_moments` of a plant with many outputs, all of them at once."""
+    """`predicted_moments` of many outputs, all at once: row `spots_under_turbulence` of tools/bench."""
     axes, n = state.shape
     rows = model.mean_row
     moments, slopes = [], []

@@ -75,10 +75,6 @@ class Reduction:
         """The prior of t, from that of the start state; leading axes as they come."""
         return state.with_noise(self.size)
 
-    def end(self, t: Gaussian) -> Gaussian:
-        """The Gaussian of the end state, without the response to the inputs; leading axes as they come."""
-        return t.mapped(self.end_rows, self.end_remainder)
-
     def coefficients(self, t: Gaussian) -> Gaussian:
         """The Gaussian of z, from that of t, one for each axis."""
         return t.mapped(self.expand, self.left_out)
