@@ -167,7 +167,7 @@ class Estimate:
         diagonal alone.
         """
         chosen = range(len(self.path)) if outputs is None else outputs
-        _, root = motion(self, np.eye(len(self.path))[list(chosen)], coefficient_roots(self))
+        _, root = motion(self, np.eye(len(self.path))[list(chosen)], psd_root(self.coefficient_covariance))
         covariance = root @ root.T
         np.fill_diagonal(covariance, self.path_sd[list(chosen)].ravel() ** 2)
         return np.asarray(covariance)
@@ -212,13 +212,8 @@ def in_single_precision(covariance: FloatArray) -> FloatArray:
     return np.where(lower, rounded, rounded.swapaxes(-1, -2)).astype(np.float64)
 
 
-def coefficient_roots(estimate: Estimate) -> list[FloatArray]:
-    """A root R of each axis's coefficient covariance R R', axes times (n_coefficients, n)."""
-    return [psd_root(each) for each in estimate.coefficient_covariance]
-
-
 def motion(
-    estimate: Estimate, mix: FloatArray, roots: Sequence[FloatArray], *, after: bool = False
+    estimate: Estimate, mix: FloatArray, roots: FloatArray, *, after: bool = False
 ) -> tuple[FloatArray, FloatArray]:
     """Weighted sums of an estimate's outputs at each fast step, and a root of their covariance.
 
@@ -227,7 +222,7 @@ def motion(
     mix:
         Weights of the outputs, (k, n_outputs).
     roots:
-        The estimate's `coefficient_roots`.
+        `psd_root` of the estimate's coefficient covariances.
     after:
         Whether the step after the last is added.
 

@@ -14,9 +14,9 @@ an exposure takes up the difference.
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -27,7 +27,6 @@ from aolink.estimation.batch import Batch
 from aolink.estimation.estimate import Estimate, WanderingValue
 from aolink.estimation.estimator import Estimator
 from aolink.estimation.kalman.filter import Posterior
-from aolink.estimation.model.base import ExposureModel
 from aolink.estimation.moments.windowed import NOT_BELIEVED
 from aolink.numerics import batched
 from aolink.numerics.arrays import FloatArray
@@ -119,7 +118,7 @@ class WanderingEstimator(Estimator):
         log_mean = w @ self._logs
         spread = (w * (self._logs - log_mean[:, None]) ** 2).sum(axis=1) + (self._logs[1] - self._logs[0]) ** 2 / 12
         value = np.exp(log_mean)
-        return dataclasses.replace(
+        return replace(
             heaviest, start_state=mean[:, :n], start_covariance=covariance[:, :n, :n], end_state=end,
             end_covariance=end_covariance, coefficients=mean, coefficient_covariance=covariance, model=nominal.model,
             components=None, wandering=WanderingValue(value, value * np.sqrt(spread)),
@@ -131,26 +130,21 @@ def at_value(rig: Rig, parameter: Wanders, relative: float) -> Rig:
 
     Raises EstimatorError: its plant cannot run faster or slower.
     """
-    plant, sensor = rig.plant, rig.sensor
+    plant, sensor, kernel = rig.plant, rig.sensor, rig.sensor.kernel
     if relative == 1.0:
         return rig
     if parameter == "frequency":
-        return dataclasses.replace(rig, plant=at_frequency(plant, relative))
-    if parameter == "gain":
-        return dataclasses.replace(rig, plant=dataclasses.replace(plant, B=relative * plant.B))
-    if parameter == "process_noise":
-        return dataclasses.replace(
-            rig, plant=dataclasses.replace(plant, process_noise=relative**2 * plant.process_noise)
-        )
-    if parameter == "sensor_noise":
-        noisy: Any = dataclasses.replace(sensor, noise_density=relative**2 * sensor.noise_density)
-        return dataclasses.replace(rig, sensor=noisy)
-    kernel = sensor.kernel
-    matrix: Any = kernel.matrix and tuple(tuple(relative * each for each in row) for row in kernel.matrix)
-    wide: Any = dataclasses.replace(
-        sensor, kernel=dataclasses.replace(kernel, sigma=relative * kernel.sigma, matrix=matrix)
-    )
-    return dataclasses.replace(rig, sensor=wide)
+        plant = at_frequency(plant, relative)
+    elif parameter == "gain":
+        plant = replace(plant, B=relative * plant.B)
+    elif parameter == "process_noise":
+        plant = replace(plant, process_noise=relative**2 * plant.process_noise)
+    elif parameter == "sensor_noise":
+        sensor = replace(sensor, noise_density=relative**2 * sensor.noise_density)
+    else:
+        matrix: Any = kernel.matrix and tuple(tuple(relative * each for each in row) for row in kernel.matrix)
+        sensor = replace(sensor, kernel=replace(kernel, sigma=relative * kernel.sigma, matrix=matrix))
+    return replace(rig, plant=plant, sensor=sensor)
 
 
 def at_frequency(plant: Plant, relative: float) -> Plant:
@@ -175,7 +169,7 @@ def at_frequency(plant: Plant, relative: float) -> Plant:
     P = stationary_covariance(plant.A, plant.B_w @ plant.process_noise @ plant.B_w.T)
     A = np.real(linalg.expm(relative * linalg.logm(plant.A)))
     B = (np.eye(n) - A) @ np.linalg.solve(np.eye(n) - plant.A, plant.B)
-    return dataclasses.replace(plant, A=A, B=B, B_w=psd_root(P - A @ P @ A.T), process_noise=np.eye(n))
+    return replace(plant, A=A, B=B, B_w=psd_root(P - A @ P @ A.T), process_noise=np.eye(n))
 
 
 def _grid(plant: Plant, wandering: Wandering) -> FloatArray:
@@ -231,14 +225,10 @@ def _in_basis(nominal: Estimate, other: Estimate, tolerance: float) -> tuple[Flo
     M = np.zeros((n + size, basis.shape[1]))
     M[:n, :n] = np.eye(n)
     M[n:] = solve @ (basis - np.pad(own[:, :n], ((0, 0), (0, basis.shape[1] - n))))
-    change = (_response(theirs, other) - _response(model, nominal)).reshape(len(other.end_state), -1)
     z = batched.matvec(M, other.coefficients)
-    z[:, n:] += change @ solve.T
+    change = theirs.response(other.inputs).path - model.response(nominal.inputs).path
+    z[:, n:] += change.reshape(len(z), -1) @ solve.T
     return z, batched.symmetric(batched.congruence(M, other.coefficient_covariance))
-
-
-def _response(model: ExposureModel, estimate: Estimate) -> FloatArray:
-    return model.response(estimate.inputs).path
 
 
 def _mixed(weight: FloatArray, mean: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:

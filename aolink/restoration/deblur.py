@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 
 from aolink.errors import RestorationError
 from aolink.estimation import Estimate
-from aolink.estimation.estimate import coefficient_roots, motion
+from aolink.estimation.estimate import motion
 from aolink.exposure import Exposure, step_shares
 from aolink.numerics.arrays import BoolArray, FloatArray, Indices
+from aolink.numerics.covariance import psd_root
 from aolink.optics.camera import is_saturated, to_density
 from aolink.optics.scene import SceneSensor, scene_motion
 from aolink.optics.sensor import Kernel
@@ -51,7 +52,7 @@ def estimated_psfs(
     exposure: Exposure, estimate: Estimate, mixes: Iterable[FloatArray], kernel: Kernel, pixel_scale: float
 ) -> Iterator[Psf]:
     """The PSF, with its uncertainty, for each weighted sum of outputs (weights as in `motion`)."""
-    roots, offset = coefficient_roots(estimate), exposure.start_offset
+    roots, offset = psd_root(estimate.coefficient_covariance), exposure.start_offset
     shares = step_shares(exposure.n_steps, offset)
     for mix in mixes:
         path, root = motion(estimate, mix, roots, after=offset > 0)

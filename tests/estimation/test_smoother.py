@@ -10,7 +10,7 @@ from scipy import linalg
 import aolink
 from aolink.errors import EstimatorError
 from aolink.estimation import Measurement, exposure_model, make_estimator, run, score, smooth
-from aolink.estimation.frames.moments import known_flux_covariance, measure_moments, noise_integrals
+from aolink.estimation.frames.moments import measure_moments, noise_integrals
 from aolink.optics.camera import effective_noise_density
 from aolink.plant.lifting import input_response, lift
 from aolink.rig import load_rig
@@ -24,7 +24,7 @@ def batch(rig, exposures):
     """Start states of all exposures by one least-squares solve, and their covariances: o1's model, whole."""
     plant, sensor = rig.plant, rig.sensor
     n, count = plant.n_states, len(exposures)
-    R = known_flux_covariance(effective_noise_density(sensor), noise_integrals(sensor, 2), [1])[0, 0]
+    R = effective_noise_density(sensor) * noise_integrals(sensor, 2)[2]
     rows, values = [], []
 
     def add(blocks, value, root):

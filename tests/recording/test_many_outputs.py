@@ -11,9 +11,10 @@ import pytest
 import zstandard
 
 from aolink.estimation import run
-from aolink.estimation.estimate import coefficient_roots, in_single_precision, motion
+from aolink.estimation.estimate import in_single_precision, motion
 from aolink.estimation.model.factored import FactoredModel
 from aolink.jobs.demo import simulated_rig
+from aolink.numerics.covariance import psd_root
 from aolink.recording import convert
 from aolink.recording.reader import Recording
 from aolink.recording.reestimate import first_difference, reestimate
@@ -86,7 +87,7 @@ def test_a_plant_of_hundreds_of_states_is_recorded_as_patterns_and_courses(tmp_p
         assert message.ByteSize() < {"o3": 0.31e6, "profile": 0.5e6}[name]  # of 1.3 and 4.5 MB as doubles
         assert not len(message.end_covariance) + len(message.coefficient_covariance)
     mix = np.eye(2, 200)
-    mixed, root = motion(estimate, mix, coefficient_roots(estimate))
+    mixed, root = motion(estimate, mix, psd_root(estimate.coefficient_covariance))
     np.testing.assert_allclose(mixed, estimate.path[:2], atol=1e-12)
     missing = estimate.path_sd[:2].ravel() ** 2 - np.sum(root**2, axis=1)
     np.testing.assert_allclose(

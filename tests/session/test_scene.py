@@ -19,9 +19,10 @@ from typer.testing import CliRunner
 import aolink
 from aolink.cli.common import app
 from aolink.errors import DeviceError, EstimatorError, RecordingError, RestorationError
-from aolink.estimation.estimate import coefficient_roots, motion
+from aolink.estimation.estimate import motion
 from aolink.exposure import Exposure, Picture
 from aolink.jobs.demo import simulated_rig
+from aolink.numerics.covariance import psd_root
 from aolink.optics.camera import to_density
 from aolink.optics.scene import SceneSensor, framed
 from aolink.optics.sensor import SpotSensor
@@ -274,13 +275,13 @@ def test_recorded_estimates_are_used_and_old_results_replaced(session: Path, sha
 def test_motion_and_its_covariance_are_those_of_the_path(session: Path) -> None:
     """For one output they are the estimate's own; for a mean of spots, what all of its coefficients say together."""
     estimate = reestimate(Recording(session), ["moments"])["moments"][-1]
-    path, root = motion(estimate, np.eye(1), coefficient_roots(estimate))
+    path, root = motion(estimate, np.eye(1), psd_root(estimate.coefficient_covariance))
     np.testing.assert_array_equal(path, estimate.path)
     np.testing.assert_allclose(np.linalg.norm(root, axis=1), estimate.path_sd[0], rtol=1e-9)
     exposures = aolink.simulate("sh-4x4", 2)
     estimate = aolink.estimate(exposures, "o3")[-1]
     mix = np.tile(np.eye(2), (1, 16)) / 16
-    path, own = motion(estimate, mix, coefficient_roots(estimate))
+    path, own = motion(estimate, mix, psd_root(estimate.coefficient_covariance))
     covariance = own @ own.T
     np.testing.assert_allclose(path, estimate.path.reshape(16, 2, -1).mean(axis=0))
     n_steps, rng = path.shape[1], np.random.default_rng(1)
@@ -304,7 +305,7 @@ def test_an_exposure_that_starts_late_ends_in_the_step_after_its_last(name: str)
     exposure, estimate = exposures[-1], aolink.estimate(exposures, "moments")[-1]
     assert exposure.start_offset == 0.4
     mix, count = np.eye(rig.n_outputs), estimate.coefficients.shape[1]
-    path, root = motion(estimate, mix, coefficient_roots(estimate), after=True)
+    path, root = motion(estimate, mix, psd_root(estimate.coefficient_covariance), after=True)
     rows, n = root.reshape(len(mix), exposure.n_steps + 1, -1), exposure.n_steps
     end = estimate.model.plant.C @ estimate.end_state[0]
     np.testing.assert_allclose(path, np.concatenate([estimate.path, end[:, None]], axis=1))
@@ -333,7 +334,7 @@ def test_spots_are_restored_in_the_windows_that_have_one() -> None:
     done = deblur(replace(rig, sensor=sensor), exposure, estimate)
     assert done.spots is not None
     window = np.s_[: sensor.window[0], 2 * sensor.window[1] : 3 * sensor.window[1]]
-    path, root = motion(estimate, np.eye(32)[:2], coefficient_roots(estimate))
+    path, root = motion(estimate, np.eye(32)[:2], psd_root(estimate.coefficient_covariance))
     psf = motion_psf(path, root @ root.T, sensor.kernel, sensor.pixel_width)
     alone = restore(to_density(sensor, exposure.pixels[window]) * sensor.pixel_size, psf).image
     np.testing.assert_allclose(done.spots[window], np.clip(alone, 0, 1), atol=1e-6)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from aolink.estimation.frames.moments import known_flux_covariance, noise_integrals
+from aolink.estimation.frames.moments import noise_integrals
 from aolink.numerics.arrays import FloatArray
 from aolink.optics.camera import effective_noise_density
 from aolink.optics.sensor import BaseSensor
@@ -40,11 +40,9 @@ def centroid_covariance(rig: Rig) -> FloatArray:
 def _of_whole_spot(sensor: BaseSensor, n_outputs: int) -> FloatArray:
     """Covariance of one spot's first moments by read-out noise, known flux, (1, 1), or (2, 2) for both directions."""
     line = sensor.profile
-    own = known_flux_covariance(effective_noise_density(line), noise_integrals(line, 2), [1])
-    if n_outputs == 1:
-        return own
-    other = effective_noise_density(sensor) * noise_integrals(line, 2)[1] ** 2
-    return np.array([[own[0, 0], other], [other, own[0, 0]]])
+    _, first, second = noise_integrals(line, 2)
+    own, other = effective_noise_density(line) * second, effective_noise_density(sensor) * first**2
+    return np.array([[own]] if n_outputs == 1 else [[own, other], [other, own]])
 
 
 def _kernel_variances(sensor: BaseSensor, n_outputs: int) -> FloatArray:

@@ -8,7 +8,7 @@ E[y_p] = mean(theta^p). Mishra & Wen (7) to (11).
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import lru_cache
 
 import numpy as np
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from aolink.estimation.frames.frame_data import Flux, Measurement
 from aolink.numerics import batched
-from aolink.numerics.arrays import BoolArray, FloatArray
+from aolink.numerics.arrays import BoolArray, FloatArray, Indices
 from aolink.optics.camera import effective_noise_density
 from aolink.optics.kernel import kernel_moments
 from aolink.optics.sensor import Sensor
@@ -43,54 +43,56 @@ def raw_moments(sensor: Sensor, counts: Counts, highest: int) -> FloatArray:
     about_centre: FloatArray = sums * (half ** np.arange(highest + 1) * sensor.pixel_width / sensor.counts_per_density)
     if centre == 0:
         return about_centre
-    return recombine(about_centre, shift_matrix(centre, highest))
+    return recombine(about_centre, _binomial_sums([centre**k for k in range(highest + 1)]))
 
 
 def noise_integrals(sensor: Sensor, highest: int) -> FloatArray:
-    """I(n), integral of omega^n over the field, for n = 0 .. highest, (highest + 1,)."""
+    """I(n), integral of omega^n over the field, for n = 0 .. highest, (highest + 1,).
+
+    With the flux known, Cov(M_p, M_q) = V I(p + q): on [-1, 1], 2/3 V and 2/5 V for orders 1 and 2, and 0 between. (11)
+    """
     low, high = sensor.field
     return np.array([(high ** (n + 1) - low ** (n + 1)) / (n + 1) for n in range(highest + 1)])
 
 
-def known_flux_covariance(noise_density: float, integrals: FloatArray, orders: Sequence[int]) -> FloatArray:
-    """Cov(M_p, M_q) = V I(p + q); on [-1, 1]: 2/3 V and 2/5 V for orders 1 and 2, and nothing between them. (11)"""
-    p = np.asarray(orders)
-    return np.asarray(noise_density * integrals[p[:, None] + p])
-
-
 def measured_flux_covariance(
-    noise_density: float, integrals: FloatArray, orders: Sequence[int], ratios: FloatArray, total: FloatArray
+    sums: FloatArray, orders: Sequence[int] | Indices, ratios: FloatArray, total: FloatArray
 ) -> FloatArray:
     """Cov(y_p, y_q) of y_p = M_p/M_0 to first order.
 
-    V [I(p+q) - y_p I(q) - y_q I(p) + y_p y_q I(0)] / M_0^2
+    [C(p+q) - y_p C(q) - y_q C(p) + y_p y_q C(0)] / M_0^2
 
     Parameters
     ----------
-    integrals:
-        I(n) from n = 0, (n,), or of each axis, (axes, n).
+    sums:
+        C(p+q) = Cov(M_p, M_q), from p + q = 0, (n,), or of each axis, (axes, n).
     ratios:
         y_p, kernel included, (axes, orders).
     total:
         M_0, (axes,).
     """
     p = np.asarray(orders)
-    y, first = ratios, integrals[..., p]
-    spread = integrals[..., p[:, None] + p] - y[:, :, None] * first[..., None, :] - first[..., :, None] * y[:, None, :]
-    spread = spread + y[:, :, None] * y[:, None, :] * integrals[..., 0, None, None]
-    return np.asarray(noise_density * spread / total[:, None, None] ** 2)
+    y, first = ratios, sums[..., p]
+    spread = sums[..., p[:, None] + p] - y[:, :, None] * first[..., None, :] - first[..., :, None] * y[:, None, :]
+    spread = spread + y[:, :, None] * y[:, None, :] * sums[..., 0, None, None]
+    return np.asarray(spread / total[:, None, None] ** 2)
 
 
-def without_kernel(kernel: FloatArray, highest: int) -> FloatArray:
+def without_kernel(kernel: FloatArray) -> FloatArray:
     """The matrix that removes the kernel from moments 0 .. highest, (highest + 1, highest + 1).
 
     The moments found are M_p = sum_k binom(p, k) kernel_k m_(p-k); this is the inverse of that map.
     """
-    mixing = np.zeros((highest + 1, highest + 1))
-    for p in range(highest + 1):
+    return np.asarray(np.linalg.inv(_binomial_sums(kernel)))
+
+
+def _binomial_sums(of: Sequence[float] | FloatArray) -> FloatArray:
+    """The matrix of M_p = sum_k binom(p, k) of_k m_(p-k), as many rows as there are numbers."""
+    mixing = np.zeros((len(of), len(of)))
+    for p in range(len(of)):
         for k in range(p + 1):
-            mixing[p, p - k] = math.comb(p, k) * kernel[k]
-    return np.asarray(np.linalg.inv(mixing))
+            mixing[p, p - k] = math.comb(p, k) * of[k]
+    return mixing
 
 
 def measure_moments(
@@ -116,33 +118,46 @@ def measure_moments(
     highest = max(orders)
     noise = effective_noise_density(sensor) * noise_integrals(sensor, 2 * highest)
     if sensor.photoelectrons:
-        noise = with_shot_noise(noise, counts, sensor.black_level, lambda light: _shot_sums(sensor, light, 2 * highest))
+        noise = _with_shot_noise(sensor, noise, counts)
     raw = raw_moments(sensor, counts, highest)
     if light is not None:
         raw, noise = raw / light[:, None], noise / light[:, None] ** 2
-    return moments_from_sums(raw, noise, _unmixing(sensor, highest), orders, flux)
+    everything = np.arange(raw.shape[1])
+    if flux == "measured":
+        total, sd = raw[:, 0].copy(), np.sqrt(noise[..., 0])
+        if (total < LEAST_FLUX * sd).any():
+            return f"the flux, {total.min():.3g}, is under {LEAST_FLUX:g} of its standard deviations, {sd.max():.3g}"
+        raw = raw / total[:, None]
+        covariance = measured_flux_covariance(noise, everything, raw, total)
+    else:
+        raw[:, 0] = 1.0
+        covariance = np.array(noise[..., everything[:, None] + everything])
+        covariance[..., 0, :] = covariance[..., :, 0] = 0.0
+    unmix = _unmixing(sensor, highest)[list(orders)]
+    covariance = batched.congruence(unmix, covariance if covariance.ndim == 3 else covariance[None])
+    return Measurement(
+        value=recombine(raw, unmix), covariance=np.broadcast_to(covariance, (len(raw), *covariance.shape[1:]))
+    )
 
 
-def with_shot_noise(
-    read: FloatArray, counts: Counts, black_level: float, sums: Callable[[FloatArray], FloatArray]
-) -> FloatArray:
-    """Cov(M_p, M_q) by p + q with shot noise of the light as measured, (axes, 2 highest + 1).
+def _with_shot_noise(sensor: Sensor, read: FloatArray, counts: Counts) -> FloatArray:
+    """Cov(M_p, M_q) by p + q with shot noise of the light as measured, from that by read-out noise alone, (n,).
 
-    Shot noise adds y_(p+q) / photoelectrons.
-
-    Parameters
-    ----------
-    read:
-        The same by read-out noise alone, (2 highest + 1,).
-    sums:
-        Contribution of shot noise, from counts above the black level (axes, pixels).
+    Shot noise adds y_(p+q) / photoelectrons, (axes, n).
     """
-    light = counts.astype(np.float64) - black_level
-    noise = read + sums(light)
+    powers = sensor.centres[:, None] ** np.arange(len(read))
+    scale = sensor.pixel_width / (sensor.counts_per_density * sensor.photoelectrons)
+
+    def noisy(light: FloatArray) -> FloatArray:
+        # A product for each row: the bits of one for all would depend on their number.
+        return np.asarray(read + (np.ascontiguousarray(light)[:, None] @ powers)[:, 0] * scale)
+
+    light = counts.astype(np.float64) - sensor.black_level
+    noise = noisy(light)
     # Where noise makes the light so negative that this is no covariance, light is what is above the black level.
     poor = ~_is_covariance(noise)
     if poor.any():
-        noise[poor] = read + sums(np.maximum(light[poor], 0.0))
+        noise[poor] = noisy(np.maximum(light[poor], 0.0))
     return noise
 
 
@@ -158,46 +173,6 @@ def _is_covariance(noise: FloatArray) -> BoolArray:
                 for q in range(k + 1, size):
                     left[p][q] = left[p][q] - left[p][k] * left[k][q] / left[k][k]
     return good
-
-
-def _shot_sums(sensor: Sensor, light: FloatArray, highest: int) -> FloatArray:
-    powers = sensor.centres[:, None] ** np.arange(highest + 1)
-    scale = sensor.pixel_width / (sensor.counts_per_density * sensor.photoelectrons)
-    # A product for each row: the bits of one for all would depend on their number.
-    return np.asarray((np.ascontiguousarray(light)[:, None] @ powers)[:, 0] * scale)
-
-
-def moments_from_sums(
-    raw: FloatArray, noise: FloatArray, unmix: FloatArray, orders: Sequence[int], flux: Flux
-) -> Measurement | str:
-    """Moments without the kernel from those with it.
-
-    Parameters
-    ----------
-    raw:
-        M_0 and on, (axes, highest + 1).
-    noise:
-        Cov(M_p, M_q) by p + q, (2 highest + 1,) or (axes, 2 highest + 1).
-    unmix:
-        As of `without_kernel`, (highest + 1, highest + 1).
-    """
-    everything = np.arange(raw.shape[1])
-    if flux == "measured":
-        total, sd = raw[:, 0].copy(), np.sqrt(noise[..., 0])
-        if (total < LEAST_FLUX * sd).any():
-            return f"the flux, {total.min():.3g}, is under {LEAST_FLUX:g} of its standard deviations, {sd.max():.3g}"
-        raw = raw / total[:, None]
-        covariance = measured_flux_covariance(1.0, noise, list(everything), raw, total)
-    else:
-        raw = raw.copy()
-        raw[:, 0] = 1.0
-        covariance = np.array(noise[..., everything[:, None] + everything])
-        covariance[..., 0, :] = covariance[..., :, 0] = 0.0
-    unmix = unmix[list(orders)]
-    covariance = batched.congruence(unmix, covariance if covariance.ndim == 3 else covariance[None])
-    return Measurement(
-        value=recombine(raw, unmix), covariance=np.broadcast_to(covariance, (len(raw), *covariance.shape[1:]))
-    )
 
 
 def spot_significance(sensor: Sensor, density: FloatArray) -> FloatArray:
@@ -234,16 +209,7 @@ def least_significance(sensor: Sensor, light: FloatArray | float = 1.0) -> Float
 
 @lru_cache(maxsize=16)
 def _unmixing(sensor: Sensor, highest: int) -> FloatArray:
-    return without_kernel(kernel_moments(sensor.kernel, sensor.pixel_width, highest), highest)
-
-
-def shift_matrix(centre: float, highest: int) -> FloatArray:
-    """Moments about ``centre`` to moments about zero, (highest + 1, highest + 1)."""
-    matrix = np.zeros((highest + 1, highest + 1))
-    for p in range(highest + 1):
-        for k in range(p + 1):
-            matrix[p, k] = math.comb(p, k) * centre ** (p - k)
-    return matrix
+    return without_kernel(kernel_moments(sensor.kernel, sensor.pixel_width, highest))
 
 
 def recombine(moments: FloatArray, matrix: FloatArray) -> FloatArray:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from aolink.numerics import batched
 from aolink.numerics.arrays import FloatArray, Indices
 
 MOST_COVARIANCES = 32
@@ -24,6 +25,11 @@ class Gaussian:
     def part(self, axes: slice | Indices) -> Gaussian:
         """The Gaussians of some axes."""
         return Gaussian(self.mean[axes], self.covariance[axes])
+
+    def mapped(self, rows: FloatArray, added: FloatArray) -> Gaussian:
+        """The Gaussian of M t + e: M is ``rows``, e independent of t, of covariance ``added``."""
+        spread = batched.congruence(rows, self.covariance) + added
+        return Gaussian(batched.matvec(rows, self.mean), batched.symmetric(spread))
 
     def with_noise(self, size: int) -> Gaussian:
         """With noise coefficients N(0, I) after these, ``size`` in all; leading axes as they come."""

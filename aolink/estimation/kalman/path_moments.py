@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Protocol, TypeVar
 
@@ -18,9 +18,6 @@ from aolink.numerics.arrays import FloatArray
 from aolink.numerics.entrywise import Entry
 from aolink.plant.alike import MANY_STATES
 from aolink.rig import Plant
-
-Form = Callable[[ExposureModel, InputResponse, Gaussian, Measurement], Update]
-
 
 Data = TypeVar("Data", contravariant=True)
 
@@ -43,7 +40,7 @@ class PathMoments:
     Parameters
     ----------
     plant:
-        Its size chooses the form in which updates are computed.
+        Its number of outputs is that of each moment's measurements.
     orders:
         Moments, of 1 and 2.
     gain:
@@ -60,48 +57,23 @@ class PathMoments:
         self.orders, self.gain = tuple(orders), gain
         self.needs = Needs(what="moments", orders=self.orders, flux=flux)
         self.n_measurements = plant.n_outputs * len(self.orders)
-        self._form = self._chosen_form(plant)
-
-    def _chosen_form(self, plant: Plant) -> Form:
-        """The form of the update for these numbers of states and measurements."""
-        if plant.n_outputs > 2:  # many spots, of which each has noise of its own
-            return self._many
-        if max(self.n_measurements, plant.n_states) > entrywise.MOST_ROWS:
-            return self._in_matrices
-        if self.gain is None and self.n_measurements == plant.n_states == 2:
-            return self._two_states
-        return self._small
 
     def update(self, model: ExposureModel, response: InputResponse, prior: Gaussian, measured: Measurement) -> Update:
-        """One step of the (extended) Kalman filter."""
-        return self._form(model, response, prior, measured)
-
-    def _many(self, model: ExposureModel, response: InputResponse, prior: Gaussian, measured: Measurement) -> Update:
-        expected, slope = many_moments(model, response, prior.mean, self.orders)
-        update = information_update if model.plant.n_states > MANY_STATES else blocked_update
-        return update(prior, measured.value - expected, slope, measured.covariance, self.gain)
-
-    def _in_matrices(
-        self, model: ExposureModel, response: InputResponse, prior: Gaussian, measured: Measurement
-    ) -> Update:
-        h, H = predicted_moments(model, response, prior.mean, self.orders)
-        return joseph_update(prior, measured.value - h, H, self._noise(measured), self.gain)
-
-    def _small(self, model: ExposureModel, response: InputResponse, prior: Gaussian, measured: Measurement) -> Update:
-        innovation, H = self._entries(model, response, prior, measured)
-        return small_update(prior, innovation, H, self._noise(measured), self.gain)
-
-    def _two_states(
-        self, model: ExposureModel, response: InputResponse, prior: Gaussian, measured: Measurement
-    ) -> Update:
-        innovation, H = self._entries(model, response, prior, measured)
-        return two_state_update(prior, innovation, H, self._noise(measured))
-
-    def _entries(
-        self, model: ExposureModel, response: InputResponse, prior: Gaussian, measured: Measurement
-    ) -> tuple[list[Entry], entrywise.Matrix]:
+        """One step of the (extended) Kalman filter, in the form for these numbers of states and measurements."""
+        n_states, n_outputs = model.plant.n_states, model.plant.n_outputs
+        if n_outputs > 2:  # many spots, of which each has noise of its own
+            expected, slope = many_moments(model, response, prior.mean, self.orders)
+            update = information_update if n_states > MANY_STATES else blocked_update
+            return update(prior, measured.value - expected, slope, measured.covariance, self.gain)
+        R = self._noise(measured)
+        if max(self.n_measurements, n_states) > entrywise.MOST_ROWS:
+            expected, slope = predicted_moments(model, response, prior.mean, self.orders)
+            return joseph_update(prior, measured.value - expected, slope, R, self.gain)
         h, H = _moment_entries(model, response, prior.mean, self.orders)
-        return [y - expected for y, expected in zip(entrywise.columns(measured.value), h, strict=True)], H
+        innovation = [y - expected for y, expected in zip(entrywise.columns(measured.value), h, strict=True)]
+        if self.gain is None and self.n_measurements == n_states == 2:
+            return two_state_update(prior, innovation, H, R)
+        return small_update(prior, innovation, H, R, self.gain)
 
     def _noise(self, measured: Measurement) -> FloatArray:
         """Covariance of the measurements, (axes, n_measurements, n_measurements); a single block may stand for it."""
@@ -175,7 +147,7 @@ def _moment_entries(
 def many_moments(
     model: ExposureModel, response: InputResponse, state: FloatArray, orders: Sequence[int]
 ) -> tuple[FloatArray, FloatArray]:
-    """`predicted_moments` of a plant with many outputs, all of them at once."""
+    """`predicted_moments` of many outputs, all at once: row `spots_under_turbulence` of tools/bench."""
     axes, n = state.shape
     rows = model.mean_row
     moments, slopes = [], []

@@ -27,12 +27,7 @@ def steady_gain(model: ExposureModel, Q: FloatArray, R: FloatArray) -> FloatArra
         return stepped_gain(model.transition, H, Q, R)
     if R.ndim == 3 and len(H) > H.shape[1]:
         return _compressed_gain(model, Q, R)
-    R = linalg.block_diag(*R) if R.ndim == 3 else R
-    try:
-        P = linalg.solve_discrete_are(model.transition.T, H.T, Q, R)
-    except (np.linalg.LinAlgError, ValueError):
-        return None
-    return np.asarray(P @ H.T @ np.linalg.inv(H @ P @ H.T + R))
+    return _riccati_gain(model.transition, H, Q, linalg.block_diag(*R) if R.ndim == 3 else R)
 
 
 def _compressed_gain(model: ExposureModel, Q: FloatArray, R: FloatArray) -> FloatArray | None:
@@ -42,10 +37,14 @@ def _compressed_gain(model: ExposureModel, Q: FloatArray, R: FloatArray) -> Floa
     blocks, size, _ = R.shape
     white = np.linalg.solve(root, model.mean_row.reshape(blocks, size, -1)).reshape(blocks * size, -1)
     rotation, H = np.linalg.qr(white)
+    gain = _riccati_gain(model.transition, H, Q, np.eye(len(H)))
+    told = np.linalg.solve(root.swapaxes(1, 2), rotation.reshape(blocks, size, -1)).reshape(blocks * size, -1)
+    return None if gain is None else np.asarray(gain @ told.T)
+
+
+def _riccati_gain(A: FloatArray, H: FloatArray, Q: FloatArray, R: FloatArray) -> FloatArray | None:
     try:
-        P = linalg.solve_discrete_are(model.transition.T, H.T, Q, np.eye(len(H)))
+        P = linalg.solve_discrete_are(A.T, H.T, Q, R)
     except (np.linalg.LinAlgError, ValueError):
         return None
-    gain = P @ H.T @ np.linalg.inv(H @ P @ H.T + np.eye(len(H)))
-    told = np.linalg.solve(root.swapaxes(1, 2), rotation.reshape(blocks, size, -1)).reshape(blocks * size, -1)
-    return np.asarray(gain @ told.T)
+    return np.asarray(P @ H.T @ np.linalg.inv(H @ P @ H.T + R))

@@ -183,10 +183,6 @@ class FactoredModel(ExposureModel):
         unmodelled = np.zeros((len(self.transition), self.n_unmodelled))
         return np.concatenate([self.transition, unmodelled, self.noise.ends], axis=1)
 
-    def columns(self, count: int) -> list[Indices]:
-        """Which of the first ``count`` coefficients have each of the distinct courses."""
-        return [np.flatnonzero(self.course_of[:count] == c) for c in range(self.functions.shape[1])]
-
     def responses(self, inputs: FloatArray) -> InputResponse:
         path, end = input_response(self.plant, by_axis(self.plant, inputs))
         mean, square = batched.mean_over_path(path), batched.mean_over_path(path * path)
@@ -226,8 +222,8 @@ class FactoredModel(ExposureModel):
         """Covariance of the courses' shares of each output's path, (axes, n_outputs, m, m)."""
         count, m = covariance.shape[1], self.functions.shape[1]
         out = np.zeros((len(covariance), self.plant.n_outputs, m, m))
+        columns = [np.flatnonzero(self.course_of[:count] == c) for c in range(m)]
         for axis, P in enumerate(covariance):
-            columns = self.columns(count)
             for c, own in enumerate(columns):
                 for d, other in enumerate(columns[: c + 1]):
                     block = matmul_one_thread(self.patterns[:, own], P[np.ix_(own, other)])

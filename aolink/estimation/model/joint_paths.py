@@ -58,14 +58,12 @@ class JointPaths:
         course_of = model.course_of[: self.size]
         used = int(course_of.max()) + 1
         self.order = np.argsort(course_of, kind="stable")
-        self.groups = [np.flatnonzero(course_of == c) for c in range(used)]
-        """Coefficients of each course."""
         self.patterns = np.ascontiguousarray(model.patterns[:, : self.size])
         """(n_outputs, size)"""
         self._gram = gram(self.patterns)
         # In the order of courses.
         self._patterns, self._course_of = np.ascontiguousarray(self.patterns[:, self.order]), course_of[self.order]
-        self._starts = np.cumsum([0] + [len(own) for own in self.groups])
+        self._starts = np.append(0, np.cumsum(np.bincount(course_of)))
         self._slices = [slice(start, end) for start, end in pairwise(self._starts.tolist())]
         self.course_of = course_of
         self._functions = model.functions[:, :used]
@@ -148,7 +146,7 @@ class JointPaths:
 
     def spread(self, covariance: FloatArray) -> FloatArray:
         """Covariance of the shares of each spot, x before y, from that of the coefficients, (spots, 2 m, 2 m)."""
-        m = len(self.groups)
+        m = self.functions.shape[1]
         out = np.empty((self.spots, 2, m, 2, m))
         by_course = self._sorted(covariance)
         for c, own in enumerate(self._slices):

@@ -133,5 +133,5 @@ def _told(paths: JointPaths, fit: Regression, R: FloatArray, new: FloatArray) ->
     """Information and score of the coefficients from the sums of all spots."""
     weighted = np.linalg.solve(R, np.concatenate([fit.slope, new[..., None]], axis=2))
     told = batched.transpose(fit.slope) @ weighted
-    shape = (len(told), 2, len(paths.groups))
+    shape = (len(told), 2, paths.functions.shape[1])
     return paths.information(told[..., :-1].reshape(*shape, *shape[1:])), paths.score(told[..., -1].reshape(shape))

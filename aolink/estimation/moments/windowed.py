@@ -219,7 +219,7 @@ class WindowedMoments(Windowed[Profile]):
         mean = batched.matvec(basis, about.mean) + nodes.inputs[:, 0]
         spread = batched.congruence(basis, about.covariance)
         W = self.window_weights(mean, np.einsum("akk->ak", spread), measured.mask)
-        y, noise = self.measured(W, measured.density, measured.light)
+        y, noise = weighted_sums(self.sensor, W, measured.density, measured.light)
         return y, noise, self.regression(W, mean, spread, basis, nodes.weights, nodes.widening)
 
     def window_weights(self, mean: FloatArray, variance: FloatArray, mask: BoolArray) -> FloatArray:
@@ -257,12 +257,6 @@ class WindowedMoments(Windowed[Profile]):
         )
         slope = batched.matmul(batched.transpose(light * g[1]), np.broadcast_to(basis, (len(W), *basis.shape)))
         return Regression((light * g[0]).sum(axis=1), slope, batched.symmetric(np.asarray(remainder)))
-
-    def measured(
-        self, W: FloatArray, density: FloatArray, light: FloatArray | None = None
-    ) -> tuple[FloatArray, FloatArray]:
-        """The weighted sums, (axes, m), and the covariance of their pixels' noise, (axes, m, m)."""
-        return weighted_sums(self.sensor, W, density, light)
 
 
 def weighted_sums(

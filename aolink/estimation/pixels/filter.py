@@ -24,7 +24,6 @@ from aolink.estimation.model.base import ExposureModel, InputResponse, over_step
 from aolink.estimation.model.exposure_model import exposure_model
 from aolink.estimation.pixels.gaussian_mixture import GaussianMixture, joined, single
 from aolink.estimation.pixels.likelihood import PixelView, Reduction
-from aolink.numerics import batched
 from aolink.numerics.arrays import BoolArray, FloatArray, Indices
 from aolink.numerics.workers import in_threads, thread_count
 from aolink.optics.camera import effective_noise_density
@@ -242,11 +241,8 @@ def _spread(parts: Sequence[Innovation], seen: Indices, axes: int) -> Innovation
 
 def _moved(h: GaussianMixture, transition: FloatArray, noise: FloatArray, kick: FloatArray) -> GaussianMixture:
     """x -> A x + d, P -> A P A' + Q for each component."""
-    return GaussianMixture(
-        h.log_weight,
-        batched.matvec(transition, h.mean) + kick[:, None],
-        batched.symmetric(batched.congruence(transition, h.covariance) + noise),
-    )
+    after = Gaussian(h.mean, h.covariance).mapped(transition, noise)
+    return GaussianMixture(h.log_weight, after.mean + kick[:, None], after.covariance)
 
 
 def _chosen(which: BoolArray, first: GaussianMixture, second: GaussianMixture) -> GaussianMixture:

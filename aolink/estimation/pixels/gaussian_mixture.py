@@ -37,7 +37,7 @@ class GaussianMixture:
 
     def copy(self) -> GaussianMixture:
         """A copy, each of whose arrays is contiguous in memory."""
-        return GaussianMixture(*(np.array(each, order="C") for each in (self.log_weight, self.mean, self.covariance)))
+        return GaussianMixture(*(np.array(each, order="C") for each in self.arrays))
 
     def weighted(self, share: float) -> GaussianMixture:
         """The mixture with its weights multiplied by a share."""
@@ -77,13 +77,9 @@ class GaussianMixture:
         return np.asarray(constant[..., None] - 0.5 * np.add.reduce(white * white, axis=-1))
 
     @property
-    def contiguous(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def contiguous(self) -> list[FloatArray]:
         """Log-weights, means and covariances, each contiguous in memory, as compiled code takes them."""
-        return (
-            np.ascontiguousarray(self.log_weight),
-            np.ascontiguousarray(self.mean),
-            np.ascontiguousarray(self.covariance),
-        )
+        return [np.ascontiguousarray(each) for each in self.arrays]
 
     def reduced(self, most: int, free: float = 0.0) -> GaussianMixture:
         """The mixture reduced to ``most`` components, or fewer if mergers cost less than ``free``. Repeatedly, the two
@@ -132,21 +128,14 @@ def single(gaussian: Gaussian) -> GaussianMixture:
 
 def joined(*mixtures: GaussianMixture) -> GaussianMixture:
     """All components of several mixtures, their weights normalised together."""
-    log_weight = np.concatenate([each.log_weight for each in mixtures], axis=1)
-    return GaussianMixture(
-        log_weight - log_sum(log_weight, axis=1)[:, None],
-        np.concatenate([each.mean for each in mixtures], axis=1),
-        np.concatenate([each.covariance for each in mixtures], axis=1),
-    )
+    arrays = zip(*(each.arrays for each in mixtures), strict=True)
+    log_weight, mean, covariance = (np.concatenate(each, axis=1) for each in arrays)
+    return GaussianMixture(log_weight - log_sum(log_weight, axis=1)[:, None], mean, covariance)
 
 
 def stacked_axes(mixtures: Sequence[GaussianMixture]) -> GaussianMixture:
     """Mixtures of different axes, one after the other."""
-    return GaussianMixture(
-        np.concatenate([each.log_weight for each in mixtures]),
-        np.concatenate([each.mean for each in mixtures]),
-        np.concatenate([each.covariance for each in mixtures]),
-    )
+    return GaussianMixture(*map(np.concatenate, zip(*(each.arrays for each in mixtures), strict=True)))
 
 
 def with_noise(prior: GaussianMixture, t: FloatArray) -> FloatArray:

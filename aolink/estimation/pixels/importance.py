@@ -22,7 +22,6 @@ import numpy as np
 from scipy import special
 
 from aolink.estimation.compiled import mixtures as compiled_mixtures
-from aolink.estimation.kalman.gaussian import Gaussian
 from aolink.estimation.pixels.gaussian_mixture import (
     GaussianMixture,
     joined,
@@ -70,15 +69,12 @@ _HEAVY = 0.05
 NEGLIGIBLE = 1e-3
 
 
-def proposed(modes_weight: FloatArray, modes: Gaussian, wide_weight: FloatArray, wide: Gaussian) -> GaussianMixture:
-    """Modes, flattened a little, and the wide Gaussians of windowed moments about them, to draw points from.
-
-    Both weights are logarithms; covariances and means (axes, components, ...).
-    """
-    weight = _EVIDENCE * (modes_weight - np.maximum.reduce(modes_weight, axis=1, keepdims=True))
+def proposed(modes: GaussianMixture, wide: GaussianMixture) -> GaussianMixture:
+    """Modes, flattened a little, and the wide Gaussians of windowed moments about them, to draw points from."""
+    weight = _EVIDENCE * (modes.log_weight - np.maximum.reduce(modes.log_weight, axis=1, keepdims=True))
     weight += math.log(1 - _WIDE) - log_sum(weight, axis=1)[:, None]
     narrow = GaussianMixture(weight, modes.mean, modes.covariance * _INFLATION)
-    return joined(narrow, GaussianMixture(wide_weight + math.log(_WIDE), wide.mean, wide.covariance))
+    return joined(narrow, wide.weighted(_WIDE))
 
 
 def posterior(

@@ -75,15 +75,9 @@ class Reduction:
         """The prior of t, from that of the start state; leading axes as they come."""
         return state.with_noise(self.size)
 
-    def end(self, t: Gaussian) -> Gaussian:
-        """The Gaussian of the end state, without the response to the inputs; leading axes as they come."""
-        spread = batched.congruence(self.end_rows, t.covariance) + self.end_remainder
-        return Gaussian(batched.matvec(self.end_rows, t.mean), batched.symmetric(spread))
-
     def coefficients(self, t: Gaussian) -> Gaussian:
         """The Gaussian of z, from that of t, one for each axis."""
-        spread = batched.congruence(self.expand, t.covariance) + self.left_out
-        return Gaussian(batched.matvec(self.expand, t.mean), batched.symmetric(spread))
+        return t.mapped(self.expand, self.left_out)
 
 
 @lru_cache(maxsize=64)

@@ -53,7 +53,7 @@ class TemperedUpdater:
         modes, _ = explored(view, prior)
         new = innovation(view, before, modes)
         fit = stacked_axes([fitted(points, reduced.end_rows, _COMPONENTS, self.seed) for points in t])
-        end = reduced.end(Gaussian(fit.mean, fit.covariance))
+        end = Gaussian(fit.mean, fit.covariance).mapped(reduced.end_rows, reduced.end_remainder)
         carried = GaussianMixture(fit.log_weight, end.mean, end.covariance)
         return MixtureUpdate(
             fit, after, carried, new, modes.total_evidence, has_several(modes), np.zeros(len(mean), dtype=bool)

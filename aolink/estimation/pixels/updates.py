@@ -160,9 +160,9 @@ def explored(view: PixelView, prior: GaussianMixture) -> tuple[Modes, GaussianMi
     for room, each in zip(modes.arrays, found.arrays, strict=True):
         room.reshape(axes, count, *each.shape[1:])[there] = each
     modes = without_repeats(modes)
-    flat = Gaussian(np.zeros_like(before.mean), np.zeros_like(before.covariance))
+    flat = GaussianMixture(prior.log_weight, np.zeros_like(before.mean), np.zeros_like(before.covariance))
     flat.mean[there], flat.covariance[there] = wide.mean, wide.covariance
-    return modes, proposed(modes.log_evidence, Gaussian(modes.mean, modes.covariance), prior.log_weight, flat)
+    return modes, proposed(GaussianMixture(modes.log_evidence, modes.mean, modes.covariance), flat)
 
 
 def _wide_part(proposal: GaussianMixture, prior: GaussianMixture) -> GaussianMixture:

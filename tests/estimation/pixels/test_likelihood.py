@@ -136,7 +136,9 @@ def test_what_the_reduction_leaves_out_is_small_and_accounted_for(kind):
     expected[:n, :n] = rig.plant.initial_covariance
     np.testing.assert_allclose(after.covariance[0], expected, atol=1e-12)
     A, Q = model.transition, model.process_noise
-    np.testing.assert_allclose(reduced.end(t).covariance[0], A @ state.covariance[0] @ A.T + Q, atol=1e-9)
+    np.testing.assert_allclose(
+        t.mapped(reduced.end_rows, reduced.end_remainder).covariance[0], A @ state.covariance[0] @ A.T + Q, atol=1e-9
+    )
 
 
 def test_fewer_nodes_and_coefficients_cost_less_than_the_noise():

@@ -400,7 +400,7 @@ def test_where_few_points_count_others_are_tempered(updates, monkeypatch):
     done, again = (updates.update(view, single(state), state, 7) for _ in range(2))
     assert done.coefficients.mean.tobytes() == again.coefficients.mean.tobytes()
     assert_near(done.coefficients, mean, covariance, 0.25, 0.2)
-    end = view.reduced.end(Gaussian(mean[None], covariance[None]))
+    end = Gaussian(mean[None], covariance[None]).mapped(view.reduced.end_rows, view.reduced.end_remainder)
     np.testing.assert_allclose(done.end.gaussian.mean, end.mean, atol=0.25 * np.sqrt(end.covariance[0].max()))
 
 
