@@ -26,17 +26,14 @@ _MOST_POINTS = 3000
 
 
 def plot_blur(
-    view: Overview, axes: Axes | None = None, *, names: Sequence[str] | None = None, unit: TimeUnit = "s",
-    bar: bool = True,
-) -> Axes:  # fmt: skip
+    view: Overview, axes: Axes | None = None, *, names: Sequence[str] | None = None, unit: TimeUnit = "s"
+) -> Axes:
     """What the camera saw of one output, exposure by exposure, and where the spot was.
 
     Parameters
     ----------
     names:
         Whose paths are drawn: ``truth`` or estimators; by default the truth and the estimator to look at first.
-    bar:
-        Whether a colour bar says what the grey is.
 
     Raises
     ------
@@ -53,8 +50,7 @@ def plot_blur(
         np.ravel(view.spans) * scale, line.edges, blur, cmap="Greys", vmin=0, vmax=1.2 * max(top, 1e-12),
         rasterized=True,
     )  # fmt: skip
-    if bar:
-        colour_bar(grey, axes, "intensity (1 / slope unit)")
+    colour_bar(grey, axes, "intensity (1 / slope unit)")
     chosen = ["truth", *view.names[-1:]] if names is None else names
     for name in [each for each in chosen if each in view.paths]:
         _draw_paths(axes, view, name, scale)

@@ -122,9 +122,7 @@ class Mode:
     at: Linearised
 
 
-def find_mode(
-    view: JointPixels, mean: FloatArray, precision: FloatArray, start: FloatArray, passes: int = _PASSES
-) -> Mode:
+def find_mode(view: JointPixels, mean: FloatArray, precision: FloatArray, start: FloatArray) -> Mode:
     """The mode that a start leads to, for a prior with this mean and precision, by Levenberg and Marquardt's method."""
     paths = view.paths
 
@@ -138,7 +136,7 @@ def find_mode(
         return Points(np.array([objective]), (paths.score(near.score) - pull)[None], H[None], kept)
 
     # What a step would gain says when it is at a mode, before the pixels are linearised again.
-    (t,), found = minimise(at, start[None], passes - 1, CONVERGED, foreseen=CONVERGED, solve=_solve)
+    (t,), found = minimise(at, start[None], _PASSES - 1, CONVERGED, foreseen=CONVERGED, solve=_solve)
     assert found.linearised is not None
     return Mode(t, found.hessian[0], float(found.objective[0]), found.linearised[0])
 
