@@ -7,7 +7,7 @@ import math
 _PREFIXES = {-12: "p", -9: "n", -6: "u", -3: "m", 0: "", 3: "k", 6: "M", 9: "G", 12: "T"}
 
 
-def with_unit(value: float, unit: str, digits: int = 4) -> str:
+def with_unit(value: float, unit: str) -> str:
     """A value with its unit and the prefix that makes it short: ``with_unit(2e-4, "s")`` is ``200 us``."""
     if not value or not math.isfinite(value):
         return f"{value:g} {unit}"
@@ -15,7 +15,7 @@ def with_unit(value: float, unit: str, digits: int = 4) -> str:
     # Kiloseconds and millibytes are not used.
     low, high = {"s": (-12, 0), "B": (0, 12)}.get(unit, (-12, 12))
     exponent = min(max(exponent, low), high)
-    return f"{value / 10.0**exponent:.{digits}g} {_PREFIXES[exponent]}{unit}"
+    return f"{value / 10.0**exponent:.4g} {_PREFIXES[exponent]}{unit}"
 
 
 def duration(seconds: float) -> str:

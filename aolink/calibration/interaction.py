@@ -49,11 +49,6 @@ class Interaction:
         """Largest over smallest singular value: how much weaker the weakest mirror mode is."""
         return float(self.singular_values[0] / max(self.singular_values[-1], 1e-300))
 
-    def control_matrix(self, weakest: float = 0.0) -> FloatArray:
-        """Matrix that gives the inputs for given slopes, (n_inputs, n_outputs), without mirror modes below ``weakest``
-        times the strongest."""
-        return np.asarray(np.linalg.pinv(self.matrix, rcond=weakest))
-
 
 def rest_exposures(rig: Rig, hold_s: float) -> int:
     """Frame periods that a poke rests before it is measured, so that it has rested for ``hold_s``: at least one."""

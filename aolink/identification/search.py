@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -36,7 +36,6 @@ _SAME = 0.02
 _RIDGE = 0.5
 _STEP = 1e-3
 _NEVER = 1e12
-Told = Callable[[int], None]
 
 
 @dataclass(frozen=True)
@@ -194,16 +193,12 @@ class Maximum:
     nodes: int
 
 
-def maxima(space: Space, seen: Sequence[Readings], tell: Told | None = None) -> list[Maximum]:
+def maxima(space: Space, seen: Sequence[Readings]) -> list[Maximum]:
     """The local maxima within `KEPT` of the highest, the highest first."""
     of = [Likelihood(each, BLOCK) for each in seen]
     points = [np.array([*point, *[0.0] * (space.with_noise + space.with_kernel)]) for point in _grid(space, seen)]
     points = [np.clip(point, *np.array(space.bounds).T) for point in points]
-    values = []
-    for k, point in enumerate(points):
-        values.append(space.log_likelihood(point, of))
-        if tell:
-            tell(k)
+    values = [space.log_likelihood(point, of) for point in points]
     order = np.argsort(values)[::-1]
     chosen: list[FloatArray] = []
     for k in order:

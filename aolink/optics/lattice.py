@@ -116,11 +116,6 @@ class Lattice:
         return np.asarray(self.origin + nodes @ self.steps)
 
     @property
-    def displacements(self) -> FloatArray:
-        """Displacement from each spot's node to the spot, pixels, (n, 2)."""
-        return self.spots - self.node_positions(self.nodes)
-
-    @property
     def lenslet(self) -> FloatArray:
         """Points that fill the cell about a node (a square or a hexagon) evenly, pixels from the node, (144, 2)."""
         part = (np.arange(12) + 0.5) / 12

@@ -61,11 +61,6 @@ class FrozenFlow:
         self.amplitudes = np.sqrt(power) * (scatter[0] + 1j * scatter[1]) * layer.wavelength_m / (2 * math.pi)
         """Complex amplitudes, metres, (waves,): W(r) = Re sum_k a_k exp(i k r)."""
 
-    def wavefront(self, points_m: FloatArray, time_s: float = 0.0) -> FloatArray:
-        """Path difference at points (..., 2), m, (...)."""
-        moved = points_m - time_s * np.asarray(self.layer.wind_m_s)
-        return np.asarray((np.exp(1j * moved @ self.wave_numbers.T) @ self.amplitudes).real)
-
     def slope_waves(self, lenslets: Lenslets) -> NDArray[np.complex128]:
         """Mean slopes of each wave over the lit part of each lenslet in radians, (spots, 2, waves); NaN in the dark.
 

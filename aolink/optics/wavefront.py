@@ -1,4 +1,4 @@
-"""Wavefront reconstruction from slopes: zonal and modal least squares; residual rms and Strehl ratio.
+"""Wavefront reconstruction from slopes, by zonal and modal least squares; residual rms.
 
 Slopes are means over lenslets as in `aolink.optics.lenslets`, (rows, columns, 2) on a grid or (spots, 2);
 wavefronts come in the unit of slopes times the lenslets' pitch.
@@ -8,17 +8,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from scipy import linalg, sparse
 from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import splu
-from scipy.special import gamma
 
 from aolink.numerics.arrays import FloatArray, IntArray
 from aolink.optics.lenslets import Lenslets
-from aolink.optics.zernike import noll_to_orders, zernike, zernike_gradient
+from aolink.optics.zernike import zernike_gradient
 
 
 class SpotReconstructor:
@@ -35,8 +33,6 @@ class SpotReconstructor:
         Positions of the spots' lenslets, (spots, 2) as (x, y); the wavefront's unit is that of slopes times theirs.
     edges:
         Pairs of neighbours, as numbers of spots, (edges, 2).
-    weights:
-        Weights of the slopes of each spot, (spots,); one where None.
 
     Raises
     ------
@@ -44,7 +40,7 @@ class SpotReconstructor:
         There are no spots.
     """
 
-    def __init__(self, positions: FloatArray, edges: IntArray, weights: FloatArray | None = None) -> None:
+    def __init__(self, positions: FloatArray, edges: IntArray) -> None:
         if not len(positions):
             raise ValueError("there are no spots")
         (a, b), row, n = edges.T, np.arange(len(edges)), len(positions)
@@ -55,8 +51,7 @@ class SpotReconstructor:
         self._means = _matrix(
             [(row, 2 * at + k, half) for k, half in ((0, half_x), (1, half_y)) for at in (a, b)], (len(edges), 2 * n)
         )
-        w = np.ones(n) if weights is None else weights
-        self._spots, self._weighted = n, (differences.T * ((w[a] + w[b]) / 2)).tocsr()
+        self._spots, self._gathered = n, differences.T.tocsr()
         self.parts = connected_components(_matrix([(a, b, ones)], (n, n)), directed=False)[1].astype(np.int64)
         """The number, from 0, of the connected part that each spot belongs to, (spots,).
 
@@ -64,7 +59,7 @@ class SpotReconstructor:
         """
         null = _matrix([(self.parts, np.arange(n), np.ones(n))], (self.parts.max() + 1, n))
         right = sparse.vstack([null.T, sparse.csr_array((null.shape[0], null.shape[0]))])
-        bordered = sparse.hstack([sparse.vstack([self._weighted @ differences, null]), right])
+        bordered = sparse.hstack([sparse.vstack([self._gathered @ differences, null]), right])
         self._factor = splu(sparse.csc_array(bordered))
 
     def __call__(self, slopes: FloatArray) -> FloatArray:
@@ -73,7 +68,7 @@ class SpotReconstructor:
             raise ValueError(f"slopes have shape {slopes.shape}, expected (..., {self._spots}, 2)")
         if not np.isfinite(slopes).all():
             raise ValueError("a lit lenslet has a slope that is not a number")
-        right = self._weighted @ (self._means @ slopes.reshape(-1, 2 * self._spots).T)
+        right = self._gathered @ (self._means @ slopes.reshape(-1, 2 * self._spots).T)
         right = np.concatenate([right, np.zeros((self.parts.max() + 1, right.shape[1]))])
         return np.asarray(self._factor.solve(right)[: self._spots].T).reshape(slopes.shape[:-1])
 
@@ -84,32 +79,19 @@ def _matrix(parts: Sequence[tuple[IntArray, IntArray, FloatArray]], shape: tuple
     return sparse.csr_array((values, (rows, columns)), shape=shape)
 
 
-@dataclass(frozen=True, eq=False)
-class ZernikeModes:
-    """Zernike modes over a pupil, as slopes of lenslets."""
+def lenslet_zernike_slopes(lenslets: Lenslets, highest: int) -> FloatArray:
+    """Slopes of Zernike modes 2 .. ``highest`` on the lenslets' round pupil, or on the circle about the whole grid.
 
-    indices: tuple[int, ...]
-    """Noll's indices; 1, the piston, has no slopes and is left out."""
-    slopes: FloatArray
-    """Slopes of each mode of unit rms in the unit of path per m, (spots, 2, modes); NaN in the dark."""
-    light: FloatArray
-    """Lit share of each lenslet, (spots,)."""
-    radius_m: float
+    Mode 1, the piston, has no slopes.
 
-    def wavefront(self, coefficients: FloatArray, points_m: FloatArray) -> FloatArray:
-        """Sum of the modes, coefficients (modes,), at points (..., 2), m, (...)."""
-        modes = [zernike(index, points_m / self.radius_m) for index in self.indices]
-        return np.asarray(np.tensordot(coefficients, modes, axes=1))
-
-
-def zernike_modes(lenslets: Lenslets, highest: int) -> ZernikeModes:
-    """Modes 2 .. ``highest`` on the lenslets' round pupil, or on the circle about the whole grid."""
-    round_pupil = lenslets.pupil_diameter_m or lenslets.pitch_m * math.hypot(*lenslets.grid)
-    radius, indices = round_pupil / 2, tuple(range(2, highest + 1))
-    slopes = lenslets.mean_slopes(
-        lambda p: np.stack([zernike_gradient(i, p / radius) / radius for i in indices], axis=-1)
+    Returns
+    -------
+    Slopes of each mode of unit rms in the unit of path per m, (spots, 2, modes); NaN in the dark.
+    """
+    radius = (lenslets.pupil_diameter_m or lenslets.pitch_m * math.hypot(*lenslets.grid)) / 2
+    return lenslets.mean_slopes(
+        lambda p: np.stack([zernike_gradient(i, p / radius) / radius for i in range(2, highest + 1)], axis=-1)
     )
-    return ZernikeModes(indices=indices, slopes=slopes, light=lenslets.light, radius_m=radius)
 
 
 def zernike_slopes(
@@ -135,10 +117,8 @@ def zernike_slopes(
     return np.stack([zernike_gradient(i, points).mean(axis=1) / radius for i in indices], axis=-1)
 
 
-def modal_reconstructor(
-    slopes: FloatArray, weights: FloatArray, noise_variance: float = 0.0, prior_variance: FloatArray | None = None
-) -> FloatArray:
-    """The matrix from slopes to coefficients: least squares, or with a prior the minimum mean square error estimate.
+def modal_reconstructor(slopes: FloatArray, weights: FloatArray) -> FloatArray:
+    """The matrix from slopes to coefficients, by least squares.
 
     Parameters
     ----------
@@ -146,10 +126,6 @@ def modal_reconstructor(
         Slopes of each mode, (spots, 2, modes).
     weights:
         Weight of each lenslet's slopes, (spots,), such as its light; zero leaves it out.
-    noise_variance:
-        Variance of a slope of weight one.
-    prior_variance:
-        Variance of each coefficient about zero, (modes,); None: no prior.
 
     Returns
     -------
@@ -158,35 +134,18 @@ def modal_reconstructor(
     Raises
     ------
     ValueError
-        There is no prior, and the slopes do not determine the modes.
+        The slopes do not determine the modes.
     """
     both = np.repeat(weights, 2)
     H = np.where(both[:, None] > 0, slopes.reshape(len(both), -1), 0.0)
     normal = (H.T * both) @ H
-    if prior_variance is not None:
-        normal += np.diag(noise_variance / prior_variance)
     # The modes may have any size: only the similarity of their slopes matters.
     size = np.sqrt(np.maximum(np.diag(normal), 1e-300))
     if np.linalg.cond(normal / np.outer(size, size)) > 1e10:
-        raise ValueError("the lit lenslets do not determine the modes: use fewer modes, or a prior")
+        raise ValueError("the lit lenslets do not determine the modes: use fewer modes")
     return np.asarray(linalg.solve(normal, H.T * both, assume_a="pos"))
-
-
-def kolmogorov_variances(indices: tuple[int, ...], diameter_m: float, r0_m: float) -> FloatArray:
-    """Variances of Zernike coefficients in Kolmogorov turbulence, rad^2; Noll (1976), equation (25)."""
-
-    n = np.array([noll_to_orders(index)[0] for index in indices], dtype=np.float64)
-    scale = (24 / 5 * gamma(6 / 5)) ** (5 / 6) * gamma(11 / 6) ** 2 * gamma(14 / 3) / (2 ** (8 / 3) * math.pi)
-    value = scale * (n + 1) * gamma(n - 5 / 6) / (gamma(17 / 6) ** 2 * gamma(n + 23 / 6))
-    return np.asarray(value * (diameter_m / r0_m) ** (5 / 3))
 
 
 def residual_rms(wavefront: FloatArray) -> float:
     """Standard deviation of a wavefront over the pupil; points that are NaN do not count."""
     return float(wavefront[np.isfinite(wavefront)].std())
-
-
-def strehl(wavefront_m: FloatArray, wavelength_m: float) -> float:
-    """Strehl ratio of a wavefront in metres of path, |mean exp(i phase)|^2; points that are NaN do not count."""
-    phase = 2 * math.pi * wavefront_m[np.isfinite(wavefront_m)] / wavelength_m
-    return float(abs(np.exp(1j * phase).mean()) ** 2)

@@ -28,6 +28,8 @@ _EXPOSURES = 24
 """Most exposures that are read for the maps, spread evenly over the series."""
 _MAP_IN = (2.6, 2.3)
 _LEAST_SPOTS = 4
+_COLUMNS = 3
+"""Maps in a row."""
 
 
 def has_pupil(series: Series) -> bool:
@@ -36,7 +38,7 @@ def has_pupil(series: Series) -> bool:
 
 
 def plot_pupil(
-    series: Series, figure: Figure | SubFigure | None = None, *, estimator: str | None = None, columns: int = 3
+    series: Series, figure: Figure | SubFigure | None = None, *, estimator: str | None = None
 ) -> Figure | SubFigure:
     """Draw maps over the lenslets: light, mean slope in x and in y, blur, NIS; as means over a part of the exposures.
 
@@ -49,8 +51,6 @@ def plot_pupil(
         The figure to draw on; by default a new one.
     estimator:
         Estimator whose paths are drawn; by default the one with the highest rank.
-    columns:
-        Maps in a row.
 
     Raises
     ------
@@ -64,10 +64,10 @@ def plot_pupil(
         raise ExportError(f"{series.path} has no map over the pupil: its sensor has fewer than {_LEAST_SPOTS} lenslets")
     names = by_rank(list(series.named(None if estimator is None else [estimator])))
     maps = _maps(series, names[-1:])
-    rows = -(-len(maps) // columns)
-    figure = figure_or_new(figure, (_MAP_IN[0] * columns, _MAP_IN[1] * rows))
+    rows = -(-len(maps) // _COLUMNS)
+    figure = figure_or_new(figure, (_MAP_IN[0] * _COLUMNS, _MAP_IN[1] * rows))
     for place, (title, (label, values, cmap)) in enumerate(maps.items(), 1):
-        axes = figure.add_subplot(rows, columns, place)
+        axes = figure.add_subplot(rows, _COLUMNS, place)
         shown = np.full(sensor.grid[0] * sensor.grid[1], np.nan)
         shown[sensor.lit] = values
         reach = float(np.nanmax(np.abs(values))) if np.isfinite(values).any() else 1.0

@@ -26,9 +26,8 @@ _MOST_POINTS = 3000
 
 
 def plot_blur(
-    view: Overview, axes: Axes | None = None, *, names: Sequence[str] | None = None, unit: TimeUnit = "s",
-    bar: bool = True,
-) -> Axes:  # fmt: skip
+    view: Overview, axes: Axes | None = None, *, names: Sequence[str] | None = None, unit: TimeUnit = "s"
+) -> Axes:
     """Draw the camera's blur of one output, exposure by exposure, and the positions of the spot.
 
     Parameters
@@ -36,8 +35,6 @@ def plot_blur(
     names:
         Names whose paths are drawn: ``truth`` or estimators; by default the truth and the estimator with the highest
         rank.
-    bar:
-        Whether a colour bar explains the grey.
 
     Raises
     ------
@@ -54,8 +51,7 @@ def plot_blur(
         np.ravel(view.spans) * scale, line.edges, blur, cmap="Greys", vmin=0, vmax=1.2 * max(top, 1e-12),
         rasterized=True,
     )  # fmt: skip
-    if bar:
-        colour_bar(grey, axes, "intensity (1 / slope unit)")
+    colour_bar(grey, axes, "intensity (1 / slope unit)")
     chosen = ["truth", *view.names[-1:]] if names is None else names
     for name in [each for each in chosen if each in view.paths]:
         _draw_paths(axes, view, name, scale)

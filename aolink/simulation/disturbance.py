@@ -11,7 +11,7 @@ from aolink.errors import RigError
 from aolink.limits import load_table
 from aolink.numerics.arrays import FloatArray
 from aolink.optics.turbulence import FrozenFlow
-from aolink.optics.wavefront import zernike_modes
+from aolink.optics.wavefront import lenslet_zernike_slopes
 from aolink.rig import Rig
 
 # Steps are made in blocks that begin at multiples of this, so that no bit depends on which steps are asked for.
@@ -26,7 +26,7 @@ class DisturbancePlayer:
     def __init__(self, rig: Rig, rng: np.random.Generator) -> None:
         assert rig.disturbance is not None
         disturbance = rig.disturbance
-        self._step_s, self._n_outputs = rig.timing.fast_step_s, rig.n_outputs
+        self._step_s = rig.timing.fast_step_s
         self._still = np.zeros(rig.n_outputs)
         directions = np.tile(np.eye(2), (-(-rig.n_outputs // 2), 1))[: rig.n_outputs]
         self._lines = [
@@ -37,8 +37,8 @@ class DisturbancePlayer:
         optics = rig.optics
         if optics is not None and len(disturbance.zernike_m):
             indices, metres = disturbance.zernike_m.T
-            modes = zernike_modes(optics.lenslets, int(indices.max()))
-            some = modes.slopes[optics.lit][..., indices.astype(int) - 2] @ metres
+            modes = lenslet_zernike_slopes(optics.lenslets, int(indices.max()))
+            some = modes[optics.lit][..., indices.astype(int) - 2] @ metres
             self._still = some.reshape(-1) / optics.slope_unit_rad
         if optics is not None:
             lenslets = optics.seen(disturbance.pupil_m) if disturbance.layers else optics.lenslets

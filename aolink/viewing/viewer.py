@@ -44,10 +44,8 @@ _LEAST_COLOURS = 50
 """A picture with fewer is blank: an empty viewer has about a dozen."""
 
 
-def screenshot(
-    rrd_path: str | Path, png_path: str | Path, *, step: int | None = None, size: tuple[int, int] = PICTURE_SIZE
-) -> Path:
-    """Take a picture of the viewer with a file in it; no display is needed.
+def screenshot(rrd_path: str | Path, png_path: str | Path, *, size: tuple[int, int] = PICTURE_SIZE) -> Path:
+    """Take a picture of the viewer with a file in it, at a time well inside the session; no display is needed.
 
     Parameters
     ----------
@@ -55,9 +53,6 @@ def screenshot(
         A file of `save_rrd`.
     png_path:
         The picture to write; an older one is replaced.
-    step:
-        Fast step on which the time cursor stands, and which the axes then count; by default a time well inside the
-        session.
     size:
         Width and height, pixels.
 
@@ -70,7 +65,7 @@ def screenshot(
     """
     png_path = Path(png_path)
     check_target(png_path, overwrite=True, suffix=".png", error=ViewerError)
-    with headless_viewer(rrd_path, step=step, size=size) as client:
+    with headless_viewer(rrd_path, size) as client:
         picture = settled_picture(client)
     # Headless too, the viewer keeps the place of its title bar free.
     inside = picture[:, _CORNER:-_CORNER]
@@ -81,10 +76,8 @@ def screenshot(
 
 
 @contextmanager
-def headless_viewer(
-    rrd_path: str | Path, *, step: int | None = None, size: tuple[int, int] = PICTURE_SIZE
-) -> Iterator[ViewerClient]:
-    """A viewer without a window that has a file open and stands at a fast step; it ends with the block.
+def headless_viewer(rrd_path: str | Path, size: tuple[int, int] = PICTURE_SIZE) -> Iterator[ViewerClient]:
+    """A viewer without a window that has a file open at a time well inside the session; it ends with the block.
 
     Raises
     ------
@@ -102,10 +95,10 @@ def headless_viewer(
             client.open(str(path))
             timeline, inside = _inside_once_loaded(client)
             client.run_command("ui.toggle_top_panel")
-            if step is None and timeline == TIME:
+            if timeline == TIME:
                 client.set_time(TIME, duration=np.timedelta64(inside, "ns"), play_state="paused")
             else:
-                client.set_time(FAST_STEP, sequence=inside if step is None else step, play_state="paused")
+                client.set_time(FAST_STEP, sequence=inside, play_state="paused")
             yield client
         except (RuntimeError, OSError, ViewerError) as error:
             # A viewer that cannot draw answers at first and ends with its first frame, during any of these calls;
@@ -117,8 +110,8 @@ def headless_viewer(
             raise ViewerError(f"the viewer cannot show {path}: {_one_line(error)}") from None
 
 
-def settled_picture(client: ViewerClient, view_id: str | None = None) -> NDArray[np.uint8]:
-    """Picture of the whole viewer, or of one view, once it has stopped changing, (rows, columns, 3).
+def settled_picture(client: ViewerClient) -> NDArray[np.uint8]:
+    """Picture of the whole viewer, once it has stopped changing, (rows, columns, 3).
 
     Raises `ViewerError` if it is blank.
     """
@@ -128,7 +121,7 @@ def settled_picture(client: ViewerClient, view_id: str | None = None) -> NDArray
         if time.monotonic() > deadline:
             raise ViewerError(f"the viewer's picture did not come to rest within {_SETTLE_S:g} s")
         try:
-            picture = client.take_screenshot(view_id)
+            picture = client.take_screenshot()
         except TimeoutError:  # a busy machine draws slowly
             continue
         except (RuntimeError, OSError) as error:

@@ -151,7 +151,7 @@ def test_what_would_fill_the_memory_is_refused_before_it_is_read(tmp_path: Path)
     rig = load_rig("sh-30x30")
     with large.open("wb") as file:
         writer = Writer(file)
-        writer._writer.add_attachment(0, 0, "rig.toml", "application/toml", rig.toml.encode())
+        writer.add_attachment(0, 0, "rig.toml", "application/toml", rig.toml.encode())
         image = RawImage(width=1, height=1, encoding="mono16", step=2, data=bytes(2))
         for number in range(1, 20_001):
             writer.write_message("/camera/exposure", ExposureInfo(frame_id=number), number, number)

@@ -37,7 +37,7 @@ def write_small(
     levels = {"nothing": 0, "black": sensor.black_level, "below black": sensor.black_level / 2, "full": 65535}
     with path.open("wb") as file:
         writer = Writer(file)
-        writer._writer.add_attachment(0, 0, "rig.toml", "application/toml", known.toml.encode())
+        writer.add_attachment(0, 0, "rig.toml", "application/toml", known.toml.encode())
         sequence = 0
         for number, made in enumerate(simulate(known, exposures, 1)):
             now, first = 1_700_000_000_000_000_000 + number * 200_000_000, number * steps

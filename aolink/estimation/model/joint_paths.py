@@ -68,8 +68,7 @@ class JointPaths:
         self.course_of = course_of
         self._functions = model.functions[:, :used]
         self.resolution = self._resolution(variance, sensor)
-        self._quadrature = self.resolution.levels[0]
-        self.functions, self.weights = self._at(self._quadrature)
+        self.functions, self.weights = self._at(self.resolution.levels[0])
         """The courses at the nodes, (nodes, m), and each node's share of the exposure, (nodes,)."""
         self.inputs = np.zeros((model.plant.n_outputs, len(self.weights)))
         """The response to the inputs, (n_outputs, nodes)."""
@@ -108,9 +107,9 @@ class JointPaths:
         """
         paths, path = copy(self), response.path[axis]
         expected = self.shares(mean) @ self._functions.T + path
-        paths._quadrature = self.resolution.levels[int(self.resolution.of(expected[None])[0])]
-        paths.functions, paths.weights = self._at(paths._quadrature)
-        paths.inputs = paths._quadrature.at(path)
+        q = self.resolution.levels[int(self.resolution.of(expected[None])[0])]
+        paths.functions, paths.weights = self._at(q)
+        paths.inputs = q.at(path)
         if self.model.moved:
             late = [path[:, 0], self.model.last_response(response.end)[axis]]
             paths.inputs = np.concatenate([paths.inputs, np.stack(late, axis=1)], axis=1)

@@ -42,9 +42,8 @@ class WindowedSpots(Windowed[SpotWindows]):
     spots:
         Number of spots of one copy; its outputs are spot 0's x and y, spot 1's x and y, ...
     orders:
-        Which functions of the basis, along x and along y; 0 is the light in the window.
-    crosses:
-        Whether the product of both directions' first functions belongs to the sums, y_11.
+        Which functions of the basis, along x and along y; 0 is the light in the window. The product of both directions'
+        first functions belongs to the sums as well, y_11.
     basis, flux:
         As in `Windowed`.
     """
@@ -52,13 +51,13 @@ class WindowedSpots(Windowed[SpotWindows]):
     most_nodes = _MOST_NODES
 
     def __init__(
-        self, sensor: SpotSensor, spots: int, orders: Sequence[int] = (0, 1, 2, 3), *, crosses: bool = True,
-        basis: Basis = "monomial", flux: Flux = "known",
+        self, sensor: SpotSensor, spots: int, orders: Sequence[int] = (0, 1, 2, 3), *, basis: Basis = "monomial",
+        flux: Flux = "known",
     ) -> None:  # fmt: skip
         self.sensor, self.spots = sensor, spots
         beyond = [p for p in orders if p]
         light = [(0, 0)] if flux == "measured" or 0 in orders else []
-        self.orders = [*light, *((p, 0) for p in beyond), *((0, p) for p in beyond), *([(1, 1)] if crosses else [])]
+        self.orders = [*light, *((p, 0) for p in beyond), *((0, p) for p in beyond), (1, 1)]
         each = len(self.orders)
         lights = [k * each for k in range(spots)]
         self.needs = Needs(what="windows", least_usable=HALF)

@@ -123,9 +123,7 @@ class Mode:
     at: Linearised
 
 
-def find_mode(
-    view: JointPixels, mean: FloatArray, precision: FloatArray, start: FloatArray, passes: int = _PASSES
-) -> Mode:
+def find_mode(view: JointPixels, mean: FloatArray, precision: FloatArray, start: FloatArray) -> Mode:
     """The mode that a start leads to, for a prior with this mean and precision, by Levenberg and Marquardt's method."""
     paths = view.paths
 
@@ -139,7 +137,7 @@ def find_mode(
         return Points(np.array([objective]), (paths.score(near.score) - pull)[None], H[None], kept)
 
     # The expected gain of a step shows when the search is at a mode, before the pixels are linearised again.
-    (t,), found = minimise(at, start[None], passes - 1, CONVERGED, foreseen=CONVERGED, solve=_solve)
+    (t,), found = minimise(at, start[None], _PASSES - 1, CONVERGED, foreseen=CONVERGED, solve=_solve)
     assert found.linearised is not None
     return Mode(t, found.hessian[0], float(found.objective[0]), found.linearised[0])
 
