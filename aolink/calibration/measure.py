@@ -391,8 +391,8 @@ def _photoelectrons(rig: Rig, gain: Measured | None, scale: Measured, notes: lis
         electrons = scale.value / (gain.value * width)
         return Measured(electrons, electrons * math.hypot(gain.sd / gain.value, scale.sd / scale.value))
     least = scale.value / ((max(gain.value, 0.0) + _SEEN * gain.sd) * width)
-    told = rig.sensor.photoelectrons
-    contradicted = 0 < told < least
+    stated = rig.sensor.photoelectrons
+    contradicted = 0 < stated < least
     notes.append(
         f"no shot noise is measurable, so there are more than {least:.3g} photo-electrons; photoelectrons"
         + (" becomes 0 (shot noise negligible)" if contradicted else " stays as the file has it")

@@ -196,9 +196,9 @@ class TcpStream:
             guest.introduction += data or b""
             begun = begins_with_identify(guest.introduction, self.signing)
             if isinstance(begun, str):
-                told = encode_message(refusal_event(begun), 0, self.signing)
+                message = encode_message(refusal_event(begun), 0, self.signing)
                 with contextlib.suppress(OSError):
-                    guest.connection.send(told)
+                    guest.connection.send(message)
                 guest.introduction, begun = b"", None
             if begun is None and data is not None and time.monotonic() - guest.since_s < self.introduction_s:
                 self._guests.append(guest)
