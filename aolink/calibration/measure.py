@@ -362,7 +362,7 @@ def _result(
     sigma = Measured(spot.sigma, spot.sigma_sd) if spot else None
     if sigma and sigma.sd > _VAGUE * sigma.value:
         notes.append(
-            "the spot is too narrow for the pixels to tell its width, kernel.sigma stays as the file has it:"
+            "the spot is too narrow for the pixels to show its width, kernel.sigma stays as the file has it:"
             " record still spots elsewhere, on the border of two pixels"
         )
         sigma = None

@@ -40,7 +40,7 @@ class PacedMirror:
         self._next = 0
         """The next step to play."""
         self._now = self._park
-        """What the device holds."""
+        """The input that the device holds."""
         self._held: list[tuple[NDArray[np.float64], bool]] = []
         """Inputs of the steps that were not reported yet, and whether they were late."""
         self._reported = 0

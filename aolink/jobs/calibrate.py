@@ -133,7 +133,7 @@ def record_frames(
     for name, _, _ in _ASKED:
         check_target(folder / f"{name}.mcap", overwrite=overwrite)
     with open_devices(rig, camera, mirror):
-        pass  # nobody is asked to do anything for devices that are not there
+        pass  # the user is asked for no light before the devices have answered
     paths: list[Path] = []
     skipped = ""
     for name, kind, what in _ASKED:

@@ -183,7 +183,7 @@ class FactoredModel(ExposureModel):
         return np.concatenate([self.transition, unmodelled, self.noise.ends], axis=1)
 
     def columns(self, count: int) -> list[Indices]:
-        """Which of the first ``count`` coefficients have each of the distinct courses."""
+        """The numbers of those of the first ``count`` coefficients that have each of the distinct courses."""
         return [np.flatnonzero(self.course_of[:count] == c) for c in range(self.functions.shape[1])]
 
     def responses(self, inputs: FloatArray) -> InputResponse:
