@@ -127,8 +127,9 @@ class FrameReassembly:
 
 
 class PlanesReassembly:
-    """Assembles the frames of all the pictures of an exposure from their chunks; each plane counts its own losses. A
-    camera sends one plane after the other, so a chunk of one plane ends the frame of the other.
+    """Assembles the frames of all the pictures of an exposure from their chunks; each plane counts its own losses.
+
+    A camera sends one plane after the other, so a chunk of one plane ends the frame of the other.
 
     Parameters
     ----------

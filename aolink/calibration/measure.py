@@ -1,6 +1,7 @@
-"""Calibration of a camera from its own frames: black level, noise, gain, scale, image kernel, standard deviations. It
-takes counts and gives a `Calibration`. Dark frames give the black level and the read noise. The photon transfer curve
-(a pixel's variance against its mean, EMVA 1288) of flats and of the resting spot gives the counts that one
+"""Calibration of a camera from its own frames: black level, noise, gain, scale, image kernel, standard deviations.
+
+It takes counts and gives a `Calibration`. Dark frames give the black level and the read noise. The photon transfer
+curve (a pixel's variance against its mean, EMVA 1288) of flats and of the resting spot gives the counts that one
 photo-electron makes. The mean profile of the resting spot gives the counts of a density of one and the kernel's width.
 Values for which the camera was not shown the light stay unknown, and `Calibration.notes` says so.
 """

@@ -189,9 +189,10 @@ class Mirror(Device, Protocol):
         """
 
     def withdraw(self, step: int) -> int:
-        """Stop sending blocks again that have steps from ``step`` on: they are about to be replaced. Gives the first
-        step from which inputs must be sent anew, because a block that begins there may not have come; ``step`` where
-        all have.
+        """Stop sending blocks again that have steps from ``step`` on: they are about to be replaced.
+
+        Gives the first step from which inputs must be sent anew, because a block that begins there may not have come;
+        ``step`` where all have.
         """
 
     def next_due_ns(self) -> int | None:

@@ -126,8 +126,9 @@ class PacedMirror:
 
     def _wait_for_step(self) -> int | None:
         """Wait for the step that follows the last one played, and give the present step; None when the mirror is
-        closed. Steps that have passed meanwhile held the device's input; they are late where an input was queued for
-        them.
+        closed.
+
+        Steps that have passed meanwhile held the device's input; they are late where an input was queued for them.
         """
         while not self._closed:
             step = self.time_ns() // self._step_ns

@@ -226,6 +226,7 @@ class TcpStream:
 
 def begins_with_identify(data: bytes, signing: Signing | None = None) -> bool | str | None:
     """Whether bytes begin with a whole Identify packet, or with a zero byte and one; None while this cannot be known.
+
     Where they do, but the packet is not signed correctly, the result is a text with the reason.
     """
     piece, end, _ = data.removeprefix(DELIMITER).partition(DELIMITER)

@@ -74,7 +74,9 @@ class SampleClock:
     @property
     def sigma_ns(self) -> float:
         """Standard deviation of the reported time, ns: that of the interval which the counts leave, and the distance of
-        the reported time from it. The line's asymmetry, at most half a round trip, does not show in the counts.
+        the reported time from it.
+
+        The line's asymmetry, at most half a round trip, does not show in the counts.
         """
         assert self._zero is not None, "add a count first"
         earliest, latest = self._zero
