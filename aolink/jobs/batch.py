@@ -179,7 +179,8 @@ def jobs(
     Raises
     ------
     RigError
-        Two jobs would write the same file. RecordingError
+        Two jobs would write the same file.
+    RecordingError
         An output would take the place of a recording that is read, or, without ``overwrite``, of a file that no
         job has written.
     """
