@@ -127,8 +127,9 @@ class FrameReassembly:
 
 
 class PlanesReassembly:
-    """Assembles the frames of all the pictures of an exposure from their chunks; each plane counts its own losses. A
-    camera sends one plane after the other, so a chunk of one plane ends the frame of the other.
+    """Assembles the frames of all the pictures of an exposure from their chunks; each plane counts its own losses.
+
+    A camera sends one plane after the other, so a chunk of one plane ends the frame of the other.
 
     Parameters
     ----------
@@ -259,17 +260,17 @@ class InputHistory:
             self._commanded = _after(end, self._commanded)
             self._last = rows[-1]
             return rows, 0
-        rows, told, reported = np.empty((n, self._n_inputs)), np.zeros(n, dtype=bool), np.zeros(n, dtype=bool)
-        for blocks, known in ((self._commanded, told), (self._applied, reported)):
+        rows, commanded, reported = np.empty((n, self._n_inputs)), np.zeros(n, dtype=bool), np.zeros(n, dtype=bool)
+        for blocks, known in ((self._commanded, commanded), (self._applied, reported)):
             for start, u in blocks:
                 some = slice(max(start - first, 0), max(start + len(u) - first, 0))
                 rows[some] = u[max(first - start, 0) :][: len(rows[some])]
                 known[some] = True
             blocks[:] = _after(end, blocks)
-        only_told = told & ~reported
-        if only_told.any():
-            rows[only_told] = self._quantise(rows[only_told])
-        for k in np.flatnonzero(~(told | reported)):
+        only_commanded = commanded & ~reported
+        if only_commanded.any():
+            rows[only_commanded] = self._quantise(rows[only_commanded])
+        for k in np.flatnonzero(~(commanded | reported)):
             rows[k] = rows[k - 1] if k else self._last
         if n:
             self._last = rows[-1].copy()

@@ -20,8 +20,9 @@ from aolink.rig import Rig
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Truth:
-    """The true states and path of one exposure, from a simulated rig or the single frames of a film. No estimator reads
-    it. Unknown states are NaN.
+    """The true states and path of one exposure, from a simulated rig or the single frames of a film.
+
+    No estimator reads it. Unknown states are NaN.
     """
 
     start_state: NDArray[np.float64]
@@ -68,9 +69,11 @@ class Exposure:
     exposure go back to the mirror's first command, before which it was at rest.
     """
     start_offset: float = 0.0
-    """The part f of its first fast step that passes before the exposure starts, 0 <= f < 1. It ends equally far into
-    the step after its last: it covers 1 - f of its first step and f of the one after its last. States and path are
-    still those of whole fast steps: the start state at ``first_step``, the end state ``n_steps`` later.
+    """The part f of its first fast step that passes before the exposure starts, 0 <= f < 1.
+
+    It ends equally far into the step after its last: it covers 1 - f of its first step and f of the one after its last.
+    States and path are still those of whole fast steps: the start state at ``first_step``, the end state ``n_steps``
+    later.
     """
     inputs_assumed: int = 0
     """Number of steps of ``inputs`` and ``lead_inputs`` for which the mirror's report is missing.

@@ -164,7 +164,9 @@ def load_table(path: Path) -> NDArray[np.float64]:
     Raises
     ------
     RigError
-        The file is above the limit of unpacked bytes. ValueError The file holds something else.
+        The file is above the limit of unpacked bytes.
+    ValueError
+        The file holds something else.
     OSError
         The file cannot be read.
     """

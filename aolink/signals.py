@@ -25,8 +25,9 @@ _AGAIN_S = 0.02
 
 
 class Interrupted(BaseException):
-    """A signal ends the command: all that is open is closed or removed on the way to `ending_the_command`. It is
-    neither an Exception nor a KeyboardInterrupt, so that no library handles it.
+    """A signal ends the command: all that is open is closed or removed on the way to `ending_the_command`.
+
+    It is neither an Exception nor a KeyboardInterrupt, so that no library handles it.
     """
 
     def __init__(self, number: int, what_stays: str = "") -> None:

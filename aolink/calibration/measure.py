@@ -1,6 +1,7 @@
-"""Calibration of a camera from its own frames: black level, noise, gain, scale, image kernel, standard deviations. It
-takes counts and gives a `Calibration`. Dark frames give the black level and the read noise. The photon transfer curve
-(a pixel's variance against its mean, EMVA 1288) of flats and of the resting spot gives the counts that one
+"""Calibration of a camera from its own frames: black level, noise, gain, scale, image kernel, standard deviations.
+
+It takes counts and gives a `Calibration`. Dark frames give the black level and the read noise. The photon transfer
+curve (a pixel's variance against its mean, EMVA 1288) of flats and of the resting spot gives the counts that one
 photo-electron makes. The mean profile of the resting spot gives the counts of a density of one and the kernel's width.
 Values for which the camera was not shown the light stay unknown, and `Calibration.notes` says so.
 """
@@ -362,7 +363,7 @@ def _result(
     sigma = Measured(spot.sigma, spot.sigma_sd) if spot else None
     if sigma and sigma.sd > _VAGUE * sigma.value:
         notes.append(
-            "the spot is too narrow for the pixels to tell its width, kernel.sigma stays as the file has it:"
+            "the spot is too narrow for the pixels to show its width, kernel.sigma stays as the file has it:"
             " record still spots elsewhere, on the border of two pixels"
         )
         sigma = None
@@ -391,8 +392,8 @@ def _photoelectrons(rig: Rig, gain: Measured | None, scale: Measured, notes: lis
         electrons = scale.value / (gain.value * width)
         return Measured(electrons, electrons * math.hypot(gain.sd / gain.value, scale.sd / scale.value))
     least = scale.value / ((max(gain.value, 0.0) + _SEEN * gain.sd) * width)
-    told = rig.sensor.photoelectrons
-    contradicted = 0 < told < least
+    stated = rig.sensor.photoelectrons
+    contradicted = 0 < stated < least
     notes.append(
         f"no shot noise is measurable, so there are more than {least:.3g} photo-electrons; photoelectrons"
         + (" becomes 0 (shot noise negligible)" if contradicted else " stays as the file has it")

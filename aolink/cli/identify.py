@@ -104,10 +104,10 @@ def identify(
     recordings = [open_recording(place) for place in places]
     with progress("identify", None) as tell:
 
-        def told(what: str, done: int, of: int) -> None:
+        def on_progress(what: str, done: int, of: int) -> None:
             tell(done, f"{what}: {done} of {of}")
 
-        result = job.identify(recordings, load_rig(rig) if rig else None, wanted, told)
+        result = job.identify(recordings, load_rig(rig) if rig else None, wanted, on_progress)
     with writing(output, overwrite=overwrite, sources=sources, error=IdentificationError) as partial:
         partial.write_text(result.text, newline="")
     if as_json:
@@ -136,10 +136,10 @@ def _follow(
     recording = GrowingRecording(place, lambda: time.sleep(_LOOK_S), rig=rig)
     with progress("follow", None) as tell:
 
-        def told(what: str, done: int, of: int) -> None:
+        def on_progress(what: str, done: int, of: int) -> None:
             tell(following.exposures, f"{what}: {done} of {of}")
 
-        following = Following(recording.rig, wanted, output, told)
+        following = Following(recording.rig, wanted, output, on_progress)
         for exposure in recording.exposures():
             for each in following.see(exposure):
                 if isinstance(each, Offer):

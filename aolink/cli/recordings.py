@@ -193,9 +193,9 @@ def _estimate_many(
             if scheduler:
                 from aolink.jobs.cluster import run_on
 
-                done = _told(run_on(scheduler, todo, stop=stop, progress=tell))
+                done = _printed(run_on(scheduler, todo, stop=stop, progress=tell))
             else:
-                done = _told(batch.run(todo, workers, stop=stop, progress=tell))
+                done = _printed(batch.run(todo, workers, stop=stop, progress=tell))
         rows = batch.table_rows(done, None if side else folder)
         fill_table(partial, rows, table.suffix)
         if side and table.suffix == ".parquet":
@@ -221,7 +221,7 @@ def _estimate_many(
 _MOST_ROWS_SHOWN = 40
 
 
-def _told(each_done: "Iterable[Done]") -> "list[Done]":
+def _printed(each_done: "Iterable[Done]") -> "list[Done]":
     """The results of jobs; errors and warnings are printed as they come."""
     done = []
     for each in each_done:

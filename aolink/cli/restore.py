@@ -21,7 +21,7 @@ class _NamingMethods(TyperCommand):
         from aolink.restoration import METHODS, find_method
         from aolink.restoration.registry import DEFAULT_METHOD
 
-        def told(name: str) -> str:
+        def described(name: str) -> str:
             try:
                 return f"{name} ({find_method(name).summary})"
             except RestorationError as error:
@@ -29,7 +29,7 @@ class _NamingMethods(TyperCommand):
 
         for each in self.params:
             if isinstance(each, TyperOption) and each.name == "method":
-                each.help, each.default = f"{'; '.join(map(told, METHODS))}.", DEFAULT_METHOD
+                each.help, each.default = f"{'; '.join(map(described, METHODS))}.", DEFAULT_METHOD
         super().format_help(*arguments, **named)
 
 
@@ -127,8 +127,8 @@ def _deblur_picture(
     write_picture(out, made, overwrite=overwrite, sources=[image, psf])
     if as_json:
         found = None if math.isnan(restored.noise_sd) else restored.noise_sd
-        told = {"method": method, "noise_sd": found, "direction": restored.direction, "pixels_filled": missing}
-        print(json.dumps({"out": str(out), **told}))
+        facts = {"method": method, "noise_sd": found, "direction": restored.direction, "pixels_filled": missing}
+        print(json.dumps({"out": str(out), **facts}))
     else:
         noise = "" if math.isnan(restored.noise_sd) else f", noise sd {restored.noise_sd:.3g}"
         scanned = f", scanned {restored.direction}s" if "direction" in find_method(method).parameters else ""

@@ -173,7 +173,7 @@ def record(
         return
     report = session.Report()
 
-    def told(done: int) -> None:
+    def on_progress(done: int) -> None:
         skipped = report.exposures_skipped.items()
         notes = ["skipped: " + ", ".join(f"{name} {n}" for name, n in skipped)] if skipped else []
         tell(done, "; ".join([*notes, *([report.control.note] if report.control else [])]))
@@ -184,7 +184,7 @@ def record(
                 loaded, camera, mirror, output, estimators=estimator or [], exposures=exposures or 0, note=note,
                 calibration=calibration or "", inputs=played, control=control or "", force=force,
                 watch=live.show if live else None, overwrite=overwrite,
-                options=options, reconnect_s=reconnect, stop=stop, progress=told, report=report,
+                options=options, reconnect_s=reconnect, stop=stop, progress=on_progress, report=report,
             )  # fmt: skip
         _print_session(report, output, as_json)
     stop.raise_if_asked()

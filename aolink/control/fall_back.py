@@ -185,6 +185,7 @@ class FallBack:
 
     def see(self, exposure: Exposure, slopes: FloatArray, estimate: Estimate | None, fit: Fit | None) -> Change | None:
         """Take the next exposure with its centroids, (n_outputs,); gives a `Change` where another controller is to act.
+
         ``fit`` says how well the asked-for controller's model fits, as far as that is known.
         """
         held = np.concatenate([exposure.lead_inputs, exposure.inputs])
@@ -284,7 +285,9 @@ def _share(judged: FloatArray, blur: FloatArray, sigmas: float) -> float:
 
 def _difference(judged: FloatArray, share: float) -> tuple[float, float]:
     """Mean square of the slopes that a rival would have left less that of the real ones, and its standard error, for b
-    = ``share``. ``judged`` are the rows of `_Judged`.
+    = ``share``.
+
+    ``judged`` are the rows of `_Judged`.
     """
     means, within = judged.T
     return _mean_and_error(means + (1 - 2 * share) * within)

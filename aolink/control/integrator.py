@@ -12,8 +12,9 @@ from aolink.rig import Rig
 
 class Integrator:
     """The controller u = u_0 + (1 - leak) (u_held - u_0) - gain R y, once an exposure. y are the centroids, R the
-    pseudo-inverse of the plant's response at rest (modal: weak mirror modes are left out), u_0 the safe input. It
-    starts from the input that the mirror really holds, so that it does not wind up at the limits.
+    pseudo-inverse of the plant's response at rest (modal: weak mirror modes are left out), u_0 the safe input.
+
+    It starts from the input that the mirror really holds, so that it does not wind up at the limits.
     """
 
     def __init__(self, rig: Rig) -> None:

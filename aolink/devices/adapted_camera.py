@@ -189,7 +189,7 @@ class AdaptedCamera(Adapted):
         return [frame, truth_message(frame_id, raw.truth)]
 
     def _place(self, since_zero_ns: int, sigma_ns: float) -> tuple[int, int]:
-        """Where an exposure starts, in parts of a fast step, and how many steps it has.
+        """The start of an exposure, in parts of a fast step, and its number of steps.
 
         The start is rounded, so that a camera in step with the mirror is not now before a step, now after it. Exposures
         do not overlap: one that seems to, by the clocks' uncertainty and half a step at most, begins with the end of

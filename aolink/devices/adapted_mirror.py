@@ -189,8 +189,8 @@ class AdaptedMirror(Adapted):
             return 0, pb.Applied.PARKED
         if late:
             return block_id, pb.Applied.LATE
-        as_told = bool((np.abs(held - commanded) <= self._margin).all())
-        return block_id, pb.Applied.COMMAND if as_told else pb.Applied.CLIPPED
+        as_commanded = bool((np.abs(held - commanded) <= self._margin).all())
+        return block_id, pb.Applied.COMMAND if as_commanded else pb.Applied.CLIPPED
 
     def _give_up(self, end: int) -> list[Event]:
         """Report the steps before ``end`` that were not reported as ``NOT_REPORTED``."""

@@ -67,7 +67,7 @@ class ClockStep:
     before_ns: int
     """Host time of the first query that agreed with the new one."""
     size_ns: int
-    """By how much the device's clock was set forward."""
+    """Step by which the device's clock was set forward, ns."""
 
 
 class ClockRegression:

@@ -61,11 +61,12 @@ class Returned:
 
 
 Event = Frame | pb.Truth | pb.Applied | pb.Event | ClockSampled | CommandAnswered | Vanished | Returned
-"""What a device may report. Texts in it can be printed."""
+"""The events that a device may report. Texts in them can be printed."""
 
 
 class Lacks(StrEnum):
-    """What a device cannot do. A driver lists it as ``lacks``; `aolink devices` shows it, and a recording keeps it."""
+    """Abilities that a device lacks. A driver lists them as ``lacks``; `aolink devices` shows them, and a recording
+    keeps them."""
 
     TIME = "reports no time: the arrival times of its frames are used"
     COUNT = "does not count its frames: lost ones show by their time only"
@@ -94,7 +95,7 @@ class Device(Protocol):
 
     @property
     def lacks(self) -> Sequence[Lacks]:
-        """What the device cannot do, for the recording."""
+        """The abilities that the device lacks, for the recording."""
 
     def query_clock(self, now_ns: int) -> None:
         """Ask the device for its time; the answer is an event."""
@@ -188,9 +189,10 @@ class Mirror(Device, Protocol):
         """
 
     def withdraw(self, step: int) -> int:
-        """Stop sending blocks again that have steps from ``step`` on: they are about to be replaced. Gives the first
-        step from which inputs must be sent anew, because a block that begins there may not have come; ``step`` where
-        all have.
+        """Stop sending blocks again that have steps from ``step`` on: they are about to be replaced.
+
+        Gives the first step from which inputs must be sent anew, because a block that begins there may not have come;
+        ``step`` where all have.
         """
 
     def next_due_ns(self) -> int | None:

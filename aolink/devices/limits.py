@@ -61,8 +61,9 @@ class CommandLimits:
         self._sent.append((first_step, u))
 
     def take(self, first_step: int, u: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Check inputs and take them as sent, as `check` does; gives the inputs to send. These are ``u``; or, after
-        `parked` and `go_on_from`, inputs as near to ``u`` as the limit of the change allows.
+        """Check inputs and take them as sent, as `check` does; gives the inputs to send.
+
+        These are ``u``; or, after `parked` and `go_on_from`, inputs as near to ``u`` as the limit of the change allows.
         """
         wanted = u
         if self._slew and first_step <= self._joined:

@@ -43,7 +43,7 @@ class NoMirror:
         self.clock.add(ClockExchange(now, now, now, now))
         self._rig, self._now_ns = rig, now_ns
         self._since_zero_ns = since_zero_ns or (lambda host_ns: host_ns - now)
-        self._told: int | None = None
+        self._reported: int | None = None
 
     @property
     def last_sent_ns(self) -> int:
@@ -66,7 +66,7 @@ class NoMirror:
 
     def start_step(self, now_ns: int) -> int:
         step = self.since_zero_ns(now_ns) // self._rig.timing.fast_step_ns
-        self._told = step if self._told is None else self._told
+        self._reported = step if self._reported is None else self._reported
         return step
 
     def send_block(self, first_step: int, u: NDArray[np.float64], cause_frame_id: int, now_ns: int) -> pb.CommandBlock:
@@ -88,7 +88,7 @@ class NoMirror:
         return self._passed(1)
 
     def park(self) -> int:
-        return 0 if self._told is None else self.since_zero_ns(self._now_ns()) // self._rig.timing.fast_step_ns
+        return 0 if self._reported is None else self.since_zero_ns(self._now_ns()) // self._rig.timing.fast_step_ns
 
     def rearm(self) -> int:
         raise DeviceError("there is no mirror to re-arm")
@@ -99,13 +99,13 @@ class NoMirror:
 
     def _passed(self, at_least: int) -> list[Event]:
         """The fast steps that have passed since the last call, if they are ``at_least`` this many."""
-        if self._told is None:  # nor is the camera's clock known
+        if self._reported is None:  # nor is the camera's clock known
             return []
         step_ns, park = self._rig.timing.fast_step_ns, self._rig.mirror.park
         end = self.since_zero_ns(self._now_ns()) // step_ns
-        if end - self._told < at_least:
+        if end - self._reported < at_least:
             return []
-        first, self._told = self._told, end
+        first, self._reported = self._reported, end
         return [
             pb.Applied(
                 first_step=k, n_steps=min(end - k, _MOST_STEPS), u=np.tile(park, min(end - k, _MOST_STEPS)),

@@ -7,8 +7,9 @@ import time
 
 
 class Outages:
-    """A thread that should run every ``period_ns`` measures by its own lateness how long this process did not run. It
-    is slightly late without an outage, too: a lateness below one period is not counted.
+    """A thread that should run every ``period_ns`` measures by its own lateness how long this process did not run.
+
+    It is slightly late without an outage, too: a lateness below one period is not counted.
     """
 
     def __init__(self, period_ns: int) -> None:

@@ -40,10 +40,10 @@ class PacedMirror:
         self._next = 0
         """The next step to play."""
         self._now = self._park
-        """What the device holds."""
+        """The input that the device holds."""
         self._held: list[tuple[NDArray[np.float64], bool]] = []
         """Inputs of the steps that were not reported yet, and whether they were late."""
-        self._told = 0
+        self._reported = 0
         """The first step of ``_held``. While the device takes an input, its step has been played, but is not in
         ``_held`` yet."""
         self._changed = threading.Condition()
@@ -80,7 +80,7 @@ class PacedMirror:
         with self._changed:
             self._raise_failure()
             held, self._held = self._held, []
-            first, self._told = self._told, self._told + len(held)
+            first, self._reported = self._reported, self._reported + len(held)
         if not held:
             return []
         return [Held(first, np.array([u for u, _ in held]), np.array([late for _, late in held]))]
@@ -94,7 +94,7 @@ class PacedMirror:
             with self._changed:
                 first = max(self._next, self.time_ns() // self._step_ns + 1)
                 # Until now the device held its input, also in the step whose input the thread waits to put out.
-                self._held += [(self._now, True)] * (first - self._told - len(self._held))
+                self._held += [(self._now, True)] * (first - self._reported - len(self._held))
                 self._next, self._now = first, self._park
                 return first
 
@@ -126,8 +126,9 @@ class PacedMirror:
 
     def _wait_for_step(self) -> int | None:
         """Wait for the step that follows the last one played, and give the present step; None when the mirror is
-        closed. Steps that have passed meanwhile held the device's input; they are late where an input was queued for
-        them.
+        closed.
+
+        Steps that have passed meanwhile held the device's input; they are late where an input was queued for them.
         """
         while not self._closed:
             step = self.time_ns() // self._step_ns
@@ -140,7 +141,7 @@ class PacedMirror:
     def _put(self, step: int, u: NDArray[np.float64]) -> None:
         with self._device:
             with self._changed:
-                if self._told + len(self._held) == self._next:  # it was parked meanwhile, which accounts for the step
+                if self._reported + len(self._held) == self._next:  # it was parked meanwhile, which covers the step
                     return
                 if self._parked:
                     self._held.append((self._now, True))

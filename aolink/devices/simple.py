@@ -116,8 +116,9 @@ class SimpleMirror(Protocol):
         order."""
 
     def park(self) -> int:
-        """Hold the safe input from now on and empty the queue; gives the first fast step with the safe input. It may be
-        called by another thread than the session's, but never at the same time as another method.
+        """Hold the safe input from now on and empty the queue; gives the first fast step with the safe input.
+
+        It may be called by another thread than the session's, but never at the same time as another method.
         """
 
     def close(self) -> None:
@@ -134,8 +135,9 @@ class DirectMirror(Protocol):
     description: str
 
     def put(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Hold ``u`` (n_inputs,) from now on; gives the input that the device took, rounded to its resolution. Raises
-        DeviceError where the device refuses it or does not answer.
+        """Hold ``u`` (n_inputs,) from now on; gives the input that the device took, rounded to its resolution.
+
+        Raises DeviceError where the device refuses it or does not answer.
         """
 
     def park(self) -> None:

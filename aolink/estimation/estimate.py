@@ -36,8 +36,9 @@ class Status(enum.IntEnum):
 
 @dataclass(frozen=True, eq=False)
 class AlignmentError:
-    """The change of an estimate by one standard deviation of the exposure's alignment with the mirror's steps. The
-    error comes from the clocks' comparison: neighbouring exposures, and all axes, have it in common.
+    """The change of an estimate by one standard deviation of the exposure's alignment with the mirror's steps.
+
+    The error comes from the clocks' comparison: neighbouring exposures, and all axes, have it in common.
     """
 
     steps: float

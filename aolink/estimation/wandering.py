@@ -203,8 +203,9 @@ def _evidence(posterior: Posterior) -> FloatArray:
 
 
 def _nearest_known(evidence: FloatArray) -> FloatArray:
-    """Evidence (axes, copies), replaced where it is not finite by that of the nearest copy with a finite one. A copy
-    with much noise, or a wide kernel, may see no spot where the others do; this is no evidence about its value.
+    """Evidence (axes, copies), replaced where it is not finite by that of the nearest copy with a finite one.
+
+    A copy with much noise, or a wide kernel, may see no spot where the others do; this is no evidence about its value.
     """
     known = np.isfinite(evidence)
     places = np.arange(evidence.shape[1])

@@ -43,9 +43,10 @@ def together(
 
 
 def clock_of(first: Exposure) -> str:
-    """The field of an exposure's time that a series uses, chosen by the first exposure; '' where there is none. It is
-    the start on the host's clock where that is known, otherwise the arrival of the frame, otherwise the start on the
-    device's clock.
+    """The field of an exposure's time that a series uses, chosen by the first exposure; '' where there is none.
+
+    It is the start on the host's clock where that is known, otherwise the arrival of the frame, otherwise the start on
+    the device's clock.
     """
     clocks = ("host_start_ns", "host_receive_ns", "device_start_ns")
     return next((name for name in clocks if getattr(first, name)), "")

@@ -15,9 +15,10 @@ from aolink.numerics.arrays import FloatArray
 
 
 def aot_film(path: Path) -> Film:
-    """The pictures of the first wavefront sensor that has them, with the commands of its loops. Where none has
-    pictures, the result is the slopes of the first sensor that has them. A command is held until the next one of its
-    loop: by the times of both, otherwise by the loop's rate, otherwise one for each frame.
+    """The pictures of the first wavefront sensor that has them, with the commands of its loops.
+
+    Where none has pictures, the result is the slopes of the first sensor that has them. A command is held until the
+    next one of its loop: by the times of both, otherwise by the loop's rate, otherwise one for each frame.
 
     Raises
     ------

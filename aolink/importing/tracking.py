@@ -136,8 +136,12 @@ def trackpy_locator(sd: float) -> Callable[[FloatArray], FloatArray] | None:
 
 
 def find_objects(film: Film, settings: Settings) -> Objects:
-    """The brightest objects of a film's first frames, as many as requested. Raises ------ ImportingError There are
-    fewer.
+    """The brightest objects of a film's first frames, as many as requested.
+
+    Raises
+    ------
+    ImportingError
+        There are fewer.
     """
     if settings.places and len(settings.places) != settings.track:
         raise ImportingError(f"{len(settings.places)} places are given for --track {settings.track}: give one for each")
@@ -199,8 +203,9 @@ class Survey:
     ground: FloatArray
     """Remaining background under each object, for one pixel, (n,)."""
     residual: FloatArray
-    """Residuals of sums over rows and over columns, as a share of the object's light, (samples,). Deviations from a
-    Gaussian are not independent from pixel to pixel, and estimators use such sums.
+    """Residuals of sums over rows and over columns, as a share of the object's light, (samples,).
+
+    Deviations from a Gaussian are not independent from pixel to pixel, and estimators use such sums.
     """
     model: FloatArray
     """The fits at the same places, as a share of the object's light, (samples,)."""
@@ -389,8 +394,9 @@ def _crowded(film: Film, known: Survey) -> Iterator[str]:
 
 
 def _blurs(picture: FloatArray, last: FloatArray, known: Survey, frames: int) -> FloatArray:
-    """Positions of the objects' blurs in an exposure, after they were at ``last`` (n, 2); NaN as there. They are
-    measured in the exposure alone: knowledge from the single frames must not show in its pixels.
+    """Positions of the objects' blurs in an exposure, after they were at ``last`` (n, 2); NaN as there.
+
+    They are measured in the exposure alone: knowledge from the single frames must not show in its pixels.
     """
     start = np.where(np.isfinite(last), last, 0.0)
     far = reach(known, frames)

@@ -179,7 +179,8 @@ def jobs(
     Raises
     ------
     RigError
-        Two jobs would write the same file. RecordingError
+        Two jobs would write the same file.
+    RecordingError
         An output would take the place of a recording that is read, or, without ``overwrite``, of a file that no
         job has written.
     """
@@ -238,8 +239,9 @@ def _check_all_differ(outputs: Iterable[Path]) -> None:
 
 
 def shard(sources: Sequence[str], part: str) -> list[str]:
-    """The recordings of one part of several, ``i/n`` with i from 1 to n: the same for any order of the recordings. The
-    parts' sizes differ by one recording at most, they have none in common, and together they are all recordings.
+    """The recordings of one part of several, ``i/n`` with i from 1 to n: the same for any order of the recordings.
+
+    The parts' sizes differ by one recording at most, they have none in common, and together they are all recordings.
 
     Raises
     ------

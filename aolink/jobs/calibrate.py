@@ -57,8 +57,9 @@ def calibrate_recordings(rig: Rig, text: str, paths: Sequence[Path]) -> Calibrat
     Raises
     ------
     RecordingError
-        A recording cannot be read. CalibrationError A recording is of another sensor, is not marked, or its frames are
-        not of the kind that it is marked with.
+        A recording cannot be read.
+    CalibrationError
+        A recording is of another sensor, is not marked, or its frames are not of the kind that it is marked with.
     """
     frames = [read_frames(path, rig) for path in paths]
     calibration = calibrate(rig, frames)
@@ -132,7 +133,7 @@ def record_frames(
     for name, _, _ in _ASKED:
         check_target(folder / f"{name}.mcap", overwrite=overwrite)
     with open_devices(rig, camera, mirror):
-        pass  # nobody is asked to do anything for devices that are not there
+        pass  # the user is asked for no light before the devices have answered
     paths: list[Path] = []
     skipped = ""
     for name, kind, what in _ASKED:
@@ -209,8 +210,9 @@ def record_pokes(
 
 
 def interaction(rig: Rig, path: Path, hold_s: float = 0.0) -> Poked:
-    """The interaction matrix of a recording with pokes, and that of the rig file's plant for the same inputs. Only
-    pokes that have rested for ``hold_s``, one frame period at least, are measured. Raises RecordingError and
+    """The interaction matrix of a recording with pokes, and that of the rig file's plant for the same inputs.
+
+    Only pokes that have rested for ``hold_s``, one frame period at least, are measured. Raises RecordingError and
     CalibrationError.
     """
     recording, rest = Recording(path), rest_exposures(rig, hold_s)

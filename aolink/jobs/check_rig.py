@@ -99,7 +99,7 @@ def check_devices(rig: Rig) -> Iterator[Finding]:
             lacks = "; ".join(lacks_of(driver)) or "nothing"
             yield _info(key, f"the driver {table.driver}; what its device lacks: {lacks}")
         elif table.delay is not None:
-            yield _error(key, f"the driver {NATIVE} tells its time: delay_s and delay_sd_s are for others")
+            yield _error(key, f"the driver {NATIVE} reports its time: delay_s and delay_sd_s are for others")
     if rig.devices and "mirror" not in rig.devices:
         yield _info("devices.mirror", "no mirror is named: without --mirror the camera is recorded alone")
 

@@ -51,7 +51,7 @@ class DemoResult:
     deblurred_recording: Path | None = None
     """The session's recording with the restored pictures."""
     differences: Mapping[str, str] = field(default_factory=dict)
-    """Where online and offline estimates differ, by estimator; empty if nowhere."""
+    """The first difference of online and offline estimates, by estimator; empty if there is none."""
     seconds: dict[str, float]
     """Wall time of each part."""
 

@@ -67,8 +67,9 @@ class Offer:
 
 
 def with_own_kinds(wanted: Wanted, rig: Rig) -> Wanted:
-    """If no model was asked for, take the kinds of the rig file's own model, if it has one of a single output. A choice
-    among nine takes minutes, while a session goes on; a process that drifts keeps its kind.
+    """If no model was asked for, take the kinds of the rig file's own model, if it has one of a single output.
+
+    A choice among nine takes minutes, while a session goes on; a process that drifts keeps its kind.
     """
     tables = tomllib.loads(rig.toml).get("disturbance", {}).get("model", [])
     kinds = [each["kind"] for each in tables]

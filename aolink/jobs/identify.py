@@ -88,7 +88,8 @@ def identify(recordings: Sequence[Recording], rig: Rig | None, wanted: Wanted, t
     ------
     IdentificationError
         The recordings are of several rigs, too short, without pixels, or without inputs to identify a plant from.
-        RecordingError A recording cannot be read.
+    RecordingError
+        A recording cannot be read.
     """
     for name in wanted.models:
         kinds_of(name)

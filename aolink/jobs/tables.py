@@ -51,8 +51,10 @@ def fill_table(partial: Path, rows: Sequence[Mapping[str, Any]], suffix: str) ->
 @contextmanager
 def rows_into(path: Path | None, job: str) -> Iterator[Callable[[Mapping[str, Any]], None]]:
     """A context that gives a function for the rows of a table of exposures, by `EXPOSURE_COLUMNS`; some thousands of
-    them are kept in memory. The table has its name, and the digest of its ``job`` in its metadata, when the block has
-    ended well. Without a path there is none. Raises AolinkError where it cannot be written or pyarrow is missing.
+    them are kept in memory.
+
+    The table has its name, and the digest of its ``job`` in its metadata, when the block has ended well. Without a path
+    there is none. Raises AolinkError where it cannot be written or pyarrow is missing.
     """
     if path is None:
         yield lambda row: None

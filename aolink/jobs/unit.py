@@ -204,8 +204,9 @@ def _digest(recording: Recording, settings: Settings) -> str:
 
 
 def _row_before(out: Path, digest: str, settings: Settings) -> dict[str, Any] | None:
-    """The row of a side file that is there already; None if it is to be made. Raises RecordingError where another file
-    has the name.
+    """The row of a side file that is there already; None if it is to be made.
+
+    Raises RecordingError where another file has the name.
     """
     if not out.exists():
         return None

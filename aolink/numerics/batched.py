@@ -63,7 +63,7 @@ def _sum_of_products(left: list[FloatArray], right: list[FloatArray]) -> FloatAr
         for a, b in zip(left[1:], right[1:], strict=True):
             out = out + a * b
         return out
-    # NumPy would put the small axes innermost where it cannot tell; long batches want the batch there.
+    # NumPy would put the small axes innermost where it cannot decide; long batches are faster with the batch there.
     order = (len(shape) - 1, *range(len(shape) - 1))
     out = np.empty((*shape[1:], shape[0])).transpose(order)
     product = np.empty((*shape[1:], shape[0])).transpose(order)

@@ -52,9 +52,10 @@ def thread_count() -> int:
 
 @contextmanager
 def processes(count: int) -> Iterator[ProcessPoolExecutor]:
-    """A pool of ``count`` processes, whose linear algebra has one thread. Ctrl-C goes to this process alone. Any
-    exception in the block ends the processes at once. They also end when this process does, even if it is killed; their
-    work is then given up in good order, so that nothing half written stays.
+    """A pool of ``count`` processes, whose linear algebra has one thread. Ctrl-C goes to this process alone.
+
+    Any exception in the block ends the processes at once. They also end when this process does, even if it is killed;
+    their work is then given up in good order, so that nothing half written stays.
     """
     environment = {name: os.environ.get(name) for name in THREAD_VARIABLES}
     os.environ.update(dict.fromkeys(THREAD_VARIABLES, "1"))

@@ -1,5 +1,6 @@
-"""The camera as an integer device: densities become counts and counts become densities. A pixel's size D is its length
-on a line sensor, and its area on a plane.
+"""The camera as an integer device: densities become counts and counts become densities.
+
+A pixel's size D is its length on a line sensor, and its area on a plane.
 """
 
 from __future__ import annotations

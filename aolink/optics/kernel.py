@@ -1,5 +1,6 @@
-"""The image kernel integrated over pixels, and averaged over an exposure. All integrals of a Gaussian up to an edge or
-over a pixel come from here; the compiled loops have a copy of their own.
+"""The image kernel integrated over pixels, and averaged over an exposure.
+
+All integrals of a Gaussian up to an edge or over a pixel come from here; the compiled loops have a copy of their own.
 """
 
 from __future__ import annotations

@@ -1,6 +1,8 @@
 """Synthesis of a camera's frames, pixel by pixel, with any kernel along any path, and with the faults of real
-detectors. `aolink.optics.frame` makes the frames of rigs, whose kernel is a Gaussian; this module has other kernels, to
-test estimators with light that their models do not describe.
+detectors.
+
+`aolink.optics.frame` makes the frames of rigs, whose kernel is a Gaussian; this module has other kernels, to test
+estimators with light that their models do not describe.
 """
 
 from __future__ import annotations

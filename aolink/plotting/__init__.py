@@ -1,6 +1,7 @@
-"""Figures of recordings with matplotlib, on given axes or figures or new ones; and a report of them. `overview` reads a
-series once; figures of the whole session are drawn from it, figures of one exposure from the series. `save_figure`
-writes one in a paper's size, `write_report` puts them on one page.
+"""Figures of recordings with matplotlib, on given axes or figures or new ones; and a report of them.
+
+`overview` reads a series once; figures of the whole session are drawn from it, figures of one exposure from the series.
+`save_figure` writes one in a paper's size, `write_report` puts them on one page.
 """
 
 from typing import TYPE_CHECKING

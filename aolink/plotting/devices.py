@@ -38,9 +38,10 @@ _LANES = {
 
 
 def incidents(view: Overview) -> dict[str, FloatArray]:
-    """Incidents by their kind, each with its fast steps, counted from the first exposure. The kinds are frames lost and
-    incomplete, exposures with inputs that the mirror did not report, estimates that were gated, diverged, began anew or
-    could not use their exposure, and those that the session had no time for.
+    """Incidents by their kind, each with its fast steps, counted from the first exposure.
+
+    The kinds are frames lost and incomplete, exposures with inputs that the mirror did not report, estimates that were
+    gated, diverged, began anew or could not use their exposure, and those that the session had no time for.
     """
     steps = view.steps.astype(np.float64)
     found = {

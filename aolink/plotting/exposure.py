@@ -34,8 +34,9 @@ _SEGMENTS = 120
 def exposure_with_estimates(
     series: Series, number: int, estimators: Sequence[str] | None = None
 ) -> tuple[Exposure, dict[str, Estimate]]:
-    """An exposure by its number, counted from 0, and its estimates. Without names they are those of the baseline and of
-    the estimator with the highest rank.
+    """An exposure by its number, counted from 0, and its estimates.
+
+    Without names they are those of the baseline and of the estimator with the highest rank.
 
     Raises
     ------

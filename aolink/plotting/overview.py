@@ -109,10 +109,10 @@ class Overview:
 
     def telling(self) -> dict[int, str]:
         """The most telling exposures, by number, each with the reason; fewer where one exposure has several reasons."""
-        told: dict[int, str] = {}
+        reasons: dict[int, str] = {}
 
         def tell(number: int, why: str) -> None:
-            told[number] = f"{told[number]}; {why}" if number in told else why
+            reasons[number] = f"{reasons[number]}; {why}" if number in reasons else why
 
         if np.isfinite(self.moved).any():
             tell(int(np.nanargmax(self.moved)), "the largest blur")
@@ -127,9 +127,9 @@ class Overview:
         if refused:
             number, name = min(refused)
             tell(number, f"the first that was gated, by {name}")
-        if not told and len(self):
+        if not reasons and len(self):
             tell(0, "the first")
-        return told
+        return reasons
 
 
 def overview(

@@ -51,7 +51,7 @@ class RecordingCopy:
         An empty file that is there already, as `aolink.files.writing` gives one. It is cut back to its last whole part
         if a ``with`` block ends before `finish`.
     notes:
-        Facts about the session in the place of those that the source has.
+        Facts about the session, instead of those of the source.
     attachments:
         Attachments by name; by default those of the source.
     """

@@ -66,8 +66,9 @@ def _date(time_ns: int) -> str | None:
 
 
 def _gaps_and_estimates(recording: Recording) -> tuple[dict[str, float], dict[str, Any]]:
-    """Number and longest length of the gaps between the camera's frames, in fast steps. Also the number of estimates of
-    each estimator, and the reasons why some could not use their exposure.
+    """Number and longest length of the gaps between the camera's frames, in fast steps.
+
+    Also the number of estimates of each estimator, and the reasons why some could not use their exposure.
     """
     period, last, gaps = recording.rig.timing.frame_period_steps, None, []
     names = recording.estimators

@@ -329,8 +329,10 @@ class Recording(Series):
         return islice(exposures, start - before, None if stop is None else stop - before)
 
     def timed_exposures(self, first_chunk: int = 0) -> Iterator[tuple[int, Exposure]]:
-        """The exposures as by `exposures`, each after the log time of the message that completed it, ns. With
-        ``first_chunk``, only those that the messages of that chunk and of later ones complete, in a file with an index.
+        """The exposures as by `exposures`, each after the log time of the message that completed it, ns.
+
+        With ``first_chunk``, only those that the messages of that chunk and of later ones complete, in a file with an
+        index.
         """
         now = 0
         assembly, beside = ExposureAssembly(self.rig), Companions(self.counts)
@@ -426,8 +428,9 @@ class Recording(Series):
 
     def iter_estimates(self, name: str, start: int = 0, stop: int | None = None) -> Iterator[Estimate]:
         """The estimates as by `estimates`, one by one: the file is read only as far as they are needed. A recording
-        without estimates is no error here. With ``start`` and ``stop``, those of the exposures that `exposures` gives
-        for them.
+        without estimates is no error here.
+
+        With ``start`` and ``stop``, those of the exposures that `exposures` gives for them.
         """
         if stop is not None and stop <= start:
             return

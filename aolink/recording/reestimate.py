@@ -193,8 +193,9 @@ def kept_estimators(recording: Recording, names: Sequence[str], *, only: bool) -
 def _without_old_estimates(
     recording: Recording, kept: Sequence[str], with_skips: Sequence[str]
 ) -> Iterator[RawMessage]:
-    """The messages of a recording, with the estimates and restored pictures of the estimators ``kept`` only. Only the
-    estimators ``with_skips`` keep their messages about skipped exposures.
+    """The messages of a recording, with the estimates and restored pictures of the estimators ``kept`` only.
+
+    Only the estimators ``with_skips`` keep their messages about skipped exposures.
     """
     restored_with = ""
     for raw in recording.raw_messages():

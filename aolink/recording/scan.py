@@ -154,8 +154,9 @@ def open_recording(path: Path | Url, expected: Sequence[tuple[int, int]] = ()) -
 
 
 def read_summary(file: IO[bytes]) -> Summary | None:
-    """The summary at a file's end; None if the file was cut off, or the summary fails its checksum. It is empty where
-    the writer has left it out.
+    """The summary at a file's end; None if the file was cut off, or the summary fails its checksum.
+
+    It is empty where the writer has left it out.
     """
     size = file.seek(0, os.SEEK_END)
     if size < len(MAGIC) + _FOOTER_BYTES:
@@ -283,7 +284,10 @@ def scan(file: IO[bytes], on_loss: Callable[[Loss], None]) -> Iterator[tuple[Mca
 
 
 def grown(file: IO[bytes], position: int, on_loss: Callable[[Loss], None]) -> tuple[int, list[McapRecord], bool]:
-    """The record at a position of a file that may still be written, or for a chunk the records in it. Returns -------
+    """The record at a position of a file that may still be written, or for a chunk the records in it.
+
+    Returns
+    -------
     The position of the next record, which is ``position`` while this one is not whole; the records that are of
     interest; whether this is the end of the data.
 

@@ -60,6 +60,7 @@ class Search:
 
     def next(self, position: int, before: int | None = None) -> int | None:
         """The position of the next whole chunk, metadata or end of the data; None if there is none ``before`` a byte.
+
         Calls must come with ascending positions.
         """
         before = self._size if before is None else before

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 
 class RecordingSlice(Series):
     """The result of ``recording[10:20]``: these exposures and their estimates, as in the whole recording, bit for bit.
+
     From a file with an index little more is read than they need. Estimators that are run on a slice begin anew there.
     """
 

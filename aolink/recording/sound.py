@@ -36,10 +36,10 @@ def _of_run(run: wire.Applied | wire.CommandBlock | Run, rig: Rig) -> str:
         return ""
     # Inputs in bytes take 8 bytes a number. A report without the inputs of its steps would be expanded to all of these
     # steps.
-    told = run.u
-    if (len(told) / 8 if isinstance(told, bytes) else len(told)) != run.n_steps * rig.n_inputs:
+    inputs = run.u
+    if (len(inputs) / 8 if isinstance(inputs, bytes) else len(inputs)) != run.n_steps * rig.n_inputs:
         return "u has not the inputs of its steps"
-    u = np.frombuffer(told, "<f8") if isinstance(told, bytes) else np.array(told)
+    u = np.frombuffer(inputs, "<f8") if isinstance(inputs, bytes) else np.array(inputs)
     # The sum of squares is fast, and is NaN or infinite where one of them is.
     fine = np.vdot(u, u) <= _MOST_INPUT**2 or np.abs(u).max(initial=0.0) <= _MOST_INPUT
     return "" if fine else "u has an input that is no number, or beyond all"

@@ -50,8 +50,9 @@ _Item = tuple[str, Message, bytes, int]
 def begin_recording(
     file: McapFile, rig: Rig, metadata: dict[str, str], start_ns: int, attachments: Mapping[str, bytes]
 ) -> None:
-    """Write the beginning of a recording: the rig file, twice, the exposure basis, and facts about the session. Those
-    of ``attachments``, by name, are added that are not among them.
+    """Write the beginning of a recording: the rig file, twice, the exposure basis, and facts about the session.
+
+    Those of ``attachments``, by name, are added that are not among them.
     """
     file.start()
     model = exposure_model(rig.plant, rig.timing.exposure_steps)

@@ -40,7 +40,7 @@ class Solver(Protocol):
 
     @property
     def frame(self) -> tuple[slice, slice]:
-        """Where the frame lies in the scene."""
+        """The place of the frame in the scene."""
         ...
 
     def project(self, images: FloatingArray) -> FloatingArray:
@@ -246,7 +246,7 @@ class Plane:
 
     taps: NDArray[np.float64]
     frame: tuple[slice, slice]
-    """Where the frame lies in the scene."""
+    """The place of the frame in the scene."""
     scene: tuple[int, int]
     """Rows and columns of the scene, which begins at the plane's first pixel."""
     shape: tuple[int, int]

@@ -68,6 +68,7 @@ def plug_and_play(
 
 def non_local_means(image: FloatArray, noise_sd: float) -> FloatArray:
     """Mean of the pixels within 7 pixels whose 5 x 5 neighbourhoods are similar, weighted by exp(-distance^2 / h^2).
+
     The squared distance is the mean squared difference less the 2 sd^2 of noise alone; h = 0.8 sd.
     """
     reach, patch, h = 7, 5, 0.8 * noise_sd

@@ -26,7 +26,9 @@ def line_variance(modes: FloatArray, scanner: Scanner) -> float:
 
 def plane_variance(modes: FloatArray, difference_weight: float) -> float:
     """Added variance for a scene of white differences; PSF modes (modes, taps) or (modes, rows, columns), each of zero
-    sum. It is the mean over all frequencies of |m|^2 / (lambda roughness).
+    sum.
+
+    It is the mean over all frequencies of |m|^2 / (lambda roughness).
     """
     if not len(modes):
         return 0.0

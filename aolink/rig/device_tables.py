@@ -10,9 +10,10 @@ from aolink.rig.toml_table import Table
 
 @dataclass(frozen=True, kw_only=True)
 class Delay:
-    """A delay that no clock measures. For a mirror it is the time from the beginning of an input's fast step until the
-    mirror follows that input; for a camera that reports no time, the time from the end of an exposure to its frame's
-    arrival.
+    """A delay that no clock measures.
+
+    For a mirror it is the time from the beginning of an input's fast step until the mirror follows that input; for a
+    camera that reports no time, the time from the end of an exposure to its frame's arrival.
     """
 
     mean_s: float = 0.0

@@ -1,6 +1,8 @@
-"""The description of a rig: a TOML file, and the frozen dataclasses that it becomes. `load_rig` reads and validates the
-whole file; an error is one `RigError` that names the key. Quantities are SI (seconds) where the key ends in a unit, and
-otherwise in the rig's own slope unit: the unit of ``sensor.field``, of the plant's output and of the kernel's width.
+"""The description of a rig: a TOML file, and the frozen dataclasses that it becomes.
+
+`load_rig` reads and validates the whole file; an error is one `RigError` that names the key. Quantities are SI
+(seconds) where the key ends in a unit, and otherwise in the rig's own slope unit: the unit of ``sensor.field``, of the
+plant's output and of the kernel's width.
 """
 
 from __future__ import annotations

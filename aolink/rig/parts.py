@@ -14,10 +14,11 @@ from aolink.optics.mirror import VoltageLaw
 
 @dataclass(frozen=True, kw_only=True)
 class UnmodelledSlopes:
-    """The estimators' model of slopes that the camera sees and the plant's model does not make. Examples are the
-    fitting error of a deformable mirror, which its actuators cannot make, and turbulence that no state follows. They
-    add to the outputs, theta(k) = C x(k) + v(k), with v Gaussian, independent of the state and from output to output,
-    and
+    """The estimators' model of slopes that the camera sees and the plant's model does not make.
+
+    Examples are the fitting error of a deformable mirror, which its actuators cannot make, and turbulence that no state
+    follows. They add to the outputs, theta(k) = C x(k) + v(k), with v Gaussian, independent of the state and from
+    output to output, and
 
         Cov(v(i), v(j)) = sd^2 exp(-((i - j) / correlation_steps)^2)  within an exposure,  0 between exposures.
 

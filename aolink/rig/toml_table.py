@@ -36,6 +36,7 @@ late_rate packet_loss_rate saturation_rate stall_rate stall_s vanish_rate vanish
 """
 KEYS = frozenset(_KEYS.split() + _FAULTS.split())
 """Every key of every table of a rig file, kept by hand; a test compares it with the keys that the readers ask for.
+
 Where a key is missing, a similar key of the file that is not among these counts as a misspelling of it. The keys that
 the readers have asked for so far would not do: they have not asked yet for the keys after the missing one.
 """

@@ -91,10 +91,11 @@ class WouldCommand:
 def would_command(
     recording: Recording, controller: str, estimator: str, *, stop: Callable[[], bool] = lambda: False
 ) -> Iterator[WouldCommand]:
-    """The inputs that a controller would have commanded in the session, exposure by exposure. Each exposure, and the
-    inputs that were pending at its end, are those of the recording: the controller responds to what happened in the
-    session, not to the effect of its own commands. Another controller than the session's does not fall back, because
-    where it did not act, its benefit cannot be measured.
+    """The inputs that a controller would have commanded in the session, exposure by exposure.
+
+    Each exposure, and the inputs that were pending at its end, are those of the recording: the controller responds to
+    what happened in the session, not to the effect of its own commands. Another controller than the session's does not
+    fall back, because where it did not act, its benefit cannot be measured.
 
     Raises
     ------

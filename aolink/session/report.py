@@ -181,8 +181,10 @@ class Report:
 
 class LatencyBook:
     """The latency of each frame, from the end of its exposure to the first command that could depend on it. It is for
-    real time only. A command can depend on a frame when it is sent after the first estimate of the frame was there, or
-    all estimators had skipped it. (`EstimatorReport` has the time of each estimator.)
+    real time only.
+
+    A command can depend on a frame when it is sent after the first estimate of the frame was there, or all estimators
+    had skipped it. (`EstimatorReport` has the time of each estimator.)
     """
 
     def __init__(self, report: Report, record: Callable[[pb.Latency, int], None]) -> None:

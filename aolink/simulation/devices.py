@@ -1,6 +1,7 @@
-"""The simulated camera and mirror driver: they take messages from the host and give messages to the host. They are
-state only, with no ports and no time of their own. `aolink.simulation.server` puts it behind ports. It is the device's
-side of protocol version 1; the host's code never imports it and meets it on the wire only.
+"""The simulated camera and mirror driver: they take messages from the host and give messages to the host.
+
+They are state only, with no ports and no time of their own. `aolink.simulation.server` puts it behind ports. It is the
+device's side of protocol version 1; the host's code never imports it and meets it on the wire only.
 """
 
 from __future__ import annotations

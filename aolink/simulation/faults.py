@@ -12,8 +12,9 @@ _BURST = 64
 
 
 class Way:
-    """One direction of one serial line: it damages bytes, and gives their delay. It takes whole packets, so that its
-    faults depend on the bytes sent and not on how they are read.
+    """One direction of one serial line: it damages bytes, and gives their delay.
+
+    It takes whole packets, so that its faults depend on the bytes sent and not on how they are read.
     """
 
     def __init__(self, faults: Faults, rng: np.random.Generator, *, to_host: bool) -> None:

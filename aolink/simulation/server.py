@@ -207,7 +207,7 @@ class RigServer:
         self._step_zero_ns = self._start_ns + round(simulation.clock_offset_s * 1e9)
         self._now_ns = self._start_ns  # virtual time
         self._last_valid_ns = self._start_ns
-        self._told: dict[Line, int] = {}
+        self._sent_ns: dict[Line, int] = {}
         self._late_rate, self._chunk_loss_rate = simulation.faults.late_rate, simulation.faults.chunk_loss_rate
         self._late: list[tuple[int, pb.CommandBlock, int]] = []
         """Blocks that a fault holds back, each with the step at which it comes and its sequence number."""
@@ -277,7 +277,7 @@ class RigServer:
             if isinstance(message, pb.Identify):
                 line.begin_session()
                 line.taken = 0
-                self._told.pop(line.line, None)
+                self._sent_ns.pop(line.line, None)
             if line.line == "mirror":  # the camera's line may be alive while the mirror's is dead
                 self._last_valid_ns = self._host_ns()
             if isinstance(message, pb.ClockQuery):
@@ -369,8 +369,8 @@ class RigServer:
 
     def _tell_time(self, line: LineEnd, *, done: bool = False) -> None:
         """Send the host's time if it has changed, or if a packet has been handled."""
-        if done or self._told.get(line.line) != self._now_ns:
-            self._told[line.line] = self._now_ns
+        if done or self._sent_ns.get(line.line) != self._now_ns:
+            self._sent_ns[line.line] = self._now_ns
             taken = {name: end.taken for name, end in self._lines.items()}
             line.put(pb.VirtualTime(host_ns=self._now_ns, camera_bytes=taken["camera"], mirror_bytes=taken["mirror"]))
 

@@ -196,9 +196,9 @@ class TcpStream:
             guest.introduction += data or b""
             begun = begins_with_identify(guest.introduction, self.signing)
             if isinstance(begun, str):
-                told = encode_message(refusal_event(begun), 0, self.signing)
+                message = encode_message(refusal_event(begun), 0, self.signing)
                 with contextlib.suppress(OSError):
-                    guest.connection.send(told)
+                    guest.connection.send(message)
                 guest.introduction, begun = b"", None
             if begun is None and data is not None and time.monotonic() - guest.since_s < self.introduction_s:
                 self._guests.append(guest)
@@ -226,6 +226,7 @@ class TcpStream:
 
 def begins_with_identify(data: bytes, signing: Signing | None = None) -> bool | str | None:
     """Whether bytes begin with a whole Identify packet, or with a zero byte and one; None while this cannot be known.
+
     Where they do, but the packet is not signed correctly, the result is a text with the reason.
     """
     piece, end, _ = data.removeprefix(DELIMITER).partition(DELIMITER)

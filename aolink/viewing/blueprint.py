@@ -289,8 +289,9 @@ def _texts(contents: Contents) -> rrb.Container:
 def _lines(
     contents: Contents, name: str, shown: list[str], *, window: bool = False, legend: bool = False
 ) -> rrb.TimeSeriesView:  # fmt: skip
-    """A plot over time: of the whole session, or of `PATH_WINDOW` exposures about the time cursor. A ``legend`` stands
-    above the lines; without one, the profile's key has the colours.
+    """A plot over time: of the whole session, or of `PATH_WINDOW` exposures about the time cursor.
+
+    A ``legend`` stands above the lines; without one, the profile's key has the colours.
     """
     axis_y = _room_above(contents, shown) if legend else None
     corner = rrb.PlotLegend(rrb.Corner2D.LeftTop, visible=legend)

@@ -276,7 +276,7 @@ def profile_bounds(sensor: Sensor, top: float, names: int) -> tuple[tuple[float,
 
 
 class Panels:
-    """Where the three panels of the profile's plot lie in its drawing units: slope to the right, y downwards.
+    """The places of the three panels of the profile's plot in its drawing units: slope to the right, y downwards.
 
     The path is on top, then its histogram, and the intensity's zero is at y = 0.
 

@@ -1,5 +1,6 @@
-"""A viewer that a recording feeds while it is read. Rerun takes most of a second to load, and its viewer as long to
-start, so the viewer is started first.
+"""A viewer that a recording feeds while it is read.
+
+Rerun takes most of a second to load, and its viewer as long to start, so the viewer is started first.
 """
 
 from __future__ import annotations
@@ -24,8 +25,9 @@ _FLUSH_S = 60.0
 
 @contextmanager
 def fed(server: Server, recording_id: str | None = None) -> Iterator[rr.RecordingStream]:
-    """A stream into a viewer, which stays open after the block until it is closed. Raises `ViewerError` where the
-    viewer takes no more data.
+    """A stream into a viewer, which stays open after the block until it is closed.
+
+    Raises `ViewerError` where the viewer takes no more data.
     """
     import rerun as rr  # while the viewer starts
 

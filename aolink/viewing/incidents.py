@@ -73,9 +73,10 @@ def log_warnings(
     estimates: Mapping[str, Mapping[int, Estimate]], skipped: Mapping[str, Collection[int]],
     before: Exposure | None = None,
 ) -> int:  # fmt: skip
-    """Warnings in words, on the timelines: ``/warnings``; gives how many there are. They are about frames lost or
-    incomplete, inputs that the mirror did not report, exposures that an estimator gated, could not use or had no time
-    for, and those in which it diverged or began anew.
+    """Warnings in words, on the timelines: ``/warnings``; gives how many there are.
+
+    They are about frames lost or incomplete, inputs that the mirror did not report, exposures that an estimator gated,
+    could not use or had no time for, and those in which it diverged or began anew.
     """
     said: list[tuple[Exposure, str]] = []
     for last, e in zip([before, *exposures], exposures, strict=False):

@@ -120,6 +120,7 @@ class Server:
 @contextmanager
 def serving(files: Sequence[str] = (), port: int | None = None) -> Iterator[Server]:
     """The web viewer's page on this machine's loopback, which shows files, or the data that comes to its data port.
+
     Raises `ViewerError` where the requested port is in use.
     """
     if port is None:

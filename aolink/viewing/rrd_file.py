@@ -19,8 +19,10 @@ from aolink.files import writing
 def new_rrd(
     application: str, path: Path, *, overwrite: bool = False, sources: Iterable[Path] = (), identity: str | None = None
 ) -> Iterator[rr.RecordingStream]:
-    """A stream into a new .rrd file, which appears when the block has ended well; it has to send a layout. Files of one
-    ``application`` with the same ``identity`` are one recording to Rerun; with None each file is one of its own.
+    """A stream into a new .rrd file, which appears when the block has ended well; it has to send a layout.
+
+    Files of one ``application`` with the same ``identity`` are one recording to Rerun; with None each file is one of
+    its own.
 
     Raises
     ------

@@ -83,6 +83,7 @@ def sent_parts(
     stream: rr.RecordingStream, recording: Recording, look: Look, *, at_once: bool = False
 ) -> Iterator[int]:  # fmt: skip
     """Send a recording to a stream part by part, and its layout at the end; gives how many exposures have been sent.
+
     With ``at_once`` a layout comes after the first part too, for a viewer that shows the data so far.
 
     Raises

@@ -180,9 +180,11 @@ class Hub:
             link.transport.close()
 
     def _settle_others(self, link: Link) -> None:
-        """On virtual time, wait until the rig has handled everything sent on the other line. Two lines are two queues,
-        and which of them the rig reads first is not determined, so nothing is sent on one before the other is handled.
-        Either nothing is read here or everything that is due: the messages read must not depend on speed.
+        """On virtual time, wait until the rig has handled everything sent on the other line.
+
+        Two lines are two queues, and which of them the rig reads first is not determined, so nothing is sent on one
+        before the other is handled. Either nothing is read here or everything that is due: the messages read must not
+        depend on speed.
         """
         others = [each for each in self.links if each is not link]
         if not all(self._has_dealt_with(others, each) for each in self.links):

@@ -150,8 +150,9 @@ class MessageDecoder:
         self._type = self._total = self._next_sequence = 0
 
     def take(self, packet: Packet) -> Message | None:
-        """The message that a packet completes; None where more of it is to come. Raises DecodeError for a payload that
-        is not a message, and for a part without the parts before it.
+        """The message that a packet completes; None where more of it is to come.
+
+        Raises DecodeError for a payload that is not a message, and for a part without the parts before it.
         """
         type_, payload = packet.type, packet.payload
         if type_ == PacketType.PART:

@@ -97,7 +97,7 @@ def test_what_gives_no_matrix_is_refused():
     with pytest.raises(CalibrationError, match="beyond the mirror's limits"):
         poke_inputs(rig, 1e3)
     exposures = poked(rig)
-    with pytest.raises(CalibrationError, match="do not tell 16 inputs apart"):
+    with pytest.raises(CalibrationError, match="do not determine 16 inputs"):
         measure_interaction(rig, exposures[:20])
     with pytest.raises(CalibrationError, match="hold each poke longer"):
         measure_interaction(rig, poked(rig, rest_exposures=0))

@@ -103,7 +103,7 @@ def test_a_session_is_aligned_by_the_clocks_recorded_estimated_and_replayed(tmp_
     [
         (
             Faults(unplug_after=8),
-            "cannot tell the time: .* timeout, is it connected, and is its power on|no longer answ",
+            "cannot give its time: .* timeout, is it connected, and is its power on|no longer answ",
         ),
         (Faults(resize_after=8), "has changed its picture to 21 x 20 pixels"),
     ],

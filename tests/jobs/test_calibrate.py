@@ -203,7 +203,7 @@ def test_a_spot_within_a_pixel_keeps_the_width_of_the_file() -> None:
     shot = next(frames for frames, position in shots if abs((position / 0.05) % 1 - 0.5) < 0.2)
     found = calibrate(rig, shot)
     assert found.kernel_sigma is None
-    assert any("too narrow for the pixels to tell its width" in note for note in found.notes)
+    assert any("too narrow for the pixels to show its width" in note for note in found.notes)
 
 
 def test_a_camera_without_noise_is_said_to_hide_it() -> None:

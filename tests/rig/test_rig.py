@@ -404,7 +404,7 @@ step_sd = [0.001, 0.002]
         ('kind = "pink"', r"disturbance.model\[0\].kind = 'pink' is not known: use one of resonance, ornstein"),
         ('kind = "resonance"\nfrequency_hz = 600.0\ndamping = 0.1\nsd = 0.1', "frequency_hz = 600 is beyond"),
         ('kind = "resonance"\nfrequency_hz = 6.0\nsd = 0.1', r"model\[0\].damping is missing"),
-        ('kind = "ar"\ncoefficients = [1.0]\nsd = 0.1', "does not die out .* modulus 1, .* use kind = 'random-walk'"),
+        ('kind = "ar"\ncoefficients = [1.0]\nsd = 0.1', "does not decay .* modulus 1, .* use kind = 'random-walk'"),
         ('kind = "ar"\ncoefficients = [1, 1, 1, 1, 1]\nsd = 0.1', r"has shape 5, expected 1 to 4 numbers"),
         ('kind = "matrices"\nA = [[0.5]]\nB_w = [[1.0]]\nC = [[1.0], [1.0]]\nprocess_noise = 1.0', "shape 2 x 1"),
         ('kind = "ornstein-uhlenbeck"\ncorrelation_s = 1.0\nsd = [0.1, 0.1]', "sd has shape 2, expected 1 "),

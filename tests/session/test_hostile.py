@@ -233,7 +233,7 @@ def test_a_stop_is_heard_in_a_flood(tmp_path: Path) -> None:
     with lying_rig(RIG, mirror=flood(pb.CommandAck, begun)) as ports:
         report = record(RIG, *ports, tmp_path / "a.mcap", stop=begun.is_set)
     assert report.ended == "interrupted"
-    assert any("talks without dealing with what it was sent" in warning for warning in report.warnings)
+    assert any("sends messages without handling those it was sent" in warning for warning in report.warnings)
     assert Recording(tmp_path / "a.mcap").complete
 
 

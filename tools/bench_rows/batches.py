@@ -28,8 +28,10 @@ _TINY = 10_000
 
 def tiny_recordings(effort: Effort) -> list[Row]:
     """Ten thousand recordings of three exposures are estimated into side files in one folder: what each costs besides
-    its estimates. The cost is the time of each less that of the estimates, which is the slope of time against
-    exposures; and the memory that the process has gained since the first thousand.
+    its estimates.
+
+    The cost is the time of each less that of the estimates, which is the slope of time against exposures; and the
+    memory that the process has gained since the first thousand.
     """
     count = effort.of(_TINY, 20)
     with tempfile.TemporaryDirectory() as name:

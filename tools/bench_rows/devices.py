@@ -43,10 +43,10 @@ def late_steps(effort: Effort) -> Row:
     mirror, n_steps = PacedMirror(rig, _AtOnce()), effort.of(_STEPS, 50)
     first = mirror.time_ns() // rig.timing.fast_step_ns + 50
     mirror.send(first, np.linspace(0.0, 0.05, n_steps)[:, None])
-    late, told = 0, 0
-    while told < first + n_steps:
+    late, reported = 0, 0
+    while reported < first + n_steps:
         for held in mirror.applied():
-            told = held[0] + len(held[1])
+            reported = held[0] + len(held[1])
             late += int(np.count_nonzero(np.asarray(held[2]))) if len(held) > 2 else 0
         time.sleep(0.01)
     mirror.close()

@@ -164,7 +164,9 @@ _CHANGES = (
 
 def following(effort: Effort) -> list[Row]:
     """The offers of `aolink identify --follow` on the rig `loop` when its disturbance changes after 80 of 320
-    exposures. There are 8 logs of each change, 16 without a change, and 8 of the rig `jitter`, with 320 exposures each.
+    exposures.
+
+    There are 8 logs of each change, 16 without a change, and 8 of the rig `jitter`, with 320 exposures each.
     """
     exposures, seeds = effort.of(320, 4), range(_FIRST_FOLLOWED, _FIRST_FOLLOWED + effort.of(8))
     rows = []

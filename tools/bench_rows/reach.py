@@ -73,13 +73,13 @@ def bit_errors(effort: Effort) -> list[Row]:
         good = {each.frame_id: each for each in _virtual(Path(name), "section-vi", 0.0, exposures)[1].exposures()}
         for rate, share in _RATES.items():
             report, recording = _virtual(Path(name), "section-vi", rate, exposures)
-            rig, seen, told = recording.rig, 0, 0
+            rig, seen, true_paths = recording.rig, 0, 0
             for each in recording.exposures():
                 sound = good[each.frame_id]
                 seen += 1
                 _require("wrong pixels", int((each.pixels != sound.pixels)[each.mask].sum()))
                 if each.truth is not None and sound.truth is not None:
-                    told += 1
+                    true_paths += 1
                     _require("steps of the true path that differ", int((each.truth.path != sound.truth.path).sum()))
                 if not each.inputs_assumed:
                     _require("steps with another input", int((each.inputs != sound.inputs).sum()))
@@ -89,7 +89,7 @@ def bit_errors(effort: Effort) -> list[Row]:
             _require("steps lost, taken twice or refused", abs(report.steps_commanded - ends))
             whole = (report.frames_received - report.frames_incomplete) / exposures
             late = report.steps_late / report.steps_commanded
-            compared = f"{seen} frames and {told} true paths compared, none wrong"
+            compared = f"{seen} frames and {true_paths} true paths compared, none wrong"
             steps = (
                 f"{report.steps_late} of {report.steps_commanded} steps late, {report.steps_not_reported} not reported"
             )
@@ -247,7 +247,7 @@ def _soak(device: str, rate: float, seconds: int, seed: int, folder: Path) -> Ro
             for cable in cables:
                 cable.close()
     pixels, held = cables[0].pixels, cables[1].held
-    _require("steps told in two ways", cables[1].contradictions)
+    _require("steps reported in two ways", cables[1].contradictions)
     for each in Recording(path).exposures():
         true = np.frombuffer(pixels[each.frame_id], "<u2").reshape(each.pixels.shape)
         _require("wrong pixels", int((each.pixels != true)[each.mask].sum()))

@@ -63,7 +63,7 @@ def restoration_uncertainty(effort: Effort) -> list[Row]:
     it."""
     rows, path = [], paths()["damped sinusoid"]
     for share in (0.02, 0.05):
-        told = motion_psf(path, share**2 * np.outer(path, path), KERNEL, 1.0)
+        given = motion_psf(path, share**2 * np.outer(path, path), KERNEL, 1.0)
         sure = motion_psf(path, None, KERNEL, 1.0)
         for noise_sd in (0.002, NOISE_SD):
             for method in ("smoother", "gauss_markov", "tv"):
@@ -74,7 +74,7 @@ def restoration_uncertainty(effort: Effort) -> list[Row]:
                         case = blurred(name, true, picture_size(effort), noise_sd=noise_sd)
                         each = [
                             psnr(restore(case.image, p, method=method, noise_sd=noise_sd).image, case.scene)
-                            for p in (told, sure, true)
+                            for p in (given, sure, true)
                         ]
                         found = np.vstack([found, each])
                 knowing, believing, exact = found.mean(axis=0)

@@ -23,7 +23,7 @@ from bench_rows.row import Effort, Row, median_s, timed
 
 _RECORDING = Path(__file__).parents[2] / "recordings" / "section-vi.mcap"
 _FIRST_PART = b"32/"
-"""What the progress bar says when the first part of a long recording is with the viewer."""
+"""Text of the progress bar when the viewer has the first part of a long recording."""
 _COMMAND = (sys.executable, "-m", "aolink")
 _NOT_COMPILED = shutil.ignore_patterns("__pycache__")
 

@@ -172,7 +172,7 @@ def read_rows(path: Path) -> list[Row]:
 
 @dataclass(frozen=True, kw_only=True)
 class Plan:
-    """Which scenes are judged by which estimators."""
+    """The plan of which scenes are judged by which estimators."""
 
     scenes: int = 200
     """Number of scenes that are judged by all but the slow estimators; the first of the reporting seeds."""

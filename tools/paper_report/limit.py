@@ -131,13 +131,13 @@ def against_o1(effort: Effort) -> list[tuple[str, dict[str, Measured]]]:
 def against_o1_section(table: Sequence[tuple[str, dict[str, Measured]]], effort: Effort) -> list[Block]:
     """The ratios, and the largest of them."""
     worst = {each: max(table, key=lambda row: row[1][each].high) for each in BETTER_THAN_O1}
-    told = "; ".join(f"{each} {row[1][each].high:.3f} ({row[0]})" for each, row in worst.items())
+    bounds = "; ".join(f"{each} {row[1][each].high:.3f} ({row[0]})" for each, row in worst.items())
     return [
         Heading("Not worse than o1, anywhere"),
         Text(
             f"RMSE of the path over o1's on the same frames, {effort.o1_runs} runs of {effort.o1_exposures} exposures,"
             f" the first {effort.limit_skip} not scored, all others counted, with the 95 % interval of a bootstrap over"
-            f" the runs. The largest upper bounds: {told}."
+            f" the runs. The largest upper bounds: {bounds}."
         ),
         Table(["scene", *BETTER_THAN_O1], [[name, *(row[n].interval for n in BETTER_THAN_O1)] for name, row in table]),
     ]

@@ -58,7 +58,7 @@ def loop_section(cells: Sequence[Measured]) -> list[Block]:
             " 95 % bound. o1, moments and profile serve lqg with the true model of the line, and of turbulence with one"
             " that is fitted to its true slopes before; identified means with a model from the blurred frames before"
             " alone. ar_kalman and least_squares are pyRTC's predictors, fitted to the centroids of the same frames."
-            " true state is lqg told the disturbance itself up to the end of each exposure, by an autoregressive model"
+            " true state is lqg given the disturbance itself up to the end of each exposure, by an autoregressive model"
             " of order 64 of turbulence: what bounds all of them, as far as that model goes."
         ),
         Table(["disturbance", *_COLUMNS, "gain"], rows),

@@ -1,5 +1,7 @@
 """A second, small implementation of the paper's o3, independent of aolink's, as printed and as corrected, to measure
-the effect of each misprint. Equations are numbered as in Mishra & Wen. There is no gate: a filter may diverge.
+the effect of each misprint.
+
+Equations are numbered as in Mishra & Wen. There is no gate: a filter may diverge.
 """
 
 from __future__ import annotations

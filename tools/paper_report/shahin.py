@@ -164,7 +164,7 @@ def draw(out: Path) -> dict[str, str]:
         "shahin-1-3.png": "Like figures 1 to 3. A uniform PSF has its zeros on the unit circle: with the initial state"
         " of the background the inverse is exact, with zero the error of the first pixels never decays.",
         "shahin-4-5.png": f"Like figures 4 and 5: noise of variance {SHOWN:g}, the one-step predictor of (13) with the"
-        " first-order scanner, the variances that it is told varied as he does; then what else the same filter gives.",
+        " first-order scanner, the variances that it is given varied as he does; then what else the same filter gives.",
         "shahin-6-7.png": "Like figures 6 and 7: the fifth-order scanner, along all lines one after the other.",
     }
 
@@ -181,7 +181,7 @@ def build(runs: int, captions: dict[str, str]) -> list[Block]:
         for noise in NOISE_VARIANCES
         for method in METHODS
     ]
-    told = [
+    shown = [
         gain("first order, α = 0.873", method, SHOWN, (a, b), runs)
         for method in ("predictor", "smoother") for a in FACTORS for b in FACTORS
     ]  # fmt: skip
@@ -204,10 +204,10 @@ def build(runs: int, captions: dict[str, str]) -> list[Block]:
             ["scanner", "noise variance", "method", "aligned", "unaligned"],
             [[g.model, f"{g.noise_variance:g}", g.method, f"{g.aligned:.1f}", f"{g.unaligned:.1f}"] for g in table],
         ),
-        Text(f"The variances that the first-order filter is told, varied; the true noise has {SHOWN:g}."),
+        Text(f"The variances that the first-order filter is given, varied; the true noise has {SHOWN:g}."),
         Table(
             ["method", "image variance ×", "noise variance ×", "aligned"],
-            [[g.method, f"{g.image_factor:g}", f"{g.noise_factor:g}", f"{g.aligned:.1f}"] for g in told],
+            [[g.method, f"{g.image_factor:g}", f"{g.noise_factor:g}", f"{g.aligned:.1f}"] for g in shown],
         ),
         Heading("What is printed, checked"),
         Points([

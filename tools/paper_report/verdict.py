@@ -128,8 +128,8 @@ def told_of_nees(row: Row) -> bool:
 
 def share_of_nees(rows: Sequence[Row]) -> float:
     """Share of scenes with `nees_inside` among those with enough runs; NaN if there is none."""
-    told = [nees_inside(row) for row in rows if told_of_nees(row)]
-    return float(np.mean(told)) if told else math.nan
+    inside = [nees_inside(row) for row in rows if told_of_nees(row)]
+    return float(np.mean(inside)) if inside else math.nan
 
 
 @dataclass(frozen=True)

@@ -56,7 +56,7 @@ def discover() -> list[tuple[str, str]]:
 
 
 class AravisCamera:
-    """A camera that speaks GigE Vision (or USB3 Vision, which nobody has tried).
+    """A camera that speaks GigE Vision (or USB3 Vision, which has not been tried).
 
     Parameters
     ----------
@@ -397,7 +397,7 @@ class AravisCamera:
         """How the camera's clock is latched: ``registers`` of GigE Vision, a ``feature``, or empty for not at all."""
         self._ticks_hz = 0
         if self._is_gige:
-            self._ticks_hz = self._do("arv_gv_device_get_timestamp_tick_frequency", self._device, to="tell the time")
+            self._ticks_hz = self._do("arv_gv_device_get_timestamp_tick_frequency", self._device, to="give its time")
         feature = self._get("is_feature_available", b"TimestampLatch")
         for how in [*(["registers"] if self._ticks_hz else []), *(["feature"] if feature else [])]:
             try:
@@ -415,7 +415,7 @@ class AravisCamera:
         if how == "feature":
             self._set("execute_command", b"TimestampLatch", to="latch its clock")
             return int(self._get("get_integer", b"TimestampLatchValue"))
-        value, to = ctypes.create_string_buffer(8), "tell the time"
+        value, to = ctypes.create_string_buffer(8), "give its time"
         self._do("arv_device_write_register", self._device, _TIMESTAMP_CONTROL, _TIMESTAMP_LATCH, to=to)
         self._do("arv_device_read_memory", self._device, _TIMESTAMP_VALUE, 8, value, to=to)
         return int.from_bytes(value.raw, "big") * 10**9 // self._ticks_hz

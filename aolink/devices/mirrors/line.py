@@ -18,7 +18,7 @@ _SHOWN = 48
 
 
 class Line:
-    """A port that nobody else uses, on which a device answers one request after another.
+    """A port that no other program uses, on which a device answers one request after another.
 
     Parameters
     ----------

@@ -36,7 +36,7 @@ _ERRORS = {
     63: "it is still starting",
     73: "its wave generator is running",
 }
-"""What the commonest error numbers mean."""
+"""The meanings of the commonest error numbers."""
 _UNKNOWN_COMMAND = 2
 SETTLING_S = 5.0
 """How long the stage may take to its safe position when it is opened."""

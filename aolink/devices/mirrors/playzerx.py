@@ -200,11 +200,11 @@ class PlayzerX:
             self._raise_failure()
             first = self._next - len(self._steps)
             n_steps = max(self._taken - first, 0)
-            told, self._steps = self._steps[:n_steps], self._steps[n_steps:]
-        if not told:
+            reported, self._steps = self._steps[:n_steps], self._steps[n_steps:]
+        if not reported:
             return []
-        u = np.array([codes for codes, _ in told])[:, : self._n_inputs] / _HALF - 1
-        return [Held(first, u, np.array([late for _, late in told]))]
+        u = np.array([codes for codes, _ in reported])[:, : self._n_inputs] / _HALF - 1
+        return [Held(first, u, np.array([late for _, late in reported]))]
 
     def park(self) -> int:
         with self._changed:

@@ -31,7 +31,7 @@ class SampleClock:
         self._zero: tuple[float, float] | None = None
         """Earliest and latest host time at which sample 0 can have begun, less ``_base_ns``, ns."""
         self._base_ns = self._at_ns = 0
-        self._told_ns = self._rate = 0.0
+        self._reported_ns = self._rate = 0.0
         """The host time reported for it, less ``_base_ns``, ns, and its rate of change against the time that passes."""
 
     def add(self, taken: int, asked_ns: int, answered_ns: int) -> float:
@@ -43,7 +43,7 @@ class SampleClock:
         if self._zero is None:
             self._base_ns = asked_ns - taken * self._period_ns
             self._zero = 0.0, float(answered_ns - asked_ns + self._period_ns)
-            self._told_ns, self._at_ns = sum(self._zero) / 2, answered_ns
+            self._reported_ns, self._at_ns = sum(self._zero) / 2, answered_ns
             return 0.0
         elapsed_ns = max(answered_ns - self._at_ns, 0)
         widened = elapsed_ns * _DRIFT
@@ -68,29 +68,31 @@ class SampleClock:
     def time_ns(self, host_ns: int) -> int:
         """Time since sample 0 began, on the device's clock, at a host time of now, ns."""
         assert self._zero is not None, "add a count first"
-        moved = self._told_ns + self._rate * (host_ns - self._at_ns)
+        moved = self._reported_ns + self._rate * (host_ns - self._at_ns)
         return host_ns - self._base_ns - round(moved)
 
     @property
     def sigma_ns(self) -> float:
         """Standard deviation of the reported time, ns: that of the interval which the counts leave, and the distance of
-        the reported time from it. The line's asymmetry, at most half a round trip, does not show in the counts.
+        the reported time from it.
+
+        The line's asymmetry, at most half a round trip, does not show in the counts.
         """
         assert self._zero is not None, "add a count first"
         earliest, latest = self._zero
-        return math.hypot((latest - earliest) / math.sqrt(12), self._told_ns - (earliest + latest) / 2)
+        return math.hypot((latest - earliest) / math.sqrt(12), self._reported_ns - (earliest + latest) / 2)
 
     def settle(self) -> None:
         """Report from now on exactly the time that the counts give, even if it jumps: for use before any time was
         reported."""
         assert self._zero is not None, "add a count first"
-        self._told_ns = sum(self._zero) / 2
+        self._reported_ns = sum(self._zero) / 2
 
     def _follow(self, middle_ns: float, elapsed_ns: int) -> None:
         """Advance a phase-locked loop of second order, critically damped: it has no lag where the drift is constant."""
         step = min(elapsed_ns / (_SETTLING_S * 1e9), 0.5)
-        self._told_ns += self._rate * elapsed_ns
-        apart = middle_ns - self._told_ns
-        self._told_ns += 2 * step * apart
+        self._reported_ns += self._rate * elapsed_ns
+        apart = middle_ns - self._reported_ns
+        self._reported_ns += 2 * step * apart
         if elapsed_ns:
             self._rate += step * step * apart / elapsed_ns

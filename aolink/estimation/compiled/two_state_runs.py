@@ -18,8 +18,8 @@ from aolink.numerics.arrays import FloatArray
 from aolink.numerics.entrywise import reciprocal
 
 NUMBERS = 16
-"""Of each axis and exposure: mean (2), upper halves of P and S (3 each), NIS; end state (2) and upper half of its
-covariance (3), innovation (2)."""
+"""Numbers for each axis and exposure: mean (2), upper halves of P and S (3 each), NIS; end state (2) and upper half of
+its covariance (3), innovation (2)."""
 
 
 @overload(reciprocal, jit_options={"error_model": "numpy"}, strict=False)  # names differ in annotations

@@ -289,7 +289,7 @@ class TwoStateFilter(BlurFilter):
 
 
 _SQUARE = np.array([[0, 1], [1, 2]])
-"""Where the entries of a symmetric matrix are in its upper half."""
+"""Places of a symmetric matrix's entries in its upper half."""
 
 
 def _upper(matrices: FloatArray) -> FloatArray:

@@ -32,7 +32,7 @@ class Gaussian:
         return Gaussian(batched.matvec(rows, self.mean), batched.symmetric(spread))
 
     def with_noise(self, size: int) -> Gaussian:
-        """With noise coefficients N(0, I) after these, ``size`` in all; leading axes as they come."""
+        """The Gaussian with noise coefficients N(0, I) after its own, ``size`` in all; leading axes are kept."""
         *lead, n = self.mean.shape
         mean, covariance = np.zeros((*lead, size)), np.empty((*lead, size, size))
         mean[..., :n], covariance[...] = self.mean, np.eye(size)

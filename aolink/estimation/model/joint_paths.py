@@ -28,7 +28,7 @@ from aolink.numerics.single_thread import gram, information_matrix, matmul_one_t
 from aolink.optics.sensor import SpotSensor
 
 # Rms of the noise path that is left out, in standard deviations of the kernel: half of what one spot alone may leave
-# out, for many spots tell a displacement of all of them more finely.
+# out, because many spots show a displacement of all of them more accurately.
 LEFT_OUT = 0.05
 # Random draws of all coefficients, to find the number of nodes.
 _DRAWS = 4

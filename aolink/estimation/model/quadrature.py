@@ -1,10 +1,11 @@
-"""Quadrature in time: a few nodes with weights instead of an exposure's fast steps. Blur is a mean over the steps, and
-paths are smooth, so a weighted mean over a few nodes is enough. For a spot that moves little, the nodes are those of
-Gauss's quadrature for a sum over equal steps, exact for polynomials in time of degree 2 n - 1 (zeros of Gram's
-polynomials: Golub & Welsch, Calculation of Gauss quadrature rules, Math. Comp. 23 (1969)); between two steps the path
-is a straight line. For a spot that goes back and forth, the nodes are means over equal blocks of steps. There are
-enough nodes for the light of the plant's typical paths to be right to a share of the camera's noise; and more for an
-axis whose predicted path moves further between two nodes than a spot is wide.
+"""Quadrature in time: a few nodes with weights instead of an exposure's fast steps.
+
+Blur is a mean over the steps, and paths are smooth, so a weighted mean over a few nodes is enough. For a spot that
+moves little, the nodes are those of Gauss's quadrature for a sum over equal steps, exact for polynomials in time of
+degree 2 n - 1 (zeros of Gram's polynomials: Golub & Welsch, Calculation of Gauss quadrature rules, Math. Comp. 23
+(1969)); between two steps the path is a straight line. For a spot that goes back and forth, the nodes are means over
+equal blocks of steps. There are enough nodes for the light of the plant's typical paths to be right to a share of the
+camera's noise; and more for an axis whose predicted path moves further between two nodes than a spot is wide.
 """
 
 from __future__ import annotations

@@ -1,6 +1,7 @@
-"""Backward simulation over Gaussian mixtures: later exposures correct the path in an earlier one. Given the start state
-x of the next exposure, this one is independent of all later measurements. Under component c of its posterior,
-coefficients z and x are jointly Gaussian, so x moves them by a gain G_c, and reweights the components:
+"""Backward simulation over Gaussian mixtures: later exposures correct the path in an earlier one.
+
+Given the start state x of the next exposure, this one is independent of all later measurements. Under component c of
+its posterior, coefficients z and x are jointly Gaussian, so x moves them by a gain G_c, and reweights the components:
 
     w_c(x) ~ a_c N(x; x_c, S_c),    z | x, c ~ N(z_c + G_c (x - x_c), P_c - G_c S_c G_c').
 

@@ -82,10 +82,11 @@ class GaussianMixture:
         return [np.ascontiguousarray(each) for each in self.arrays]
 
     def reduced(self, most: int, free: float = 0.0) -> GaussianMixture:
-        """The mixture reduced to ``most`` components, or fewer if mergers cost less than ``free``. Repeatedly, the two
-        components whose merger costs least are merged. The cost is Runnalls' bound on the Kullback-Leibler divergence,
-        in nats; a merger keeps mean and covariance. Runnalls, Kullback-Leibler approach to Gaussian mixture reduction,
-        IEEE Trans. AES 43 (2007), (21).
+        """The mixture reduced to ``most`` components, or fewer if mergers cost less than ``free``.
+
+        Repeatedly, the two components whose merger costs least are merged. The cost is Runnalls' bound on the
+        Kullback-Leibler divergence, in nats; a merger keeps mean and covariance. Runnalls, Kullback-Leibler approach to
+        Gaussian mixture reduction, IEEE Trans. AES 43 (2007), (21).
         """
         merged = self.copy()
         compiled_mixtures.merge(*merged.contiguous, most, free)

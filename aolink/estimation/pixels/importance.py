@@ -39,7 +39,8 @@ ENOUGH = 100.0
 # If less than this share of it is reached, points are tempered: number of components fitted to their end states.
 _TOO_FEW = 0.5
 _COMPONENTS = 6
-# Modes are scattered if the windowed moments leave the path uncertain by a variance of so many variances of the kernel.
+# Modes are scattered if the windowed moments leave the path uncertain by a variance of this many variances of the
+# kernel.
 _SCATTERED = 2.5
 # Least effective sample size when a mixture is fitted; weights are raised to a power below one to reach it, since a fit
 # to a handful of points is too sure. And steps of the search for that power.
@@ -102,8 +103,9 @@ def tempered(view: PixelView, prior: GaussianMixture, count: int, number: int) -
 
 
 def scattered(view: PixelView, wide: GaussianMixture) -> BoolArray:
-    """Whether a search about the windowed moments' Gaussians finds too few of the modes, (axes,). Components of small
-    weight do not count.
+    """Whether a search about the windowed moments' Gaussians finds too few of the modes, (axes,).
+
+    Components of small weight do not count.
     """
     variance = np.einsum("ij,acij->ac", view.gram, wide.covariance) / view.outputs
     heavy = wide.log_weight > math.log(_HEAVY)

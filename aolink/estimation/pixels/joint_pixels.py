@@ -1,7 +1,7 @@
 """The pixels of all spots of one large plant: one mode of the joint posterior, by Levenberg and Marquardt's method.
 
 As `aolink.estimation.pixels.modes`, but for hundreds of coefficients and in information form: the objective is
-(t - m)' P^-1 (t - m) / 2 minus the pixels' log-likelihood, Fisher's information in the place of the Hessian. At the
+(t - m)' P^-1 (t - m) / 2 minus the pixels' log-likelihood, with Fisher's information instead of the Hessian. At the
 mode its inverse is the covariance.
 
 The search starts at the prior's mean only. One spot does not distinguish a path from its reversal; the spots that one

@@ -19,7 +19,7 @@ from aolink.numerics.arrays import FloatArray, Indices
 
 FIRST_DAMPING = 0.01
 LARGEST_DAMPING = 1e6
-"""With more than this no step makes the objective smaller: the search is over."""
+"""Largest damping: beyond it no step makes the objective smaller, and the search ends."""
 FREE_DAMPING = 0.1
 """Up to this damping a short step means that a mode is near; with more damping, the damping makes it short."""
 

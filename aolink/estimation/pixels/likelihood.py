@@ -39,8 +39,8 @@ from aolink.optics.sensor import BaseSensor, SpotSensor
 
 # Rms of the noise path that is left out, in standard deviations of the kernel.
 _LEFT_OUT = 0.1
-# And in standard deviations with which the pixels of a spot at rest tell its position; for the sake of this there are
-# no more coefficients than so many, since what an estimate costs grows with their square.
+# And in standard deviations of the position as measured from the pixels of a spot at rest; for the sake of this there
+# are no more coefficients than this, since the cost of an estimate grows with the square of their number.
 _SEEN = 2.0
 _MOST_SEEN = 12
 # Random paths from which the number of nodes is found.
@@ -52,7 +52,7 @@ _REACH = 5.0
 
 @dataclass(frozen=True, eq=False)
 class Reduction:
-    """Few coefficients t in the place of z: z = (x, V xi'), t = (x, xi')."""
+    """A few coefficients t instead of z: z = (x, V xi'), t = (x, xi')."""
 
     expand: FloatArray
     """(n_coefficients, n): z = expand t."""
@@ -117,7 +117,7 @@ def reduction(model: ExposureModel, sensor: BaseSensor, *, left_out: float = _LE
 
 
 def _resting_sd(sensor: BaseSensor, variance: float) -> float:
-    """Standard deviation with which the pixels tell the position of a spot at rest (Cramer and Rao's bound).
+    """Standard deviation of the position of a spot at rest as measured from its pixels (Cramer and Rao's bound).
 
     By the mean information over positions in a pixel: a spot much narrower than that is seen only at its edges.
     """

@@ -1,7 +1,7 @@
 """Modes of the posterior of all pixels by Levenberg and Marquardt's method, from several starts; Laplace's evidence.
 
 The objective is -log p(t | pixels) with t whitened by its prior, s = L^-1 (t - m): |s|^2 / 2 minus the pixels'
-log-likelihood, Fisher's information in the place of the Hessian. At a mode its inverse is the covariance, and
+log-likelihood, with Fisher's information instead of the Hessian. At a mode its inverse is the covariance, and
 (Laplace) the log-evidence is log p(y | s) - |s|^2 / 2 - log |H| / 2.
 
 A search starts at the posterior of windowed moments, and others start from there along the directions in which that
@@ -43,7 +43,7 @@ _BROAD_PASSES = 2
 _NO_NOISE = 1e-14
 # The objective changes by less than this at a mode, which is near enough to draw points about it.
 _CONVERGED = 0.03
-# Modes that are nearer to each other than so many standard deviations are one.
+# Modes that are nearer to each other than this many standard deviations count as one.
 _APART = 0.7
 # Starts lie on both sides along the most uncertain direction of the path; along more directions where its variance is
 # larger than this many variances of the kernel.
@@ -73,7 +73,7 @@ class Modes:
 
     @classmethod
     def none(cls, axes: int, count: int, n: int) -> Modes:
-        """Room for so many modes, none of which is there."""
+        """Room for a number of modes, none of which is there yet."""
         nothing, never = np.zeros((axes, count)), np.full((axes, count), np.inf)
         return cls(np.zeros((axes, count, n)), np.zeros((axes, count, n, n)), -never, nothing, never)
 

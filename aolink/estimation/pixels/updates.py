@@ -172,8 +172,10 @@ def _wide_part(proposal: GaussianMixture, prior: GaussianMixture) -> GaussianMix
 
 
 def _by_share_of(points: GaussianMixture, wide: GaussianMixture) -> GaussianMixture:
-    """The wide Gaussians, each weighted by the share of the points' mixture that lies nearest to it. This is for axes
-    whose prior is in doubt: some of the wide Gaussians are about that prior, which the frame may rule out.
+    """The wide Gaussians, each weighted by the share of the points' mixture that lies nearest to it.
+
+    This is for axes whose prior is in doubt: some of the wide Gaussians are about that prior, which the frame may rule
+    out.
     """
     there = np.isfinite(wide.log_weight)
     covariance = np.where(there[..., None, None], wide.covariance, np.eye(wide.mean.shape[2]))

@@ -49,7 +49,7 @@ def test_a_session_records_the_counts_that_the_camera_gives(tmp_path: Path) -> N
     counted(found, shown)
     assert all(each.alignment_sigma_ns >= 2e6 for each in found)  # what the table says of the delay, at least
     assert recording.metadata["camera"] == f"Basler Emulation, serial number {SERIAL}, firmware 1.1, exposure 0.04 s"
-    assert "tells no time" in recording.metadata["camera_lacks"]
+    assert "reports no time" in recording.metadata["camera_lacks"]
     assert "does not count" not in recording.metadata["camera_lacks"]
 
 

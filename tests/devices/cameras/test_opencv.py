@@ -56,7 +56,7 @@ def test_a_session_records_a_film_as_it_plays(film: Path, tmp_path: Path) -> Non
     assert order == list(range(order[0], order[0] + len(order)))
     assert all(each.alignment_sigma_ns >= 2e6 for each in found)  # what the table says of the delay, at least
     assert recording.metadata["camera"].endswith("film.avi, exposure 0.04 s as the rig file says")
-    assert "tells no time" in recording.metadata["camera_lacks"]
+    assert "reports no time" in recording.metadata["camera_lacks"]
     assert "does not count" in recording.metadata["camera_lacks"]
 
 

@@ -372,7 +372,7 @@ def test_estimators_of_few_coefficients_are_refused(membrane):
     W = membrane.plant.process_noise.copy()
     W[0, 1] = W[1, 0] = 1.0
     other = dataclasses.replace(membrane, plant=dataclasses.replace(membrane.plant, process_noise=W))
-    with pytest.raises(EstimatorError, match="not of alike systems side by side: use o3"):
+    with pytest.raises(EstimatorError, match="does not consist of equal systems side by side: use o3"):
         make_estimator(other, "profile")
 
 
