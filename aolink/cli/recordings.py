@@ -154,9 +154,8 @@ def estimate(
             sources, models, estimator or ["o3"], output, engine.value, table=table is not None, overwrite=overwrite
         )
         part = f"-{shard.replace('/', '-of-')}" if shard else ""
-        _estimate_many(
-            todo, output, table or output / f"results{part}.csv", jobs, scheduler, side=True, as_json=as_json
-        )
+        results = table.with_stem(table.stem + part) if table else output / f"results{part}.csv"
+        _estimate_many(todo, output, results, jobs, scheduler, side=True, as_json=as_json)
         return
     if urls := [each for each in map(location, files) if not isinstance(each, Path)]:
         raise typer.BadParameter(f"{urls[0]} is a URL: of many recordings behind URLs --side makes side files")

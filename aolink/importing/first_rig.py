@@ -169,6 +169,7 @@ def _text(
     unit = side / 2  # pixels
     n, K = settings.track, settings.frames_per_exposure
     sigma, sigma_sd = known.sd * math.sqrt(2) / unit, known.sd_sd * math.sqrt(2) / unit
+    width_sd = f"+- {sigma_sd:.2g}" if math.isfinite(sigma_sd) else "no +- from one object"
     area = (2 / side) ** 2
     read, read_sd, electrons = _noise(known, 2 / side)
     peak = 1 / (2 * math.pi * (sigma**2 / 2 + area / 12))
@@ -215,7 +216,7 @@ photoelectrons = {electrons:.4g}
 
 [sensor.kernel]
 shape = "gaussian"
-sigma = {sigma:.6g}  # +- {sigma_sd:.2g}: {known.sd:.4g} pixels rms in one direction
+sigma = {sigma:.6g}  # {width_sd}: {known.sd:.4g} pixels rms in one direction
 
 [mirror]              # the shift of each window, of which the importer makes the inputs
 input_min = -4.0

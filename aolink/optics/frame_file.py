@@ -73,41 +73,55 @@ def parse_fits(data: bytes) -> FloatArray:
 
 
 def parse_fits_array(data: bytes) -> tuple[dict[str, str], NDArray[Any], float, float]:
-    """The primary array of a FITS file; Pence et al., Astron. Astrophys. 524, A42 (2010).
+    """The first array of a FITS file, primary or in an image extension; Pence et al., Astron. Astrophys. 524, A42
+    (2010).
 
     Returns
     -------
-    The header's values as text, by their keys; the array as it is stored, its axes in NumPy's order; and BSCALE and
-    BZERO, so that the values are ``array * BSCALE + BZERO``.
+    The values of the primary header and of the array's own as text, by their keys; the array as it is stored, its axes
+    in NumPy's order; and BSCALE and BZERO, so that the values are ``array * BSCALE + BZERO``.
 
     Raises
     ------
     FrameError
-        The data are not a FITS file.
+        The data are not a FITS file, or have no array.
     """
     if not data[:9] == b"SIMPLE  =":
         raise FrameError("it is not a FITS file: it does not begin with SIMPLE")
-    values, start = {}, 0
+    values, start, compressed = dict[str, str](), 0, False
+    while start < len(data):
+        own, start = _header(data, start)
+        values |= own
+        try:
+            kind = np.dtype(_TYPES[int(own["BITPIX"])])
+            shape = tuple(int(own[f"NAXIS{axis}"]) for axis in range(int(own["NAXIS"]), 0, -1))
+            scale, zero = (float(own.get(key, default)) for key, default in (("BSCALE", "1"), ("BZERO", "0")))
+            groups, heap = int(own.get("GCOUNT", "1")), int(own.get("PCOUNT", "0"))
+        except (KeyError, ValueError) as error:
+            raise FrameError(f"its header has no usable {error}") from None
+        count = math.prod(shape) if shape else 0
+        if count > 0 and own.get("XTENSION", "IMAGE") == "IMAGE":
+            if len(data) - start < count * kind.itemsize:
+                raise FrameError(f"it is cut off: {' x '.join(map(str, shape))} pixels are announced")
+            return values, np.frombuffer(data, kind, count, start).reshape(shape), scale, zero
+        compressed |= "ZIMAGE" in own
+        size = kind.itemsize * groups * (heap + max(count, 0))
+        start += -(-max(size, 0) // _BLOCK) * _BLOCK
+    if compressed:
+        raise FrameError("its picture is compressed in tiles: unpack it first, with funpack for instance")
+    raise FrameError("it has no array of pixels, neither a primary one nor in an image extension")
+
+
+def _header(data: bytes, start: int) -> tuple[dict[str, str], int]:
+    """A header's values as text by their keys, and where what comes after it begins."""
+    values = {}
     while (card := bytes(data[start : start + _CARD]))[:8].rstrip() != b"END":
         if len(card) < _CARD:
             raise FrameError("its header has no END: the file is cut off")
         if card[8:10] == b"= ":
             values[card[:8].decode("latin-1").rstrip()] = _value(card[10:].decode("latin-1"))
         start += _CARD
-    start = (start // _BLOCK + 1) * _BLOCK
-    try:
-        kind = _TYPES[int(values["BITPIX"])]
-        axes = int(values["NAXIS"])
-        shape = tuple(int(values[f"NAXIS{axis}"]) for axis in range(axes, 0, -1))
-        scale, zero = (float(values.get(key, default)) for key, default in (("BSCALE", "1"), ("BZERO", "0")))
-    except (KeyError, ValueError) as error:
-        raise FrameError(f"its header has no usable {error}") from None
-    if not shape or min(shape) < 1:
-        raise FrameError(f"its primary array has the shape {shape}: there is no picture in it")
-    count = math.prod(shape)
-    if len(data) - start < count * np.dtype(kind).itemsize:
-        raise FrameError(f"it is cut off: {' x '.join(map(str, shape))} pixels are announced")
-    return values, np.frombuffer(data, kind, count, start).reshape(shape), scale, zero
+    return values, (start // _BLOCK + 1) * _BLOCK
 
 
 def _value(text: str) -> str:

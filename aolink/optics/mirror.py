@@ -62,11 +62,6 @@ class Membrane:
         return np.stack([total.real, total.imag], axis=-2)
 
     @property
-    def coupling(self) -> FloatArray:
-        """Deflection at each pad's middle (rows) for 1 Pa on each (columns), m/Pa, (actuators, actuators)."""
-        return self.influence(self.pads_m)
-
-    @property
     def _strength(self) -> float:
         """Pad area over 2 pi T, m/Pa."""
         return self.pad_radius_m**2 / (2 * self.tension_n_per_m)

@@ -33,7 +33,7 @@ _BAND = 32
 """Rows of groups that are made at once: it bounds the memory."""
 
 
-def block_matching(image: FloatArray, noise_sd: float, *, band: int = _BAND) -> FloatArray:
+def block_matching(image: FloatArray, noise_sd: float) -> FloatArray:
     """A picture without its white noise of this standard deviation.
 
     In the first pass the small coefficients of each group are left out. Its result shows in the second pass which
@@ -53,8 +53,8 @@ def block_matching(image: FloatArray, noise_sd: float, *, band: int = _BAND) -> 
     level = image.mean()
     noisy = (image - level).astype(np.float32)
     patches = _Patches.of(noisy.shape[0], noisy.shape[1])
-    basic = patches.filtered(noisy, None, noise_sd, band)
-    return np.asarray(level + patches.filtered(noisy, basic.astype(np.float32), noise_sd, band))
+    basic = patches.filtered(noisy, None, noise_sd)
+    return np.asarray(level + patches.filtered(noisy, basic.astype(np.float32), noise_sd))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -87,12 +87,12 @@ class _Patches:
             window=np.outer(*(np.kaiser(n, _KAISER) for n in sides)).astype(np.float32),
         )  # fmt: skip
 
-    def filtered(self, noisy: Singles, guide: Singles | None, noise_sd: float, band: int) -> FloatArray:
+    def filtered(self, noisy: Singles, guide: Singles | None, noise_sd: float) -> FloatArray:
         """One pass: by a guide picture, or without one by a threshold."""
         total, weight = np.zeros(noisy.shape), np.zeros(noisy.shape)
         starts = _every(self.places[0])
-        for first in range(0, len(starts), band):
-            some = starts[first : first + band]
+        for first in range(0, len(starts), _BAND):
+            some = starts[first : first + _BAND]
             top = max(some[0] - _REACH, 0)
             part = slice(top, some[-1] + _REACH + self.sides[0])
             self._add(

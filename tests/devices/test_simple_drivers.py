@@ -7,7 +7,8 @@ import time
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from itertools import pairwise
-from typing import Any
+from pathlib import Path
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -16,14 +17,15 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from aolink.assembly import Frame
-from aolink.devices import discovery
 from aolink.devices.adapted_camera import AdaptedCamera
 from aolink.devices.adapted_mirror import AdaptedMirror
+from aolink.devices.discovery import find_drivers
 from aolink.devices.interfaces import ClockSampled, CommandAnswered, Event
 from aolink.devices.opening import open_devices
 from aolink.devices.simple import ClockAnswer, Lacks, SimpleFrame
 from aolink.errors import DeviceError
-from aolink.rig import load_rig
+from aolink.extensions import installed
+from aolink.rig import Rig, load_rig
 from aolink.rig.device_tables import Delay, DeviceTable
 from aolink.session.account import Account
 from aolink.session.report import Report
@@ -552,45 +554,70 @@ def test_a_camera_that_repeats_a_number_is_refused(camera: AdaptedCamera, bench:
         camera.poll()
 
 
+class WatchedMirror(Bench):
+    """A driver of which it is known when it was closed."""
+
+    closed: ClassVar[list[str]] = []
+
+    def __init__(self, rig: Rig) -> None:
+        super().__init__()
+
+    def close(self) -> None:
+        self.closed.append(type(self).__name__)
+
+
+class WingedMirror(WatchedMirror):
+    lacks = ("wings",)
+
+
+class CameraWithoutClock(WatchedMirror):
+    def time_ns(self) -> int:
+        raise OSError("no clock")
+
+
+@pytest.fixture
+def package(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """An installed package that has these drivers."""
+    (info := tmp_path / "odd-1.0.dist-info").mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: odd\nVersion: 1.0\n")
+    drivers = {
+        "cameras": {"clockless": CameraWithoutClock, "winged": WingedMirror},
+        "mirrors": {"good": WatchedMirror, "winged": WingedMirror},
+    }
+    (info / "entry_points.txt").write_text(
+        "".join(
+            f"[aolink.{kind}]\n" + "".join(f"{name} = {each.__module__}:{each.__name__}\n" for name, each in of.items())
+            for kind, of in drivers.items()
+        )
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    installed.cache_clear()
+    WatchedMirror.closed.clear()
+
+
+@pytest.mark.usefixtures("package")
 @pytest.mark.parametrize(
-    ("lacks", "what", "closed"),
+    ("mirror", "what", "closed"),
     [
-        ((), r"the driver of the camera failed when it was opened: OSError\('no clock'\)", ["camera", "mirror"]),
-        (("wings",), "the driver of the mirror failed when it was opened: ValueError", ["mirror"]),
+        (
+            "good", r"the driver of the camera failed when it was opened: OSError\('no clock'\)",
+            ["CameraWithoutClock", "WatchedMirror"],
+        ),
+        ("winged", "the driver of the mirror failed when it was opened: ValueError", ["WingedMirror"]),
     ],
-)
-def test_a_driver_that_turns_out_to_be_of_no_use_is_closed(
-    lacks: tuple[str, ...], what: str, closed: list[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    were_closed: list[str] = []
-
-    class Driver(Bench):
-        def __init__(self, kind: str) -> None:
-            super().__init__()
-            self.kind, self.lacks = kind, lacks if kind == "mirror" else ()
-
-        def time_ns(self) -> int:
-            if self.kind == "camera":
-                raise OSError("no clock")
-            return super().time_ns()
-
-        def close(self) -> None:
-            were_closed.append(self.kind)
-
-    monkeypatch.setattr("aolink.devices.opening.open_driver", lambda kind, table, rig: Driver(kind))
-    tables = {kind: DeviceTable(driver="bench", options={}) for kind in ("camera", "mirror")}
+)  # fmt: skip
+def test_a_driver_that_turns_out_to_be_of_no_use_is_closed(mirror: str, what: str, closed: list[str]) -> None:
+    tables = {
+        kind: DeviceTable(driver=name, options={}) for kind, name in (("camera", "clockless"), ("mirror", mirror))
+    }
     with pytest.raises(DeviceError, match=what), open_devices(replace(RIG, devices=tables)):
         pass
-    assert were_closed == closed
+    assert WatchedMirror.closed == closed
 
 
-def test_a_driver_with_an_unknown_lack_is_a_line_among_those_found(monkeypatch: pytest.MonkeyPatch) -> None:
-    class Driver:
-        lacks = ("wings",)
-
-    monkeypatch.setattr(discovery, "driver_names", lambda kind: ["odd"])
-    monkeypatch.setattr(discovery, "load_driver", lambda kind, name: Driver)
-    problems = [found.problem for found in discovery.find_drivers()]
+@pytest.mark.usefixtures("package")
+def test_a_driver_with_an_unknown_lack_is_a_line_among_those_found() -> None:
+    problems = [found.problem for found in find_drivers() if found.name == "winged"]
     assert [problem.split(":")[0] for problem in problems] == [
         f"the driver of the {kind} failed when it was asked what its devices lack" for kind in ("camera", "mirror")
     ]

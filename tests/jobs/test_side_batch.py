@@ -69,6 +69,16 @@ def test_the_command_in_parts_and_then_as_a_whole(aolink: Run, tmp_path: Path) -
     assert Recording(tmp_path / "s4.mcap", side=[tmp_path / "out" / "s4.o1.mcap"]).estimators == ["o1"]
 
 
+def test_parts_with_a_table_of_a_name_have_one_each(aolink: Run, tmp_path: Path) -> None:
+    names = [write_small(tmp_path / f"s{k}.mcap", 2).name for k in range(2)]
+    for part in ("1/2", "2/2"):
+        done = aolink("estimate", *names, "-e", "o1", "--side", "-o", "out", "--shard", part, "--table", "all.parquet")
+        assert done.returncode == 0, done.stderr
+    tables = [pq.read_table(tmp_path / f"all-{k}-of-2.parquet").to_pylist() for k in (1, 2)]
+    assert sorted(row["recording"] for table in tables for row in table) == names
+    assert not (tmp_path / "all.parquet").exists()
+
+
 def test_both_tables_in_parquet(aolink: Run, tmp_path: Path) -> None:
     """A failed recording is in the first; models by their names."""
     names = [write_small(tmp_path / f"s{k}.mcap", 3 + k).name for k in range(2)]

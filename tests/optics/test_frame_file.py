@@ -2,6 +2,8 @@
 
 import gzip
 import warnings
+from io import BytesIO
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from aolink.errors import FrameError
-from aolink.optics.frame_file import parse_fits, read_frame
+from aolink.optics.frame_file import parse_fits, parse_fits_array, read_frame
 
 
 @pytest.mark.parametrize("dtype", ["uint8", "int16", "uint16", "int32", "int64", "float32", "float64"])
@@ -77,3 +79,27 @@ def test_bad_files_say_what_is_wrong(tmp_path):
     np.save(tmp_path / "cube.npy", np.zeros((2, 2, 2)))
     with pytest.raises(FrameError, match="rows and columns"):
         read_frame(tmp_path / "cube.npy")
+
+
+def fits_bytes(*units: Any) -> bytes:
+    file = BytesIO()
+    fits.HDUList(list(units)).writeto(file)
+    return file.getvalue()
+
+
+def test_a_picture_in_an_extension_is_read_past_tables():
+    picture = np.arange(12, dtype=np.int16).reshape(3, 4)
+    table = fits.BinTableHDU.from_columns([fits.Column(name="t", format="D", array=np.arange(700.0))])
+    primary = fits.PrimaryHDU()
+    primary.header["EXPTIME"] = 0.25
+    data = fits_bytes(primary, table, fits.ImageHDU(picture))
+    values, found, scale, zero = parse_fits_array(data)
+    np.testing.assert_array_equal(found, picture)
+    assert (scale, zero, values["EXPTIME"]) == (1.0, 0.0, "0.25")
+
+
+def test_a_file_without_a_picture_says_what_it_has():
+    with pytest.raises(FrameError, match="compressed in tiles"):
+        parse_fits_array(fits_bytes(fits.PrimaryHDU(), fits.CompImageHDU(np.ones((40, 40), np.int16))))
+    with pytest.raises(FrameError, match="no array of pixels"):
+        parse_fits_array(fits_bytes(fits.PrimaryHDU()))

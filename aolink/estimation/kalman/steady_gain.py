@@ -10,6 +10,9 @@ from aolink.estimation.model.base import ExposureModel
 from aolink.numerics.arrays import FloatArray
 from aolink.plant.alike import MANY_STATES
 
+# The largest eigenvalue of a stable filter exceeds one by rounding at most.
+_ROUNDING = 1e-6
+
 
 def steady_gain(model: ExposureModel, Q: FloatArray, R: FloatArray) -> FloatArray | None:
     """Steady-state gain of the centroid filter on the lifted plant (A^N, C-bar), (n_states, n_outputs).
@@ -47,4 +50,8 @@ def _riccati_gain(A: FloatArray, H: FloatArray, Q: FloatArray, R: FloatArray) ->
         P = linalg.solve_discrete_are(A.T, H.T, Q, R)
     except (np.linalg.LinAlgError, ValueError):
         return None
-    return np.asarray(P @ H.T @ np.linalg.inv(H @ P @ H.T + R))
+    gain = np.asarray(P @ H.T @ np.linalg.inv(H @ P @ H.T + R))
+    # A state that neither decays nor is driven by noise can make the solver return another solution than the
+    # stabilising one, without an error.
+    growth = np.abs(np.linalg.eigvals(A @ (np.eye(len(A)) - gain @ H))).max()
+    return gain if growth <= 1 + _ROUNDING else None

@@ -50,9 +50,8 @@ def test_several_vibrations_are_tempered_and_the_reason_says_so():
     assert "too few importance weights count: 600 points tempered, and 54% of windowed moments" in estimate.reason
 
 
-def test_too_few_points_for_the_coefficients_are_not_tempered(monkeypatch):
+def test_too_few_points_for_the_coefficients_are_not_tempered():
     """It is then the estimate of windowed moments, which is uncertain enough."""
-    monkeypatch.delattr("aolink.estimation.pixels.importance.tempered_points")
     rig, exposure = one_axis(1)
     estimate = make_estimator(rig, "profile", tempered=100).step(exposure)
     assert estimate.reason.endswith("too few importance weights count: windowed moments")
@@ -62,15 +61,13 @@ def test_too_few_points_for_the_coefficients_are_not_tempered(monkeypatch):
     assert np.mean(estimate.path_sd**2) == pytest.approx(np.mean(moments.path_sd**2), rel=0.3)
 
 
-def test_without_a_budget_nothing_is_tempered(monkeypatch):
-    monkeypatch.delattr("aolink.estimation.pixels.importance.tempered_points")
+def test_without_a_budget_nothing_is_tempered():
     rig, exposure = one_axis(1)
     estimate = make_estimator(rig, "profile", tempered=0).step(exposure)
     assert "too few importance weights count: the estimate is wide" in estimate.reason
 
 
-def test_a_spot_that_windowed_moments_find_is_not_tempered(monkeypatch):
-    monkeypatch.delattr("aolink.estimation.pixels.importance.tempered_points")
+def test_a_spot_that_windowed_moments_find_is_not_tempered():
     estimator = make_estimator(LIVELY, "profile")
     assert not any("tempered" in estimator.step(exposure).reason for exposure in simulate(LIVELY, 4, seed=1))
 

@@ -11,16 +11,18 @@ from scipy import linalg
 from aolink.errors import EstimatorError
 from aolink.estimation import SpotWindows, Status, exposure_model, make_estimator, run, score, smooth
 from aolink.estimation.frames.centroid_noise import centroid_covariance
+from aolink.estimation.frames.frame_data import Measurement
 from aolink.estimation.frames.measure import measure
-from aolink.estimation.kalman import information_form, path_moments, predict
-from aolink.estimation.kalman.filter import BlurFilter
+from aolink.estimation.kalman import information_form
 from aolink.estimation.kalman.gaussian import Gaussian
-from aolink.estimation.kalman.path_moments import PathMoments
+from aolink.estimation.kalman.path_moments import predicted_moments
 from aolink.estimation.kalman.steady_gain import steady_gain
+from aolink.estimation.kalman.update import joseph_update
 from aolink.estimation.model import joint_paths
 from aolink.estimation.model.dense import DenseModel
 from aolink.estimation.model.factored import FactoredModel
 from aolink.estimation.model.joint_paths import JointPaths
+from aolink.estimation.model.quadrature import quadrature_paths
 from aolink.estimation.moments import windowed
 from aolink.estimation.moments.joint_moments import JointMoments, by_spot
 from aolink.estimation.moments.spots import WindowedSpots
@@ -174,25 +176,25 @@ def test_the_mode_and_its_covariance_are_those_of_the_dense_search(rig, frame):
 # The estimators
 
 
-def test_o3_is_the_dense_filter_in_every_step(small_membrane, monkeypatch):
-    rig = small_membrane
+def test_o3_is_the_dense_filter_in_every_step(small_membrane):
+    rig, plant = small_membrane, small_membrane.plant
     exposures = simulate(rig, 6)
-    estimates = run(rig, exposures, ["o3"])["o3"]
     needs = make_estimator(rig, "o3").filter.needs
-    measured = [measure(rig, exposure, needs)[0] for exposure in exposures]
-    for module in (path_moments, predict):
-        monkeypatch.setattr(module, "MANY_STATES", 10_000)
-    moments = PathMoments(rig.plant, (1, 2))
-    model = DenseModel(rig.plant, 200)
-    dense = BlurFilter(rig.plant, moments)
-    for exposure, found, seen in zip(exposures, estimates, measured, strict=True):
-        step = dense.step(model, exposure_model(rig.plant, 200).response(exposure.inputs), seen)
-        sd = np.sqrt(np.diag(step.end.covariance[0]))
-        np.testing.assert_allclose(found.end_state[0] / sd, step.end.mean[0] / sd, atol=1e-6)
-        ours, theirs = (each / sd / sd[:, None] for each in (found.end_covariance[0], step.end.covariance[0]))
-        np.testing.assert_allclose(ours, theirs, atol=1e-6)
+    model, P, mean = DenseModel(plant, 200), plant.initial_covariance, plant.initial_mean
+    for exposure, found in zip(exposures, run(rig, exposures, ["o3"])["o3"], strict=True):
+        seen = must_be(Measurement, measure(rig, exposure, needs)[0])
+        response = exposure_model(plant, 200).response(exposure.inputs)
+        h, H = predicted_moments(model, response, mean[None], (1, 2))
+        noise = linalg.block_diag(*seen.covariance[0])
+        step = joseph_update(Gaussian(mean[None], P[None]), seen.value - h, H, noise[None])
+        mean = model.transition @ step.posterior.mean[0] + response.end[0]
+        P = model.transition @ step.posterior.covariance[0] @ model.transition.T + model.process_noise
+        sd = np.sqrt(np.diag(P))
+        np.testing.assert_allclose(found.end_state[0] / sd, mean / sd, atol=1e-6)
+        np.testing.assert_allclose(found.end_covariance[0] / sd / sd[:, None], P / sd / sd[:, None], atol=1e-6)
         np.testing.assert_allclose(found.nis, step.nis, rtol=1e-8)
-        np.testing.assert_allclose(found.innovation_covariance, step.innovation_covariance, rtol=1e-8)
+        variances = np.einsum("amm->am", step.innovation_covariance)
+        np.testing.assert_allclose(found.innovation_covariance, variances, rtol=1e-8)
 
 
 @pytest.mark.parametrize("flux", ["known", "measured"])
@@ -204,19 +206,23 @@ def test_moments_are_the_dense_ones_but_for_errors_that_spots_share(rig, frame, 
     paths = joint_paths.joint_paths(frame.model, rig.sensor)
     assert paths.size == frame.model.n_coefficients
     spots = rig.plant.n_outputs // 2
-    theirs = WindowedSpots(rig.sensor, spots, flux=flux)
-    monkeypatch.setattr(windowed, "blocks", lambda *_: paths.resolution.levels[0])
-    whole = WindowedSpots.regression
+    nodes = quadrature_paths(frame.model, frame.response, paths.resolution.levels[0])
 
-    def of_each_spot(*arguments):
-        fit = whole(*arguments)
-        size = fit.remainder.shape[1] // spots
-        own = np.kron(np.eye(spots), np.ones((size, size)))
-        return Regression(fit.expected, fit.slope, fit.remainder * own)
+    class Apart(WindowedSpots):
+        """At these nodes, and without errors that spots share."""
 
-    monkeypatch.setattr(theirs, "regression", lambda *arguments: of_each_spot(theirs, *arguments))
+        def look(self, _, about, measured):
+            return super().look(nodes, about, measured)
+
+        def regression(self, *arguments):
+            fit = super().regression(*arguments)
+            size = fit.remainder.shape[1] // spots
+            own = np.kron(np.eye(spots), np.ones((size, size)))
+            return Regression(fit.expected, fit.slope, fit.remainder * own)
+
     before = whole_prior(frame, paths.size)
-    expected = theirs.update(frame.model, frame.response, before, frame.windows)
+    dense = Apart(rig.sensor, spots, flux=flux)
+    expected = dense.update(frame.model, frame.response, before, frame.windows)
     found = JointMoments(rig.sensor, rig.plant.n_outputs, flux=flux).update(
         frame.model, frame.response, before, frame.windows
     )
