@@ -34,17 +34,20 @@ class FrameIndex:
     @classmethod
     def of(cls, path: Path, chunks: Sequence[ChunkIndex], frames: Collection[int]) -> FrameIndex | None:
         """Count the messages of the channels ``frames``; None where the file does not index its messages."""
-        counts = []
-        with open_recording(path) as file:
-            unbuffered = getattr(file, "raw", file)  # only a few bytes of each chunk are needed, not a page
-            for chunk in chunks:
+        # Only a few bytes of each chunk are needed, not a page of a file, nor what is read ahead behind a URL.
+        heads = [
+            sorted((offset, channel) for channel, offset in chunk.message_index_offsets.items() if channel in frames)
+            for chunk in chunks
+        ]
+        size, counts = HEAD.size + _INDEX_HEAD.size, []
+        with open_recording(path, sorted((offset, size) for each in heads for offset, _ in each)) as file:
+            unbuffered = getattr(file, "raw", file)
+            for each in heads:
                 count = 0
-                for channel, offset in chunk.message_index_offsets.items():
-                    if channel not in frames:
-                        continue
+                for offset, channel in each:
                     unbuffered.seek(offset)
-                    head = unbuffered.read(HEAD.size + _INDEX_HEAD.size)
-                    if len(head) < HEAD.size + _INDEX_HEAD.size or head[0] != Opcode.MESSAGE_INDEX:
+                    head = unbuffered.read(size)
+                    if len(head) < size or head[0] != Opcode.MESSAGE_INDEX:
                         return None
                     found, length = _INDEX_HEAD.unpack_from(head, HEAD.size)
                     if found != channel:

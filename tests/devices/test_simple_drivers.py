@@ -300,7 +300,7 @@ def test_arrivals_before_a_session_are_apart_from_its_own() -> None:
         ({"pixels": np.zeros((2, 3), np.uint16)}, r"the camera gives \(2, 3\) pixels from 0 to 0, the rig file says"),
         ({"exposure_ns": EXPOSURE_NS + STEP_NS}, r"the camera exposes for 0.201 s, the rig file says 0.2 s: correct"),
         ({"start_ns": CAMERA_ZERO_NS + 10**12}, "a frame whose exposure ends in the future"),
-        ({"start_ns": None}, r"the driver of bench gives a frame without start_ns although its time_ns\(\) tells"),
+        ({"start_ns": None}, r"the driver of bench gives a frame without start_ns although its time_ns\(\) gives"),
     ],
 )
 def test_a_frame_that_is_not_of_this_rig_is_refused(

@@ -232,7 +232,7 @@ def test_a_fits_header_says_times(tmp_path):
 
 
 def test_fits_without_a_cube_is_refused(tmp_path):
-    assert "there is no picture" in refused(others.write_fits(tmp_path / "a.fits", None))  # type: ignore[arg-type]
+    assert "no array of pixels" in refused(others.write_fits(tmp_path / "a.fits", None))  # type: ignore[arg-type]
     four = others.write_fits(tmp_path / "b.fits", np.zeros((2, 3, 4, 5)))
     assert "shape (2, 3, 4, 5), expected (frames, rows, columns)" in refused(four)
 

@@ -63,5 +63,5 @@ def test_the_demo_prints_what_readme_says(readme: Rows, printed: Rows) -> None:
 
 def test_the_readme_says_how_near_its_figures_are() -> None:
     text = " ".join(README.read_text().split())
-    assert "on x86-64 your figures are these to a unit of the last digit" in text
+    assert "on x86-64 your figures agree with these to one unit of the last digit" in text
     assert "allow `profile` and `mixture` 1 % (NIS and NEES 3 %)" in text

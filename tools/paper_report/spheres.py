@@ -141,16 +141,19 @@ def _film_of(frames: int, effort: Effort) -> Film:
         spread = np.hypot(np.array([each.path_sd for each in some]), truth_sd)
         coverage[name] = float((error <= BEYOND_95 * spread).mean(axis=2).T[counts].mean())
 
+    def of(errors: FloatArray, which: BoolArray) -> FloatArray:
+        """Those that count, of the axes that have any."""
+        return np.where(which, errors, np.nan)[which.any(axis=1)]
+
     def over(errors: dict[str, FloatArray], reference: FloatArray, which: BoolArray) -> dict[str, Measured]:
-        own = np.where(which, reference, np.nan)
-        return {name: ratio(np.where(which, each, np.nan), own) for name, each in errors.items()}
+        return {name: ratio(of(each, which), of(reference, which)) for name, each in errors.items()}
 
     everywhere = np.ones_like(counts)
     return Film(
         frames,
-        {name: rms(np.where(counts, each, np.nan)) for name, each in path.items()},
+        {name: rms(of(each, counts)) for name, each in path.items()},
         over(path, held, counts),
-        {name: rms(np.where(counts, each, np.nan)) for name, each in smoothed.items()},
+        {name: rms(of(each, counts)) for name, each in smoothed.items()},
         over(smoothed, interpolated, counts),
         coverage,
         int((~counts).sum()) // 2,
