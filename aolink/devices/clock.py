@@ -80,8 +80,8 @@ class ClockRegression:
     two steps of the clock; it does not average out.
 
     A reply that contradicts the regression makes the clock suspect, and so does a call of `suspect`. Until newer
-    queries have settled it, both hypotheses count: times follow the clock before the step, and sigma is wide enough to
-    cover the clock after it.
+    queries have settled it, both clocks count, before and after the step: times follow the clock before the step, and
+    sigma is wide enough to cover the clock after it.
     """
 
     def __init__(self) -> None:

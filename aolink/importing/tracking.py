@@ -44,7 +44,7 @@ _SAMPLES = 100
 STRAY = 1 / 8
 """Distance of an object from the middle of its window at which the window moves, as a share of the window."""
 _STRETCH = 10
-"""Of these frames, so many in a row are averaged to see what shines beside an object."""
+"""Number of successive sampled frames that are averaged to find light beside an object."""
 _ALONE = 1 / 3
 """Light beside an object that is less bright than this share of it does not matter."""
 _REST = 2.5
@@ -260,7 +260,7 @@ def _fitted(
 ) -> tuple[float, float, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
     """The Gaussian, integrated over pixels, and the background that best fit windows (samples, n, side, side).
 
-    What they leave of the windows, averaged over some of these, tells the light beside an object (`Survey.beside`).
+    The residuals, averaged over some windows, give the light beside an object (`Survey.beside`).
     """
     _, n, side, _ = windows.shape
     edges = np.arange(side + 1) - 0.5

@@ -1,4 +1,4 @@
-"""The table of topics says of each message what the rest of the house relies on."""
+"""The table of topics says of each message what the rest of aolink relies on."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from aolink.recording import topics
 from aolink.recording.topics import TOPICS, Topic
 from aolink.viewing import devices
 
-HOUSE = Path(aolink.__file__).parent
+PACKAGE = Path(aolink.__file__).parent
 
 
 @pytest.mark.parametrize("row", TOPICS, ids=lambda row: row.name)
@@ -44,8 +44,8 @@ def test_a_message_of_another_kind_belongs_to_its_time_alone() -> None:
 
 def test_topics_are_written_in_the_table_alone() -> None:
     """Every other module of aolink names them by the table."""
-    for path in HOUSE.rglob("*.py"):
-        if path.name.endswith("_pb2.py") or path == HOUSE / "recording" / "topics.py":
+    for path in PACKAGE.rglob("*.py"):
+        if path.name.endswith("_pb2.py") or path == PACKAGE / "recording" / "topics.py":
             continue
         found = list(ast.walk(ast.parse(path.read_text())))
         parts = {
@@ -55,11 +55,11 @@ def test_topics_are_written_in_the_table_alone() -> None:
         assert not texts & {row.name for row in TOPICS}, path
 
 
-def test_the_rooms_page_has_the_table() -> None:
+def test_the_page_has_the_table() -> None:
     def cell(text: str) -> str:
         return f"`{text}`" if text else ""
 
-    page = (HOUSE / "recording" / "README.md").read_text()
+    page = (PACKAGE / "recording" / "README.md").read_text()
     found = [re.sub(r" +", " ", line) for line in page.splitlines() if line.startswith("| `")]
     assert found == [
         re.sub(
@@ -73,6 +73,6 @@ def test_the_rooms_page_has_the_table() -> None:
 
 
 def test_the_page_for_other_software_names_every_topic() -> None:
-    page = (HOUSE.parent / "recordings" / "FORMAT.md").read_text()
+    page = (PACKAGE.parent / "recordings" / "FORMAT.md").read_text()
     for row in TOPICS:
         assert f"`{row.name}" in page or (row.name.startswith(topics.RESTORED) and f"`{topics.RESTORED}" in page)

@@ -47,7 +47,7 @@ class Innovation:
     """(axes, k, k)"""
     nis: FloatArray
     """(axes,)"""
-    believed: BoolArray
+    within_gate: BoolArray
     """Whether the chi-square of pixels and prior together passes the gate, (axes,)."""
 
 
@@ -185,7 +185,7 @@ class MixtureFilter(Filter):
             # The pixels' own noise is left out of their likelihoods, being the same at all points of one camera.
             pixels = np.count_nonzero(measured.mask.reshape(axes, -1), axis=1)
             log_evidence -= 0.5 * pixels * math.log(effective_noise_density(self.sensor) / self.sensor.pixel_size)
-            trusted = new.believed[seen] | (not self._gate)
+            trusted = new.within_gate[seen] | (not self._gate)
             took = seen[trusted]
             status[seen], self._missed[seen] = gate_status(trusted, lost[seen], self._missed[seen])
         if not np.array_equal(took, np.arange(axes)):

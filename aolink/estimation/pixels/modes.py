@@ -55,7 +55,7 @@ _REVERSED_TO = 0.2
 # Directions of the pixels, for each output, in which an innovation is given; in the others there is hardly but noise.
 _NEW_DIRECTIONS = 4
 # Information of a direction, as a share of the largest, that is rounding.
-_TELLS_NOTHING = 1e-13
+_NO_INFORMATION = 1e-13
 
 
 @dataclass(frozen=True, eq=False)
@@ -280,7 +280,7 @@ def innovation(view: PixelView, prior: Gaussian, modes: Modes) -> Innovation:
     if (line := view.line) is not None:
         u, values, nis, square = np.empty((axes, k)), np.empty((axes, k)), np.empty(axes), np.empty(axes)
         compiled_modes.innovations_of_lines(
-            line, np.ascontiguousarray(prior.mean), np.ascontiguousarray(prior.covariance), t, _TELLS_NOTHING, u,
+            line, np.ascontiguousarray(prior.mean), np.ascontiguousarray(prior.covariance), t, _NO_INFORMATION, u,
             values, nis, square,
         )  # fmt: skip
     else:
@@ -288,9 +288,9 @@ def innovation(view: PixelView, prior: Gaussian, modes: Modes) -> Innovation:
     # At the truth this is chi-square of all pixels and coefficients, and where the objective is least it is less.
     total = square + distance
     degrees = np.add.reduce(view.mask, axis=1) + n
-    believed = total <= 2 * special.gammainccinv(degrees / 2, GATE_PROBABILITY)
+    within_gate = total <= 2 * special.gammainccinv(degrees / 2, GATE_PROBABILITY)
     covariance = (1 + values)[..., None] * np.eye(k)
-    return Innovation(u, covariance, nis, believed & np.isfinite(nis))
+    return Innovation(u, covariance, nis, within_gate & np.isfinite(nis))
 
 
 def _innovations(
@@ -307,7 +307,7 @@ def _innovations(
     values, V = np.maximum(values[:, ::-1][:, :k], 0.0), V[:, :, ::-1][:, :, :k]
     S = np.sqrt(values)
     # The innovation is zero in a direction about which the pixels have no information.
-    tells = values > _TELLS_NOTHING * values[:, :1]
+    tells = values > _NO_INFORMATION * values[:, :1]
     pull = batched.matvec(batched.transpose(batched.matmul(A, V)), e)
     u = np.where(tells, pull / np.where(tells, S, 1.0), 0.0) + S * batched.matvec(batched.transpose(V), s)
     return u, values, np.add.reduce(u * u / (1 + values), axis=1), batched.dot(e, e)

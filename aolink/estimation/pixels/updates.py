@@ -116,7 +116,7 @@ class ImportanceUpdater:
             if len(which):
                 fit, good = posterior(view.part(which), before.part(which), proposal.part(which), share)
                 after = after.replaced(which, fit)
-                poor[which] |= ~good & new.believed[which]
+                poor[which] |= ~good & new.within_gate[which]
         few = np.flatnonzero(poor)
         if len(few) and self.points:
             some, fit, missed = view.part(few), wide.part(few), self._missed(reduced)

@@ -1,4 +1,4 @@
-"""The smoother of mixtures: against all hypotheses of a linear case, and on paths that only later frames make out."""
+"""The smoother of mixtures: against all components of a linear case, and on paths that only later frames make out."""
 
 import dataclasses
 
@@ -40,7 +40,7 @@ class Centroid:
         return joseph_update(prior, innovation, row[None], np.full((1, 1, 1), SD**2))
 
 
-def hypothesis(rig, mean, exposures):
+def component(rig, mean, exposures):
     """Estimates of a linear filter that starts from this mean, and the log-likelihood of all frames up to each."""
     plant = dataclasses.replace(
         rig.plant, initial_mean=np.asarray(mean), initial_covariance=rig.plant.initial_covariance / 50
@@ -52,7 +52,7 @@ def hypothesis(rig, mean, exposures):
 
 
 def mixed(logs, estimates, components):
-    """The estimate of a mixture of hypotheses with these log-weights."""
+    """The estimate of a mixture of components with these log-weights."""
     w = special.softmax(logs)
     changes = {}
     for mean, covariance in (("coefficients", "coefficient_covariance"), ("end_state", "end_covariance")):
@@ -73,11 +73,11 @@ def without_components(estimates):
 
 
 def exact(means, seed=3, count=6):
-    """Filtered estimates of a linear mixture of hypotheses, and the smoothed ones, hypothesis by hypothesis."""
+    """Filtered estimates of a linear mixture of components, and the smoothed ones, component by component."""
     timing = dataclasses.replace(LIVELY.timing, frame_period_steps=260)
     rig = dataclasses.replace(LIVELY, timing=timing)
     exposures = simulate(rig, count, seed=seed)
-    found, logs = zip(*(hypothesis(rig, mean, exposures) for mean in means), strict=True)
+    found, logs = zip(*(component(rig, mean, exposures) for mean in means), strict=True)
     size = found[0][0].coefficients.shape[1]
     wide = np.zeros((1, 2)), 1e3 * rig.plant.initial_covariance[None]
     filtered = []
@@ -111,7 +111,7 @@ def test_one_gaussian_gives_what_rauch_tung_and_striebel_give():
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
-def test_hypotheses_are_weighed_by_all_frames(seed):
+def test_components_are_weighed_by_all_frames(seed):
     rig, exposures, filtered, expected = exact([(0.04, 0.0), (-0.04, 0.2), (0.0, -0.3)], seed)
     smoothed = smooth(rig.plant, exposures, filtered)
     as_one_gaussian = smooth(rig.plant, exposures, without_components(filtered))

@@ -252,7 +252,7 @@ def test_the_innovation_is_that_of_the_twin(pair):
     information = np.einsum("aii->ai", theirs.covariance) - 1
     tells = information > 1e-5 * information[:, :1]
     np.testing.assert_allclose(ours.value[tells] ** 2, theirs.value[tells] ** 2, rtol=0.02, atol=0.02)
-    np.testing.assert_array_equal(ours.believed, theirs.believed)
+    np.testing.assert_array_equal(ours.within_gate, theirs.within_gate)
     np.testing.assert_allclose(ours.covariance, theirs.covariance, rtol=5e-3, atol=1e-3)
 
 

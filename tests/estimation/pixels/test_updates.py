@@ -460,6 +460,6 @@ def test_a_frame_that_cannot_be_believed_is_not_tempered(updates, monkeypatch):
     lie.y = np.roll(np.abs(lie.y), 15, axis=1) + 3.0
     monkeypatch.setattr("aolink.estimation.pixels.importance.ENOUGH", np.inf)
     of_a_lie = updates.update(lie, single(state), state, 0)
-    assert not of_a_lie.innovation.believed[0]
+    assert not of_a_lie.innovation.within_gate[0]
     assert not of_a_lie.poor[0]
     assert updates.update(view, single(state), state, 0).poor[0]
