@@ -235,15 +235,15 @@ def _text(
         A, B, B_w, C = f"[[{motion.a:.8g}, 0.0], [0.0, 1.0]]", "[[0.0], [1.0]]", "[[1.0], [0.0]]", "[[1.0, 1.0]]"
         variance = motion.q / (1 - motion.a**2) / unit**2
         kind, initial = "Ornstein-Uhlenbeck process", f"[[{variance:.4g}, 0.0], [0.0, {_ANYWHERE}]]"
-    memory = "" if walk else f"; a = {motion.a:.5g} +- {motion.a_sd:.2g} a frame"
+    memory = "" if walk else f": a = {motion.a:.5g} +- {motion.a_sd:.2g} a frame"
     said = "".join(f"# Note: {note}.\n" for note in notes)
     return f"""# Written by `aolink rig --from {film.name}` from its single frames. +- is one standard deviation.
 {said}name = "{name}"
 summary = "{n} objects of {film.name}, each in a window of {side} pixels that follows it; slope unit: {unit:g} pixels"
 
-[plant]               # a copy for each object along x and along y: {kind}{memory}
+[plant]               # a copy for each object along x and along y
 axes = {2 * n}
-A = {A}
+A = {A}  # {kind}{memory}
 B = {B}           # the input shifts the window
 B_w = {B_w}
 C = {C}
