@@ -2,22 +2,16 @@
 
 from __future__ import annotations
 
-import struct
 from bisect import bisect_right
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import accumulate
-from pathlib import Path
 
-from mcap.opcode import Opcode
 from mcap.records import ChunkIndex
 
-from aolink.recording.scan import open_recording
-from aolink.recording.search import HEAD
-
-_INDEX_HEAD = struct.Struct("<HI")
-"""Channel and bytes of a message index."""
-_ENTRY_BYTES = 16
+_INDEX_HEAD = 15
+"""Bytes of a message index without entries: opcode, length, channel, length of the entries."""
+_ENTRY = 16
 """Bytes of an entry in a message index."""
 
 StepRun = tuple[str, int]
@@ -32,28 +26,26 @@ class FrameIndex:
     """Frames before each chunk, (chunks + 1,); the last element is the number of all frames."""
 
     @classmethod
-    def of(cls, path: Path, chunks: Sequence[ChunkIndex], frames: Collection[int]) -> FrameIndex | None:
-        """Count the messages of the channels ``frames``; None where the file does not index its messages."""
-        # Only a few bytes of each chunk are needed, not a page of a file, nor what is read ahead behind a URL.
-        heads = [
-            sorted((offset, channel) for channel, offset in chunk.message_index_offsets.items() if channel in frames)
-            for chunk in chunks
-        ]
-        size, counts = HEAD.size + _INDEX_HEAD.size, []
-        with open_recording(path, sorted((offset, size) for each in heads for offset, _ in each)) as file:
-            unbuffered = getattr(file, "raw", file)
-            for each in heads:
-                count = 0
-                for offset, channel in each:
-                    unbuffered.seek(offset)
-                    head = unbuffered.read(size)
-                    if len(head) < size or head[0] != Opcode.MESSAGE_INDEX:
-                        return None
-                    found, length = _INDEX_HEAD.unpack_from(head, HEAD.size)
-                    if found != channel:
-                        return None
-                    count += length // _ENTRY_BYTES
-                counts.append(count)
+    def of(cls, chunks: Sequence[ChunkIndex], frames: Collection[int]) -> FrameIndex | None:
+        """Count the messages of the channels ``frames``; None where the file does not index its messages.
+
+        The indexes of a chunk's messages follow it one after the other, so that their places tell how long they are:
+        nothing of the file is read.
+        """
+        counts = []
+        for chunk in chunks:
+            start = chunk.chunk_start_offset + chunk.chunk_length
+            places = sorted((offset, channel) for channel, offset in chunk.message_index_offsets.items())
+            ends = [*(offset for offset, _ in places[1:]), *([start + chunk.message_index_length] if places else [])]
+            if places and places[0][0] != start:
+                return None
+            count = 0
+            for (offset, channel), end in zip(places, ends, strict=True):
+                entries, rest = divmod(end - offset - _INDEX_HEAD, _ENTRY)
+                if entries < 0 or rest:
+                    return None
+                count += entries * (channel in frames)
+            counts.append(count)
         return cls([0, *accumulate(counts)])
 
     def chunk_of(self, frame: int) -> int:

@@ -385,7 +385,7 @@ class Recording(Series):
         if self._index is None or self._losses or self.counts.get(topics.EXPOSURE) != self.n_frames:
             return None
         frames = {channel for channel, (topic, _) in self._channels.items() if topic == topics.EXPOSURE}
-        index = FrameIndex.of(self.path, self._index, frames)
+        index = FrameIndex.of(self._index, frames)
         return index if index is not None and index.before[-1] == self.n_frames else None
 
     def _runs_in(self, chunk: int) -> Iterator[StepRun]:

@@ -42,8 +42,8 @@ def only_paths(places: Iterable[Path | Url]) -> list[Path]:
 class Url:
     """The place of a recording that is not a file of this machine.
 
-    It keeps the first and the last bytes that were read, so that a recording that is opened again requests no bytes
-    twice. Between processes only the URL itself travels.
+    It keeps the first, the last and the latest bytes that were read, so that a recording that is opened again requests
+    few bytes twice. Between processes only the URL itself travels.
     """
 
     def __init__(self, text: str) -> None:
@@ -51,6 +51,8 @@ class Url:
         """The whole URL. Messages show it without password and query, which may hold a signature."""
         self.ends: dict[int, bytes] = {}
         """The first and the last bytes, as far as they were read, by their position."""
+        self.latest: deque[tuple[int, bytes]] = deque(maxlen=_KEPT)
+        """The latest ranges that were read: where each begins, and its bytes."""
 
     def __str__(self) -> str:
         parts = urlsplit(self.text)
@@ -164,7 +166,6 @@ class RangeFile(io.RawIOBase):
     def __init__(self, url: Url, expected: Sequence[tuple[int, int]] = ()) -> None:
         self._url, self._size, self._at = url, url.size, 0
         self._spans = deque(_joined(expected))
-        self._kept: deque[tuple[int, bytes]] = deque(maxlen=_KEPT)
 
     def readable(self) -> bool:
         return True
@@ -193,13 +194,14 @@ class RangeFile(io.RawIOBase):
 
     def _around(self, position: int, end: int) -> tuple[int, bytes]:
         """The bytes of a range that contains a position, and where it begins; the file will be read up to ``end``."""
-        for start, data in (*self._url.ends.items(), *self._kept):
+        for start, data in (*self._url.ends.items(), *self._url.latest):
             if start <= position < start + len(data):
                 return start, data
         start, stop = self._range(position, end)
         stop = min([stop, *(there for there in self._url.ends if there > position)])  # that is known already
-        self._kept.append((start, self._url.read(start, stop)))
-        return self._kept[-1]
+        found = start, self._url.read(start, stop)
+        self._url.latest.append(found)
+        return found
 
     def _range(self, position: int, end: int) -> tuple[int, int]:
         while self._spans and self._spans[0][1] <= position:
