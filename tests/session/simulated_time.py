@@ -154,7 +154,7 @@ class SimulatedTimeHub(Host):
         self.at.sort(key=itemgetter(0))
 
     def wait(self, timeout_s: float) -> list[tuple[Link, Received]]:
-        pending, self._pending = self._pending, []
+        pending, self.pending = self.pending, []
         for thread in threading.enumerate():
             if thread.name == "aolink-reopening":  # which takes no time on the simulated clock
                 thread.join()
