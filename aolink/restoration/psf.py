@@ -231,7 +231,8 @@ def _path_root(covariance: ArrayLike, size: int) -> FloatArray:
 def _axis(positions: FloatArray, width: FloatArray) -> tuple[FloatArray, FloatArray, int]:
     """Masses in pixels and their derivatives by position, (n_steps, points, pixels), and the pixel of no displacement.
 
-    Positions (n_steps, points), widths (n_steps,).
+    Positions (n_steps, points), widths (n_steps,). `aolink.optics.kernel.pixel_masses` has the same integrals, and
+    derivatives that differ in their last bits: these stand alone so that restored pictures stay as they are.
     """
     reach = _REACH * float(width.max()) / math.sqrt(2)
     low = min(0, math.floor(positions.min() - reach))
