@@ -20,7 +20,7 @@ from scipy import ndimage, optimize
 from aolink.errors import FrameError, ImportingError
 from aolink.exposure import Truth
 from aolink.importing.film import Film
-from aolink.importing.frames import Account, ImportedExposure, Light, Settings, counts_of, grouped, rig_frame
+from aolink.importing.frames import Account, FilmLight, ImportedExposure, Settings, counts_of, grouped, rig_frame
 from aolink.numerics.arrays import BoolArray, FloatArray
 from aolink.optics.centroid import weighted_centroid
 from aolink.optics.kernel import pixel_masses
@@ -145,7 +145,7 @@ def find_objects(film: Film, settings: Settings) -> Objects:
     """
     if settings.places and len(settings.places) != settings.track:
         raise ImportingError(f"{len(settings.places)} places are given for --track {settings.track}: give one for each")
-    light, frames = Light(film, settings), []
+    light, frames = FilmLight(film, settings), []
     for frame in film.frames():
         frames.append(light.of(frame)[0])
         if len(frames) == _FIRST_FRAMES:
@@ -233,7 +233,7 @@ def survey(film: Film, settings: Settings, objects: Objects, progress: Callable[
     ImportingError
         None of the objects can be followed.
     """
-    light = Light(film, settings)
+    light = FilmLight(film, settings)
     tracker = Tracker(objects, trackpy_locator(objects.sd))
     every, half = max(1, film.count // _SAMPLES), math.ceil(4 * objects.sd)
     places, windows, centres = [], [], []
@@ -344,7 +344,7 @@ def tracked(
     known = survey(film, settings, find_objects(film, settings))
     account.notes += tuple(_crowded(film, known))
     windows = _Windows(rig, sensor, known)
-    light, step, area = Light(film, settings), 0, sensor.pixel_size
+    light, step, area = FilmLight(film, settings), 0, sensor.pixel_size
     for group in grouped(film, settings.frames_per_exposure, periods):
         shown = [light.of(frame) for frame in group.frames]
         mean = np.mean([one for one, _ in shown], axis=0)

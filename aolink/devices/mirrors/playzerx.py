@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from aolink.devices.drivers import Failure
 from aolink.devices.mirrors.keys import text
-from aolink.devices.mirrors.line import Line, shown
+from aolink.devices.mirrors.line import SerialLine, shown
 from aolink.devices.mirrors.resolution import check_resolution
 from aolink.devices.mirrors.sample_clock import SampleClock
 from aolink.devices.simple import Held, Lacks
@@ -137,7 +137,7 @@ class PlayzerX:
         self._park = codes_of(rig.mirror.park[None])
         self._laser: list[int] = []
         """Levels of its colours, once it is known how many it has."""
-        self._line = Line("the PlayzerX", text("port", port), BAUD_RATE)
+        self._line = SerialLine("the PlayzerX", text("port", port), BAUD_RATE)
         try:
             self.description, data_format = self._identify()
             self._laser = [laser] * _COLOURS[data_format]
