@@ -231,8 +231,8 @@ def test_what_was_not_shown_is_not_known_and_said_so() -> None:
 
 def test_shot_noise_that_is_not_seen_takes_only_an_impossible_value_out() -> None:
     shot = shoot(camera(0), 1, "dark,flat:8,still")[0]
-    for told, expected in ((0.0, None), (1e9, None), (10.0, 0.0)):
-        found = calibrate(camera(told), shot).photoelectrons
+    for photoelectrons, expected in ((0.0, None), (1e9, None), (10.0, 0.0)):
+        found = calibrate(camera(photoelectrons), shot).photoelectrons
         assert (found and found.value) == expected
 
 

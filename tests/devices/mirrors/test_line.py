@@ -140,9 +140,9 @@ def test_each_driver_lists_the_usb_ports_of_its_maker_and_no_others() -> None:
 
 @pytest.mark.usefixtures("usb")
 def test_the_command_shows_what_was_found_in_words_and_for_programs() -> None:
-    told = CliRunner().invoke(app, ["devices", "--json"])
-    assert told.exit_code == 0, told.output
-    said = json.loads(told.stdout)
+    done = CliRunner().invoke(app, ["devices", "--json"])
+    assert done.exit_code == 0, done.output
+    said = json.loads(done.stdout)
     drivers = {each["name"]: each["devices"] for each in said["drivers"] if each["kind"] == "mirror"}
     assert {name: [tuple(each) for each in drivers[name]] for name in FOUND} == FOUND
     assert {"port": "/dev/ttyUSB2", "description": "E-727"} in said["ports"]
