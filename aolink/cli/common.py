@@ -33,7 +33,19 @@ stdout = PlainConsole(highlight=False, soft_wrap=True, width=None if sys.stdout.
 stderr = PlainConsole(stderr=True, highlight=False, soft_wrap=True)
 
 RigArgument = Annotated[str, typer.Argument(help="A rig file, or the name of a rig that comes with aolink.")]
-FileArgument = Annotated[Path, typer.Argument(help="A recording.", metavar="FILE")]
+
+
+def local_file(text: str) -> Path:
+    """The path of a file of this machine. Raises typer.BadParameter for a URL."""
+    from aolink.recording.remote import Url, location
+
+    place = location(text)
+    if isinstance(place, Url):
+        raise typer.BadParameter(f"{place} is a URL, and this command reads files of this machine: copy it here first")
+    return place
+
+
+FileArgument = Annotated[Path, typer.Argument(help="A recording.", metavar="FILE", parser=local_file)]
 EstimatorOption = Annotated[
     list[str] | None,
     typer.Option(

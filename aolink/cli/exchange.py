@@ -5,12 +5,12 @@ from typing import Annotated
 
 import typer
 
-from aolink.cli.common import FileArgument, OverwriteOption, app, open_recording, progress, stdout, warn
+from aolink.cli.common import OverwriteOption, app, open_recording, progress, stdout, warn
 
 
 @app.command(epilog="Example: aolink export session.mcap -o session.parquet -e o3")
 def export(
-    file: FileArgument,
+    file: Annotated[str, typer.Argument(metavar="FILE", help="A recording: a file or a URL.")],
     output: Annotated[
         Path,
         typer.Option(
@@ -32,11 +32,12 @@ def export(
     NumPy, NetCDF and AOT telemetry hold the frames and the paths; a table has a row for each exposure and axis.
     """
     from aolink.exporting.files import export as export_series
+    from aolink.recording.remote import location
 
-    recording = open_recording(file)
+    recording = open_recording(location(file))
     known = recording.damage
     with progress("export", recording.n_frames) as tell:
         export_series(recording, output, estimator, overwrite=overwrite, progress=tell)
     if recording.damage != known:
-        warn(f"{file}: {recording.damage}")
+        warn(f"{recording.path}: {recording.damage}")
     stdout.print(f"written: {output}", markup=False)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from aolink.cli.common import JsonOption, OutputOption, OverwriteOption, app, progress, stdout
+from aolink.cli.common import JsonOption, OutputOption, OverwriteOption, app, local_file, progress, stdout
 from aolink.errors import ImportingError
 
 if TYPE_CHECKING:
@@ -71,6 +71,7 @@ def import_(
         Path,
         typer.Argument(
             metavar="SOURCE",
+            parser=local_file,
             help="A film: .npy, .npz, TIFF, FITS cube, video, MCAP, ROS bag, AOT telemetry, or a folder of pictures.",
         ),
     ],
@@ -133,7 +134,7 @@ def import_(
     for note in account.notes:
         stdout.print(f"note: {note}", markup=False)
     for count, what in (
-        (account.saturated, "saturated in the film"),
+        (account.saturated, "saturated in the film, no numbers, or shared by two objects"),
         (account.clipped, "beyond the range of the rig's camera"),
     ):
         if count:

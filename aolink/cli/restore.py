@@ -9,7 +9,16 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperCommand, TyperOption
 
-from aolink.cli.common import JsonOption, OverwriteOption, app, check_measured, open_recording, progress, stdout
+from aolink.cli.common import (
+    JsonOption,
+    OverwriteOption,
+    app,
+    check_measured,
+    local_file,
+    open_recording,
+    progress,
+    stdout,
+)
 from aolink.errors import RestorationError
 from aolink.files import check_target
 
@@ -43,7 +52,8 @@ def deblur(
         Path, typer.Option("--out", "-o", metavar="OUT", help="File to write: a recording, or a picture of its type.")
     ],
     file: Annotated[
-        Path | None, typer.Argument(metavar="FILE", help="A recording, all of whose exposures are restored.")
+        Path | None,
+        typer.Argument(metavar="FILE", help="A recording, all of whose exposures are restored.", parser=local_file),
     ] = None,
     estimator: Annotated[
         str,

@@ -155,9 +155,11 @@ def _write_first_rig(path: Path, source: Path, topic: str | None, settings: "Set
     check_target(path, overwrite=overwrite, suffix=".toml", error=RigError)
     film = open_film(source, topic)
     with progress("follow", film.count) as tell:
-        text = first_rig(film, settings, path.stem, tell)
+        made = first_rig(film, settings, path.stem, tell)
     with writing(path, overwrite=overwrite, error=RigError) as partial:
-        partial.write_text(text, encoding="utf-8")
+        partial.write_text(made.text, encoding="utf-8")
+    for note in made.notes:
+        stdout.print(f"note: {note}", markup=False)
     stdout.print(f"{path}: written from {film.name}; read it, then: {program()} rig {path} --check", markup=False)
 
 

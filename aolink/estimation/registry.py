@@ -119,10 +119,10 @@ def make_estimator(rig: Rig, name: str, **options: Any) -> Estimator:
     return WanderingEstimator(rig, made)
 
 
-def _moments_refusal(rig: Rig) -> str | None:
+def _many_spots_refusal(rig: Rig, name: str = "moments") -> str | None:
     if rig.plant.n_outputs > 2 * _MOST_SPOTS and alike_systems(rig.plant) is None:
         return (
-            f"moments takes at most {_MOST_SPOTS} spots that one plant moves together (it compares every two of them),"
+            f"{name} takes at most {_MOST_SPOTS} spots that one plant moves together (it compares every two of them),"
             f" {rig.name} has {rig.plant.n_outputs // 2}: use o3"
         )
     return None
@@ -140,6 +140,8 @@ def _pixels_refusal(name: str) -> Callable[[Rig], str | None]:
                 f"{name} follows the posterior's modes for at most {MANY_STATES} states of one plant, {rig.name} has"
                 f" {rig.plant.n_states}{alike}: use {'o3' if alike else 'profile or moments'}"
             )
+        if reason := _many_spots_refusal(rig, name):  # its widest Gaussian is found by windowed moments
+            return reason
         if rig.sensor.spot_light is not None:
             return (
                 f"{name} takes each spot to have the whole light, but {rig.name} has partly lit lenslets:"
@@ -176,7 +178,7 @@ _OURS = {
         EstimatorRow(name="o2", rank=20, colour=(120, 130, 255), build=_built("paper", 2), engines=_PAPER_ENGINES),
         EstimatorRow(name="o3", rank=30, colour=(240, 110, 50), build=_built("paper", 1, 2), engines=_PAPER_ENGINES),
         EstimatorRow(
-            name="moments", rank=40, colour=(0, 175, 125), build=_built("moments"), refusal=_moments_refusal,
+            name="moments", rank=40, colour=(0, 175, 125), build=_built("moments"), refusal=_many_spots_refusal,
             wanders=True,
         ),
         EstimatorRow(

@@ -14,6 +14,7 @@ from aolink.rig import Rig, parse_rig
 from aolink.rig.edit import with_tables, with_value
 
 _COMMENT = "by `aolink identify`"
+_MOVED = "by `aolink identify`: the models of the disturbance move the plant"
 
 
 def identified_text(
@@ -47,15 +48,17 @@ def identified_text(
             ("A", _rows(space.A)), ("B", _rows(B)), ("B_w", _rows(vectors[:, kept])), ("C", _rows(space.C)),
             ("process_noise", np.diag(values[kept]).tolist()), ("initial_covariance", "stationary"),
         ):  # fmt: skip
-            text = with_value(text, f"plant.{key}", value, may_be_new=True)
+            text = with_value(text, f"plant.{key}", value, may_be_new=True, comment=_COMMENT)
     else:
         written = tomllib.loads(rig.toml)["plant"]["process_noise"]
-        text = with_value(text, "plant.process_noise", np.zeros_like(written, dtype=np.float64).tolist())
+        text = with_value(
+            text, "plant.process_noise", np.zeros_like(written, dtype=np.float64).tolist(), comment=_MOVED
+        )
     if noise != 1:
-        text = with_value(text, "sensor.noise_density", _written(rig.sensor.noise_density * noise))
+        text = with_value(text, "sensor.noise_density", _written(rig.sensor.noise_density * noise), comment=_COMMENT)
     if wider:
         sigma = math.sqrt(rig.sensor.kernel.sigma**2 + 2 * wider)
-        text = with_value(text, "sensor.kernel.sigma", _written(sigma))
+        text = with_value(text, "sensor.kernel.sigma", _written(sigma), comment=_COMMENT)
     tables = for_outputs([as_tables(model, step) for model in models])
     text = with_tables(text, "disturbance.model", tables, _COMMENT) if tables else text
     parse_rig(text)

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy import optimize, signal
@@ -12,7 +13,9 @@ from scipy import optimize, signal
 from aolink.errors import ImportingError
 from aolink.importing.film import Film
 from aolink.importing.frames import Settings
-from aolink.importing.tracking import STRAY, Survey, find_objects, reach, survey
+from aolink.importing.survey import Survey, reach, survey
+from aolink.importing.tracker import find_objects
+from aolink.importing.tracking import STRAY
 from aolink.numerics.arrays import FloatArray
 
 _COUNTS = 62_000
@@ -21,6 +24,10 @@ _NOISE_SDS = 6
 """Standard deviations of a pixel's noise that fit below black and above the brightest pixel."""
 _SETTLED = 1e-9
 """A smaller change of a gain counts as none."""
+_LAGS = range(2, 11)
+"""Frames over which innovations must not be correlated. Over one they are where a frame is exposed throughout."""
+_CORRELATED = 0.15
+"""Correlation of innovations from which on a motion is another one than the fitted, if it is no chance."""
 _LEAST_WINDOW = 12
 _ANYWHERE = 0.1
 """Variance of the place of an object in its window before it is seen, slope units squared."""
@@ -43,6 +50,8 @@ class Motion:
     """Variance of the error of a place, pixels squared."""
     spread: float
     """Standard deviation of the places about their mean, pixels."""
+    unexplained: float
+    """Largest correlation of innovations some frames apart; zero where it is small or may be by chance."""
 
 
 def fit_motion(places: FloatArray) -> Motion:
@@ -63,12 +72,17 @@ def fit_motion(places: FloatArray) -> Motion:
     start = math.log(max(float(np.nanvar(steps)), 1e-12))
 
     # The part between two gaps is a series of its own; an Ornstein-Uhlenbeck process moves about its mean.
-    runs = [(one, one.mean(axis=0)) for one in _runs(places)]
+    runs = [(one, one - one.mean(axis=0)) for one in _runs(places)]
 
     def cost(values: FloatArray, bound: bool) -> float:
         q, r = math.exp(values[0]), math.exp(values[1])
         a = 1 / (1 + math.exp(-values[2])) if bound else 1.0
-        return sum(_negative_log_likelihood(one - (means if a < 1 else 0.0), a, q, r) for one, means in runs)
+        total = 0.0
+        for series in (about if a < 1 else one for one, about in runs):
+            innovations, variances = _innovations(series, a, q, r)
+            logs = series.shape[1] * float(np.log(2 * np.pi * variances).sum())
+            total += float((innovations**2 / variances[:, None]).sum()) + logs
+        return total / 2
 
     walk = optimize.minimize(cost, [start, start - 2], args=(False,), method="Nelder-Mead")
     bound = optimize.minimize(cost, [*walk.x, 3.0], args=(True,), method="Nelder-Mead", options={"maxiter": 600})
@@ -78,10 +92,11 @@ def fit_motion(places: FloatArray) -> Motion:
     best = bound.x if is_bound else walk.x
     variances = _inverse_curvature(lambda values: cost(values, is_bound), best)
     a = 1 / (1 + math.exp(-best[2])) if is_bound else 1.0
-    q = math.exp(best[0])
+    q, r = math.exp(best[0]), math.exp(best[1])
     a_sd = a * (1 - a) * math.sqrt(variances[2]) if is_bound else 0.0
     spread = float(np.sqrt(np.nanmean((places - np.nanmean(places, axis=0)) ** 2)))
-    return Motion(a=a, a_sd=a_sd, q=q, q_sd=q * math.sqrt(variances[0]), r=math.exp(best[1]), spread=spread)
+    unexplained = _correlation([_innovations(about if is_bound else one, a, q, r)[0] for one, about in runs])
+    return Motion(a=a, a_sd=a_sd, q=q, q_sd=q * math.sqrt(variances[0]), r=r, spread=spread, unexplained=unexplained)
 
 
 def _runs(places: FloatArray) -> list[FloatArray]:
@@ -94,26 +109,35 @@ def _runs(places: FloatArray) -> list[FloatArray]:
     return runs
 
 
-def _negative_log_likelihood(y: FloatArray, a: float, q: float, r: float) -> float:
-    """Negative log-likelihood of series (frames, series) by a Kalman filter, which settles after some frames."""
-    walk = a == 1
-    first = int(walk)  # the first place of a walk may be anywhere
-    x = y[0] if walk else np.zeros(y.shape[1])
-    P, gain, total, k = (r + q if walk else q / (1 - a * a)), math.nan, 0.0, first
-    while k < len(y):
+def _innovations(y: FloatArray, a: float, q: float, r: float) -> tuple[FloatArray, FloatArray]:
+    """Innovations of a Kalman filter, which settles after some frames, for series (frames, series), and their
+    variances: (frames - 1, series) and (frames - 1,).
+
+    The first place of each series starts the filter, of a random walk and of an Ornstein-Uhlenbeck process alike, so
+    that their likelihoods can be compared.
+    """
+    innovations, variances = np.empty((len(y) - 1, y.shape[1])), np.empty(len(y) - 1)
+    x, P, gain = a * y[0], a * a * r + q, math.nan
+    for k in range(len(y) - 1):
         S = P + r
         before, gain = gain, P / S
-        innovation = y[k] - x
-        total += float((innovation**2).sum()) / S + y.shape[1] * math.log(2 * math.pi * S)
-        x, P, k = a * (x + gain * innovation), a * a * P * (1 - gain) + q, k + 1
+        innovations[k], variances[k] = y[k + 1] - x, S
+        x, P = a * (x + gain * innovations[k]), a * a * P * (1 - gain) + q
         if abs(gain - before) < _SETTLED:
+            seen, _ = signal.lfilter([0.0, a * gain], [1.0, -a * (1 - gain)], y[k + 2 :], axis=0, zi=x[None])
+            innovations[k + 1 :], variances[k + 1 :] = y[k + 2 :] - seen, S
             break
-    if k < len(y):
-        pole = a * (1 - gain)
-        seen, _ = signal.lfilter([0.0, a * gain], [1.0, -pole], y[k:], axis=0, zi=x[None])
-        innovations = y[k:] - seen
-        total += float((innovations**2).sum()) / S + innovations.size * math.log(2 * math.pi * S)
-    return total / 2
+    return innovations, variances
+
+
+def _correlation(series: list[FloatArray]) -> float:
+    """The largest correlation of innovations that are some frames apart; zero if it is small or may be by chance."""
+    power = sum(float((one**2).sum()) for one in series)
+    pairs = [sum(one[lag:].size for one in series) for lag in _LAGS]
+    sums = [sum(float((one[lag:] * one[:-lag]).sum()) for one in series) for lag in _LAGS]
+    count = sum(one.size for one in series)
+    found = max((total / n / (power / count) for total, n in zip(sums, pairs, strict=True) if n), key=abs, default=0.0)
+    return found if abs(found) > max(_CORRELATED, 4 / math.sqrt(count)) else 0.0
 
 
 def _inverse_curvature(cost: Callable[[FloatArray], float], at: FloatArray) -> FloatArray:
@@ -133,8 +157,16 @@ def _inverse_curvature(cost: Callable[[FloatArray], float], at: FloatArray) -> F
     return np.clip(np.diagonal(np.linalg.pinv(H)), 0.0, None)
 
 
-def first_rig(film: Film, settings: Settings, name: str, progress: Callable[[int], None] | None = None) -> str:
-    """The text of a rig file for the objects of a film, ``settings.track`` of them: for an import with these settings.
+class FirstRig(NamedTuple):
+    """A rig file for a film."""
+
+    text: str
+    notes: tuple[str, ...]
+    """What in the film contradicts the rig file, or is left out of it; the text has these notes, too."""
+
+
+def first_rig(film: Film, settings: Settings, name: str, progress: Callable[[int], None] | None = None) -> FirstRig:
+    """A rig file for the objects of a film, ``settings.track`` of them: for an import with these settings.
 
     The slope unit is half a window. The plant has a copy for each object and direction; its input is the shift of the
     window that follows the object.
@@ -160,11 +192,30 @@ def first_rig(film: Film, settings: Settings, name: str, progress: Callable[[int
     K = settings.frames_per_exposure
     # The window moves before its object has strayed too far from the middle.
     side = max(_LEAST_WINDOW, 2 * math.ceil(reach(known, K) / (1 - 2 * STRAY)))
-    return _text(film, settings, name, known, motion, side, rate)
+    notes = tuple(_notes(known, motion))
+    return FirstRig(_text(film, settings, name, known, motion, side, rate, notes), notes)
+
+
+def _notes(known: Survey, motion: Motion) -> Iterator[str]:
+    """What the user should know of the film before using the rig file."""
+    yield from known.notes()
+    if known.left_out:
+        yield (
+            f"{known.left_out:.2%} of the pixels about the objects are saturated or no numbers: kernel, light and noise"
+            " are fitted without them"
+        )
+    if motion.unexplained:
+        kind = "a random walk" if motion.a == 1 else "an Ornstein-Uhlenbeck process"
+        yield (
+            f"the motion is not {kind}: what it leaves unexplained is correlated by {motion.unexplained:.2f} from one"
+            " frame to one some frames later, as of a vibration, and intervals will be too narrow. Import with this"
+            " rig file, then try `aolink identify` with --model resonance"
+        )
 
 
 def _text(
-    film: Film, settings: Settings, name: str, known: Survey, motion: Motion, side: int, rate: float
+    film: Film, settings: Settings, name: str, known: Survey, motion: Motion, side: int, rate: float,
+    notes: tuple[str, ...],
 ) -> str:  # fmt: skip
     unit = side / 2  # pixels
     n, K = settings.track, settings.frames_per_exposure
@@ -184,14 +235,15 @@ def _text(
         A, B, B_w, C = f"[[{motion.a:.8g}, 0.0], [0.0, 1.0]]", "[[0.0], [1.0]]", "[[1.0], [0.0]]", "[[1.0, 1.0]]"
         variance = motion.q / (1 - motion.a**2) / unit**2
         kind, initial = "Ornstein-Uhlenbeck process", f"[[{variance:.4g}, 0.0], [0.0, {_ANYWHERE}]]"
-    memory = "" if walk else f"; a = {motion.a:.5g} +- {motion.a_sd:.2g} a frame"
+    memory = "" if walk else f": a = {motion.a:.5g} +- {motion.a_sd:.2g} a frame"
+    said = "".join(f"# Note: {note}.\n" for note in notes)
     return f"""# Written by `aolink rig --from {film.name}` from its single frames. +- is one standard deviation.
-name = "{name}"
+{said}name = "{name}"
 summary = "{n} objects of {film.name}, each in a window of {side} pixels that follows it; slope unit: {unit:g} pixels"
 
-[plant]               # a copy for each object along x and along y: {kind}{memory}
+[plant]               # a copy for each object along x and along y
 axes = {2 * n}
-A = {A}
+A = {A}  # {kind}{memory}
 B = {B}           # the input shifts the window
 B_w = {B_w}
 C = {C}

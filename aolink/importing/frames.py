@@ -70,7 +70,7 @@ class Account:
     frames: int = 0
     exposures: int = 0
     saturated: int = 0
-    """Pixels at the end of their range in the film, which are masked."""
+    """Pixels that are masked: at the end of their range in the film, no numbers, or with the light of two objects."""
     clipped: int = 0
     """Pixels whose counts do not fit into the rig's range, which are masked as well."""
     pixels: int = 0
@@ -88,7 +88,7 @@ class FilmLight:
         self._is_integer = kind in "iu"
 
     def of(self, frame: Frame) -> tuple[FloatArray, NDArray[np.bool_]]:
-        """Light of a frame and where its pixels are saturated, (rows, columns) each."""
+        """Light of a frame and where its pixels are saturated or no numbers, (rows, columns) each."""
         settings = self._settings
         values = frame.astype(np.float64)
         # A saturated background does not harm a dark object.

@@ -144,6 +144,8 @@ class Url:
             denied = isinstance(error, PermissionError) or getattr(cause, "status", 0) in (401, 403)
             if denied or type(error).__name__ in ("NoCredentialsError", "PartialCredentialsError"):
                 why = "no right to read it; give the credentials that its server wants, as AWS_PROFILE for s3"
+            elif isinstance(cause, OSError) and not isinstance(cause, FileNotFoundError):
+                why = f"its server does not answer ({_first_line(cause)})"
             elif isinstance(error, FileNotFoundError):
                 what = "" if cause is error else f" ({_first_line(cause)})"
                 why = f"there is no such file, or it may not be listed{what}"

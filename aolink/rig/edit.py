@@ -14,7 +14,7 @@ from aolink.errors import RigError
 from aolink.rig.toml_table import did_you_mean
 
 
-def with_value(text: str, key: str, value: Any, *, may_be_new: bool = False) -> str:
+def with_value(text: str, key: str, value: Any, *, may_be_new: bool = False, comment: str = "") -> str:
     """The text with another value for a key such as ``plant.process_noise``.
 
     Parameters
@@ -23,6 +23,8 @@ def with_value(text: str, key: str, value: Any, *, may_be_new: bool = False) -> 
         Any value that TOML can hold, or a `tomlkit.value`, which keeps its digits.
     may_be_new:
         Whether the key may be missing; it is added behind the last value of its table.
+    comment:
+        The comment behind the value, in place of one that is there; empty: that one stays.
 
     Raises
     ------
@@ -44,6 +46,8 @@ def with_value(text: str, key: str, value: Any, *, may_be_new: bool = False) -> 
         if not new:
             _entry(table, name, key)
         table[name] = value
+        if comment:
+            table[name].comment(comment)
 
     return _edited(text, edit)
 

@@ -22,6 +22,13 @@ def test_names_come_by_rank():
     assert [row.rank for row in estimator_rows()] == sorted(row.rank for row in estimator_rows())
 
 
+def test_hundreds_of_spots_of_one_plant_are_refused_by_all_that_compare_every_two():
+    rig = load_rig("sh-30x30")
+    for name in ("moments", "profile", "mixture", "sampled"):
+        with pytest.raises(EstimatorError, match=f"{name} takes at most 128 spots .* sh-30x30 has 900: use o3"):
+            make_estimator(rig, name)
+
+
 def test_a_row_refuses_what_making_the_estimator_refuses():
     rig = load_rig("sh-8x8")
     refused = {row.name: reason for row in estimator_rows() if (reason := row.refusal(rig))}

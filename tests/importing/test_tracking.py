@@ -14,7 +14,8 @@ from aolink.importing.film import array_film
 from aolink.importing.first_rig import first_rig, fit_motion
 from aolink.importing.frames import Settings
 from aolink.importing.recording import import_film
-from aolink.importing.tracking import find_objects, survey
+from aolink.importing.survey import survey
+from aolink.importing.tracker import find_objects
 from aolink.recording.reader import Recording
 from aolink.rig import Rig, parse_rig
 from tests.kinds import truth_of
@@ -64,10 +65,105 @@ def test_light_beside_an_object_is_said_with_its_frames(tmp_path: Path) -> None:
     known = survey(source, SETTINGS, find_objects(source, SETTINGS))
     assert known.alone(0, 80).tolist() == [True, True]
     assert known.alone(72, 88).tolist() == known.alone(80, 160).tolist() == [False, True]
-    rig = parse_rig(first_rig(source, SETTINGS, "film"))
+    rig = parse_rig(first_rig(source, SETTINGS, "film").text)
     (note,) = import_film(source, rig, SETTINGS, tmp_path / "a.mcap").notes
     assert "object 1" in note
     assert "in frames 80 to 159" in note
+
+
+def passing(frames: int, least: float) -> np.ndarray:
+    """Motion (frames, 8, 2, 2) of two objects about `MIDDLES`: they come towards each other along x up to ``least``
+    pixels in the middle of the film, and go back, with a small random walk."""
+    rng = np.random.default_rng(3)
+    walk = random_walk(rng, frames, 2, 0.15)
+    apart = MIDDLES[1] - MIDDLES[0]
+    towards = (1 - np.abs(np.linspace(-1, 1, frames))) * (1 - least / np.linalg.norm(apart))
+    walk[..., 0, :] += towards[:, None, None] * apart / 2
+    walk[..., 1, :] -= towards[:, None, None] * apart / 2
+    return walk
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_objects_beside_each_other_are_measured_apart(seed: int) -> None:
+    """Down to three standard deviations, where a centroid of one moves with the light of the other."""
+    film = spot_film(np.random.default_rng(seed), passing(160, 4.0), MIDDLES)
+    source = array_film(film.frames, "film")
+    known = survey(source, SETTINGS, find_objects(source, SETTINGS))
+    assert np.linalg.norm(film.places[:, 0] - film.places[:, 1], axis=1).min() < 4 * 1.8
+    assert not known.together.any()
+    assert np.abs(known.places - film.places).max() < 0.5
+    assert np.sqrt(np.mean((known.places - film.places) ** 2)) < 0.1
+
+
+def test_objects_that_meet_are_left_out_until_they_part(tmp_path: Path) -> None:
+    rng = np.random.default_rng(4)
+    film = spot_film(rng, passing(320, 0.0), MIDDLES)
+    source = array_film(film.frames, "film")
+    known = survey(source, SETTINGS, find_objects(source, SETTINGS))
+    distance = np.linalg.norm(film.places[:, 0] - film.places[:, 1], axis=1)
+    together = np.asarray(known.together.any(axis=(1, 2)))
+    assert together[distance < 2 * 1.8].all()
+    assert not together[distance > 4 * 1.8].any()
+    assert np.isnan(known.places[together]).all()
+    # Once apart, there is a track on each of them; which one is not known.
+    assert np.isfinite(known.places[~together]).all()
+    error = known.places - film.places
+    swapped = known.places[:, ::-1] - film.places
+    after = np.arange(320) > np.flatnonzero(together).max()
+    near = [float(np.sqrt(np.mean(one[after & (distance > 5 * 1.8)] ** 2))) for one in (error, swapped)]
+    assert min(near) < 0.1
+    rig = parse_rig(first_rig(source, SETTINGS, "film").text)
+    account = import_film(source, rig, SETTINGS, tmp_path / "a.mcap")
+    first, last = np.flatnonzero(together)[[0, -1]]
+    assert any(f"objects 1 and 2 come together in frames {first} to {last}" in note for note in account.notes)
+    exposures = list(Recording(tmp_path / "a.mcap").exposures())
+    for k, each in enumerate(exposures):
+        during = together[k * K : (k + 1) * K]
+        assert not during.any() or each.truth is None
+        assert not during.all() or not each.mask.all()
+    (estimates,) = run(rig, exposures, ["profile"]).values()
+    scored = [(e, truth_of(x)) for e, x in zip(estimates, exposures, strict=True) if x.truth is not None]
+    inside = [np.abs(e.path - t.path) < 1.96 * np.hypot(e.path_sd, t.path_sd) for e, t in scored]
+    assert np.mean(inside) > 0.85
+
+
+def test_an_object_that_passes_a_faded_one_is_followed_on() -> None:
+    """The track of an object that has faded ends on the light of the other one: only the other one is seen."""
+    rng = np.random.default_rng(4)
+    motion = passing(160, 0.0)
+    motion[..., 1, :] = 0.0
+    motion[..., 0, :] *= 2.0  # up to where the second one stood
+    film = spot_film(rng, motion[:, :, :1], MIDDLES[:1])
+    film.frames[:40] += spot_film(rng, motion[:40, :, 1:], MIDDLES[1:], noise=0.0, ground=0.0).frames
+    source = array_film(film.frames, "film")
+    known = survey(source, SETTINGS, find_objects(source, SETTINGS))
+    assert not known.together.any()
+    assert np.isfinite(known.places[:, 0]).all()
+    assert np.sqrt(np.mean((known.places[:, 0] - film.places[:, 0]) ** 2)) < 0.1
+
+
+def test_saturated_pixels_do_not_widen_the_kernel(walkers: SpotFilm) -> None:
+    flat = np.minimum(walkers.frames, np.uint16(1700))
+    full = np.where(flat == 1700, np.uint16(65535), flat)
+    film = array_film(full, "bright")
+    made = first_rig(film, SETTINGS, "bright")
+    known = survey(film, SETTINGS, find_objects(film, SETTINGS))
+    assert known.left_out > 0
+    assert known.sd == pytest.approx(1.8, rel=0.03)
+    assert any("saturated" in note for note in made.notes)
+    assert "# Note: " in made.text
+    assert not first_rig(array_film(walkers.frames, "film"), SETTINGS, "film").notes
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_motion_that_is_neither_is_said(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    noise = 0.1 * rng.normal(size=(320, 4))
+    vibration = resonance(rng, 320, 2, 1.5, 5.3).mean(axis=1).reshape(320, 4)
+    assert abs(fit_motion(vibration + noise).unexplained) > 0.15
+    walk = random_walk(rng, 320, 2, 0.5).mean(axis=1).reshape(320, 4)
+    assert fit_motion(walk + noise).unexplained == 0
+    assert fit_motion(walk).unexplained == 0, "a frame that is exposed throughout correlates neighbours only"
 
 
 @pytest.mark.parametrize(("asked", "what"), [(9, "shows . objects, 9 are asked for"), (1, None)])
@@ -103,7 +199,7 @@ def test_a_walk_and_a_bound_motion_are_told_apart_and_fitted(seed: int) -> None:
 
 def imported_film(film: SpotFilm, path: Path) -> tuple[Rig, Recording]:
     source = array_film(film.frames, "film")
-    rig = parse_rig(first_rig(source, SETTINGS, "film"))
+    rig = parse_rig(first_rig(source, SETTINGS, "film").text)
     import_film(source, rig, SETTINGS, path)
     return rig, Recording(path)
 
@@ -139,7 +235,7 @@ def test_a_resonance_inside_the_exposure_is_found_with_its_plant(tmp_path: Path)
     rng = np.random.default_rng(11)
     film = spot_film(rng, resonance(rng, 320, 2, 1.5, 5.3), MIDDLES, light=60_000.0)
     source = array_film(film.frames, "film")
-    text = first_rig(source, SETTINGS, "film")
+    text = first_rig(source, SETTINGS, "film").text
     side = parse_rig(text).sensor.shape[0]
     decay, turn = np.exp(-0.02 / 5.3), 2 * np.pi / 5.3
     A = decay * np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
@@ -170,7 +266,7 @@ initial_covariance = [[{variance}, 0.0, 0.0], [0.0, {variance}, 0.0], [0.0, 0.0,
 
 @pytest.mark.long
 def test_a_rig_whose_inputs_do_not_shift_its_spots_keeps_its_windows(walkers: SpotFilm, tmp_path: Path) -> None:
-    text = first_rig(array_film(walkers.frames, "film"), SETTINGS, "film").replace("B = [[1.0]]", "B = [[0.0]]")
+    text = first_rig(array_film(walkers.frames, "film"), SETTINGS, "film").text.replace("B = [[1.0]]", "B = [[0.0]]")
     rig = parse_rig(text)
     import_film(array_film(walkers.frames, "film"), rig, SETTINGS, tmp_path / "a.mcap")
     assert not any(each.inputs.any() for each in Recording(tmp_path / "a.mcap").exposures())

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pickle
 import re
+import socket
 import subprocess
 import threading
 from collections.abc import Callable, Iterator
@@ -115,6 +116,15 @@ def test_so_do_a_web_server_and_memory(web: tuple[str, type[_Ranges]], tmp_path:
     fsspec.filesystem("memory").pipe("/lab/s.mcap", source.read_bytes())
     (tmp_path / "memory").mkdir()
     same_as_from_the_file("memory://lab/s.mcap", source, tmp_path / "memory")
+
+
+def test_a_server_that_does_not_answer_is_no_missing_file(tmp_path: Path) -> None:
+    with socket.socket() as unused:
+        unused.bind(("127.0.0.1", 0))
+        url = f"http://127.0.0.1:{unused.getsockname()[1]}/s.mcap"
+        with pytest.raises(RecordingError, match="its server does not answer") as error:
+            Recording(url)
+    assert "no such file" not in str(error.value)
 
 
 @pytest.mark.long

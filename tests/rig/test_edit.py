@@ -30,6 +30,12 @@ def test_a_value_changes_and_nothing_else() -> None:
     assert with_value(TEXT, "sensor.field", [-2, 2]) == TEXT.replace("[ -1,\n          1 ]", "[-2, 2]")
 
 
+def test_a_comment_takes_the_place_of_the_old_one() -> None:
+    text = "[plant]\nA = 1 # a walk\nB = 2 # stays\nC = 3\n"
+    assert with_value(text, "plant.A", 4, comment="new") == text.replace("A = 1 # a walk", "A = 4 # new")
+    assert with_value(text, "plant.C", 4, comment="new") == text.replace("C = 3", "C = 4 # new")
+
+
 def test_a_number_keeps_the_digits_that_it_is_given_with() -> None:
     assert "sigma = 0.0600\n" in with_value(TEXT, "sensor.kernel.sigma", tomlkit.value("0.0600"))
 

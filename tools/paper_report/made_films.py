@@ -78,7 +78,7 @@ def made(kind: Kind, seed: int, exposures: int) -> tuple[Rig, list[Exposure], Fl
     places = tuple((float(x), float(y)) for x, y in film.places[0])
     settings = Settings(rate_hz=100.0, subtract_median=True, track=_SPOTS, frames_per_exposure=K, places=places)
     source = array_film(film.frames, "film")
-    text = first_rig(source, settings, "film")
+    text = first_rig(source, settings, "film").text
     if kind.periods:
         text = _with_resonance(text, K / kind.periods, kind.lasts)
     rig = parse_rig(text)

@@ -19,7 +19,8 @@ from aolink.importing.first_rig import first_rig
 from aolink.importing.frames import Settings
 from aolink.importing.readers import open_film
 from aolink.importing.recording import import_film
-from aolink.importing.tracking import find_objects, survey
+from aolink.importing.survey import survey
+from aolink.importing.tracker import find_objects
 from aolink.numerics.arrays import BoolArray, FloatArray
 from aolink.optics.camera import to_density
 from aolink.optics.centroid import weighted_centroid
@@ -52,7 +53,7 @@ def spheres(K: int) -> tuple[Rig, list[Exposure], BoolArray]:
     """
     settings = Settings(rate_hz=_RATE_HZ, invert=True, track=6, places=places(), frames_per_exposure=K)
     film = open_film(FILE)
-    rig = parse_rig(first_rig(film, settings, "spheres"))
+    rig = parse_rig(first_rig(film, settings, "spheres").text)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "spheres.mcap"
         import_film(film, rig, settings, path)

@@ -1,0 +1,211 @@
+"""What the single frames of a film show of its objects: places, kernel, light, noise and steps."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import ndimage, optimize
+
+from aolink.errors import ImportingError
+from aolink.importing.film import Film
+from aolink.importing.frames import FilmLight, Settings
+from aolink.importing.tracker import FIRST_FRAMES, WEIGHT, Objects, Tracker, trackpy_locator
+from aolink.numerics.arrays import BoolArray, FloatArray, IntArray
+from aolink.optics.kernel import pixel_masses
+from aolink.optics.maxima import cut_windows
+
+_SAMPLES = 100
+"""Frames in which the objects' light is fitted."""
+_STRETCH = 10
+"""Number of successive sampled frames that are averaged to find light beside an object."""
+_ALONE = 1 / 3
+"""Light beside an object that is less bright than this share of it does not matter."""
+_REST = 2.5
+"""Reach of an object's light, in standard deviations that include its walk in an exposure: light beyond belongs to
+other objects."""
+
+
+@dataclass(frozen=True, eq=False)
+class Survey:
+    """The measurements of a film's objects in the single frames."""
+
+    places: FloatArray
+    """Position (x, y) of each object in each frame, pixels, (frames, n, 2); NaN where it is not seen."""
+    last: FloatArray
+    """As ``places``, where an object is not seen the position at which it was last seen."""
+    together: BoolArray
+    """Which objects cannot be told apart in each frame (`Tracker.together`), (frames, n, n)."""
+    sd: float
+    """Standard deviation of the Gaussian that fits the objects best, pixels."""
+    sd_sd: float
+    """Standard deviation of ``sd``, from the differences of the objects."""
+    light: FloatArray
+    """Light of each object, (n,)."""
+    ground: FloatArray
+    """Remaining background under each object, for one pixel, (n,)."""
+    residual: FloatArray
+    """Residuals of sums over rows and over columns, as a share of the object's light, (samples,).
+
+    Deviations from a Gaussian are not independent from pixel to pixel, and estimators use such sums.
+    """
+    model: FloatArray
+    """The fits at the same places, as a share of the object's light, (samples,)."""
+    place_sd: float
+    """Standard deviation of the error of a place in one frame, pixels."""
+    walk: float
+    """Variance of the step from frame to frame along one direction, pixels squared."""
+    beside: FloatArray
+    """The brightest light beside each object as a share of its own, both through a Gaussian of the object's size, in
+    each stretch of the film, (stretches, n); NaN where the object is not seen."""
+    stretch: int
+    """Frames of a stretch."""
+    left_out: float
+    """Share of the pixels about the objects that are saturated or no numbers: kernel, light and noise are fitted
+    without them."""
+
+    def alone(self, first: int, end: int) -> BoolArray:
+        """Which objects have no other light beside them in the frames from ``first`` to before ``end``, (n,)."""
+        some = self.beside[first // self.stretch : -(-end // self.stretch)]
+        return np.asarray(~(some >= _ALONE).any(axis=0) & ~self.together[first:end].any(axis=(0, 1)))
+
+    def notes(self) -> Iterator[str]:
+        """A note on each pair of objects that came together, and on each object that has other light beside it."""
+        for a, b in np.argwhere(np.triu(self.together.any(axis=0))):
+            frames = _stretches(np.flatnonzero(self.together[:, a, b]), 1, len(self.together))
+            yield (
+                f"objects {a + 1} and {b + 1} come together in frames {frames}: they are left out there, and which is"
+                " which is not known afterwards"
+            )
+        for k, beside in enumerate(self.beside.T):
+            stretches = np.flatnonzero(beside >= _ALONE)
+            if not len(stretches):
+                continue
+            frames = _stretches(stretches, self.stretch, len(self.places))
+            x, y = self.last[stretches[0] * self.stretch, k]
+            yield (
+                f"object {k + 1} (at {x:.0f},{y:.0f}) has other light beside it in frames {frames}, up to"
+                f" {beside[stretches].max():.0%} as bright: its estimates are wrong there by more than they say"
+            )
+
+
+def _stretches(numbers: IntArray, each: int, count: int) -> str:
+    """Successive numbers of stretches of ``each`` frames, as ranges of the frames of a film of ``count``."""
+    ends = np.flatnonzero(np.diff(numbers, append=-1) != 1)
+    starts = np.concatenate([[0], ends[:-1] + 1])
+    return ", ".join(
+        f"{numbers[a] * each} to {min((numbers[b] + 1) * each, count) - 1}" for a, b in zip(starts, ends, strict=True)
+    )
+
+
+def survey(film: Film, settings: Settings, objects: Objects, progress: Callable[[int], None] | None = None) -> Survey:
+    """Follow the objects through the whole film and fit their images in single frames.
+
+    Raises
+    ------
+    ImportingError
+        None of the objects can be followed.
+    """
+    light = FilmLight(film, settings)
+    tracker = Tracker(objects, trackpy_locator(objects.sd))
+    every, half = max(1, film.count // _SAMPLES), math.ceil(4 * objects.sd)
+    places, last, together = [], [], []
+    windows, centres = [], []
+    for k, frame in enumerate(film.frames()):
+        shown, bad = light.of(frame)
+        found = tracker.follow(shown)
+        places.append(found)
+        last.append(tracker.places.copy())
+        together.append(tracker.together.copy())
+        if k % every == 0:
+            shown[bad] = np.nan
+            cut, corners = cut_windows(shown, tracker.places, half)
+            windows.append(cut)
+            centres.append(found - corners)
+        if progress is not None:
+            progress(k + 1)
+    path, near = np.array(places), np.array(together)
+    if np.isfinite(path).all(axis=2).sum() < 2 * FIRST_FRAMES:
+        raise ImportingError(f"{film.name}: no object can be followed from frame to frame: do they move too far?")
+    cuts = np.array(windows)
+    sd, sd_sd, amounts, ground, residual, model, beside = _fitted(cuts, np.array(centres), objects.sd)
+    walk, place_sd = _steps(path)
+    return Survey(
+        places=path, last=np.array(last), together=near, sd=sd, sd_sd=sd_sd, light=amounts, ground=ground,
+        residual=residual, model=model, place_sd=place_sd, walk=walk, beside=beside, stretch=every * _STRETCH,
+        left_out=float(np.isnan(cuts).mean()),
+    )  # fmt: skip
+
+
+def _fitted(
+    windows: FloatArray, centres: FloatArray, start_sd: float
+) -> tuple[float, float, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
+    """The Gaussian, integrated over pixels, and the background that best fit windows (samples, n, side, side); NaN are
+    pixels that are left out.
+
+    The residuals, averaged over some windows, give the light beside an object (`Survey.beside`).
+    """
+    _, n, side, _ = windows.shape
+    edges = np.arange(side + 1) - 0.5
+
+    def amounts(sd: float, k: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Light and background of an object, its model, and the residuals of its pixels."""
+        seen = np.isfinite(centres[:, k]).all(axis=1)
+        x, y = (pixel_masses(sd**2, edges, centres[seen, k, d], 0)[0] for d in (0, 1))
+        shape = (y[:, :, None] * x[:, None, :]).ravel()
+        values = windows[seen, k].ravel()
+        columns = np.column_stack([shape, np.ones(len(shape))])
+        known = np.isfinite(values)
+        found, *_ = np.linalg.lstsq(columns[known], values[known], rcond=None)
+        return np.asarray(found), shape, np.asarray(values - columns @ found)
+
+    def left(sd: float, k: int) -> float:
+        return float(np.nansum(amounts(sd, k)[2] ** 2))
+
+    usable = [k for k in range(n) if np.isfinite(centres[:, k]).all(axis=1).any()]
+    bounds = (max(0.3, start_sd / 3), 2 * start_sd)
+    each = np.array([optimize.minimize_scalar(left, bounds=bounds, args=(k,), method="bounded").x for k in usable])
+    # The median is used because two objects that stick together should not widen the fit.
+    sd = float(np.median(each))
+    sd_sd = float(each.std(ddof=1) / math.sqrt(len(each))) if len(each) > 1 else math.nan
+    light, ground, residuals, models = np.full(n, np.nan), np.zeros(n), [], []
+    beside = np.full((-(-len(windows) // _STRETCH), n), np.nan)
+    for k in usable:
+        (light[k], ground[k]), shape, rest = amounts(sd, k)
+        stretches = np.flatnonzero(np.isfinite(centres[:, k]).all(axis=1)) // _STRETCH
+        for stretch in np.unique(stretches):
+            left_over = np.nan_to_num(rest.reshape(-1, side, side)[stretches == stretch]).mean(axis=0)
+            beside[stretch, k] = _brightest_beside(left_over, sd) / (light[k] / (4 * math.pi * sd**2))
+        for axis in (1, 2):
+            sums = rest.reshape(-1, side, side).sum(axis=axis).ravel()  # NaN where a pixel is left out
+            residuals.append(sums[np.isfinite(sums)] / light[k])
+            models.append(shape.reshape(-1, side, side).sum(axis=axis).ravel()[np.isfinite(sums)])
+    return sd, sd_sd, light, ground, np.concatenate(residuals), np.concatenate(models), beside
+
+
+def _brightest_beside(window: FloatArray, sd: float) -> float:
+    """The largest value beside the middle of a window (side, side), smoothed by a Gaussian."""
+    y, x = np.indices(window.shape) - len(window) // 2
+    smooth = ndimage.gaussian_filter(window, sd, mode="constant")
+    return float(smooth[np.hypot(x, y) >= WEIGHT * sd].max())
+
+
+def _steps(places: FloatArray) -> tuple[float, float]:
+    """Variance of the steps of a random walk and the tracker's error, pixels squared and pixels.
+
+    A frame that is exposed throughout sees the walk's mean: steps then have the variance 2 q / 3 + 2 r and from step to
+    step the covariance q / 6 - r. Berglund, Phys. Rev. E 82, 011917 (2010).
+    """
+    steps = np.diff(places, axis=0)
+    steps = steps - np.nanmean(steps, axis=0)
+    variance = float(np.nanmean(steps**2))
+    covariance = float(np.nanmean(steps[1:] * steps[:-1]))
+    walk = max(variance + 2 * covariance, 0.0)
+    return walk, math.sqrt(max(walk / 6 - covariance, 0.0))
+
+
+def reach(known: Survey, frames: int) -> float:
+    """Largest distance of an object's light from the middle of its blur in an exposure of ``frames`` frames, pixels."""
+    return _REST * math.sqrt(known.sd**2 + known.walk * frames)
