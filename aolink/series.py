@@ -171,11 +171,12 @@ class Series(ABC):
     def __repr__(self) -> str:
         estimators = f", estimates of {', '.join(self.estimators)}" if self.estimators else ""
         truth = ", truth" if self.has_truth else ""
-        return f"<{self._title()}: {len(self)} exposures, rig {self.rig.name}{estimators}{truth}>"
+        return f"<{self.title()}: {len(self)} exposures, rig {self.rig.name}{estimators}{truth}>"
 
     def _repr_html_(self) -> str:
         rows = "".join(f"<tr><th>{name}</th><td>{escape(text)}</td></tr>" for name, text in self.facts().items())
-        return f"<table><caption>{escape(self._title())}</caption>{rows}</table>"
+        return f"<table><caption>{escape(self.title())}</caption>{rows}</table>"
 
-    def _title(self) -> str:
+    def title(self) -> str:
+        """What it is called where it is shown."""
         return f"Recording {self.path.name}"

@@ -1,4 +1,4 @@
-"""What several rooms of tests share: a rig as a process, the command line as a process, a recorded session."""
+"""What several folders of tests share: a rig as a process, the command line as a process, a recorded session."""
 
 from __future__ import annotations
 

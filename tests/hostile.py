@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 from google.protobuf.message import Message
 
 from aolink.rig import Rig
-from aolink.simulation.devices import Line
+from aolink.simulation.devices import LineName
 from aolink.simulation.server import RigServer
 from aolink.simulation.streams import PtyStream, Stream, TcpStream
 from aolink.wire.packet import MessageDecoder, PacketDecoder, encode_message
@@ -91,7 +91,7 @@ def lying_rig(
     tcp: bool = False,
 ) -> Iterator[tuple[str, str]]:
     """A simulated rig in a thread whose camera and mirror change what they say; gives the paths of their ports."""
-    streams: dict[Line, LyingStream] = {
+    streams: dict[LineName, LyingStream] = {
         "camera": LyingStream(camera, tcp=tcp),
         "mirror": LyingStream(mirror, tcp=tcp),
     }

@@ -275,6 +275,14 @@ def test_the_architecture_names_what_there_is() -> None:
     assert named == there - {"__init__", "__main__", "__pycache__"}
 
 
+@pytest.mark.parametrize("page", sorted(ROOT.glob("aolink/*/README.md")), ids=lambda page: page.parent.name)
+def test_the_page_of_a_package_names_each_of_its_modules(page: Path) -> None:
+    code = " ".join(re.findall(r"`([^`\n]+)`", page.read_text()))
+    named = {*re.findall(r"\w+", code), "__init__", "__main__"}
+    modules = {module.stem for module in page.parent.rglob("*.py")}
+    assert {name for name in modules if not name.endswith("_pb2")} <= named
+
+
 def test_commands_in_the_text_have_the_options_that_they_are_given() -> None:
     """Commands inside sentences are not run, but neither may they name what there is not."""
     known = must_be(TyperGroup, typer.main.get_command(app)).commands

@@ -16,7 +16,7 @@ from aolink.files import check_target, writing
 
 if TYPE_CHECKING:
     from aolink.jobs.follow import News, Offer
-    from aolink.jobs.identify import Found, Wanted
+    from aolink.jobs.identify import IdentifiedModel, Wanted
     from aolink.recording.remote import Url
     from aolink.rig import Rig
 
@@ -181,7 +181,7 @@ def _say(each: "News | Offer", *, as_json: bool) -> None:
         stdout.print(f"frame {each.frame_id}: {line}", markup=False)
 
 
-def _as_json(found: "Found") -> dict[str, Any]:
+def _as_json(found: "IdentifiedModel") -> dict[str, Any]:
     return {
         "output": found.output,
         "model": found.model.name,

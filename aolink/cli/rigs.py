@@ -202,7 +202,7 @@ def devices(
 ) -> None:
     """List the serial ports and the drivers of this machine with their devices, or identify the devices behind
     ports."""
-    from aolink.devices.discovery import Found, find_drivers, identify_port, list_ports
+    from aolink.devices.discovery import FoundDevice, find_drivers, identify_port, list_ports
 
     if not ports:
         listed, drivers = list_ports(), find_drivers()
@@ -223,7 +223,7 @@ def devices(
             for address, text in each.devices:
                 stdout.print(f"    found: {escape(address)}  {escape(text)}")
         return
-    found: list[Found] = []
+    found: list[FoundDevice] = []
     failed: AolinkError | None = None
     for port in ports:
         try:

@@ -46,7 +46,7 @@ if TYPE_CHECKING:
 MOST_EXPOSURES = 2**32 - 1
 
 
-class Light(StrEnum):
+class CalibrationLight(StrEnum):
     """The light in a recording for a calibration."""
 
     DARK = "dark"
@@ -77,7 +77,7 @@ def record(
     duration: Annotated[float | None, typer.Option(metavar="S", help="How long to record, s of device time.")] = None,
     note: Annotated[str, typer.Option(metavar="TEXT", help="A text to keep in the recording.")] = "",
     calibration: Annotated[
-        Light | None,
+        CalibrationLight | None,
         typer.Option(help="Record frames of this light for `aolink calibrate`; the mirror stays parked."),
     ] = None,
     control: Annotated[

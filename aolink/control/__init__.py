@@ -5,7 +5,7 @@ from aolink.control.controller import Controller, ControllerRow, Seen
 from aolink.control.drift import Fit, FitMonitor
 from aolink.control.fall_back import FallBack
 from aolink.control.loop import Act, ControlLoop, State, delay_steps
-from aolink.control.modes import Modes, response_at_rest
+from aolink.control.modes import MirrorModes, response_at_rest
 from aolink.control.registry import controller_names, find_controller
 from aolink.control.stability import Stability, check_stable, stability
 
@@ -17,7 +17,7 @@ __all__ = [
     "FallBack",
     "Fit",
     "FitMonitor",
-    "Modes",
+    "MirrorModes",
     "Seen",
     "Stability",
     "State",

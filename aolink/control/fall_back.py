@@ -78,7 +78,7 @@ STILL = ControllerRow(name="still", summary="holds the safe input", build=Still,
 
 
 @dataclass(frozen=True, kw_only=True)
-class Change:
+class ControllerChange:
     """The change to another controller."""
 
     acting: str
@@ -183,8 +183,11 @@ class FallBack:
         missing."""
         self._rivals = {}
 
-    def see(self, exposure: Exposure, slopes: FloatArray, estimate: Estimate | None, fit: Fit | None) -> Change | None:
-        """Take the next exposure with its centroids, (n_outputs,); gives a `Change` where another controller is to act.
+    def see(
+        self, exposure: Exposure, slopes: FloatArray, estimate: Estimate | None, fit: Fit | None
+    ) -> ControllerChange | None:
+        """Take the next exposure with its centroids, (n_outputs,); gives a `ControllerChange` where another
+        controller is to act.
 
         ``fit`` says how well the asked-for controller's model fits, as far as that is known.
         """
@@ -225,7 +228,7 @@ class FallBack:
         self._power: deque[float] = deque(maxlen=WINDOW)
         self._judged: dict[str, deque[_Judged]] = {name: deque(maxlen=WINDOW) for name in self._rows}
 
-    def _verdict(self, fit: Fit | None) -> Change | None:
+    def _verdict(self, fit: Fit | None) -> ControllerChange | None:
         """The controller that is to act, where that changes; the asked-for one once it is time to try it."""
         if len(self._power) < _FEWEST:
             return None
@@ -253,7 +256,7 @@ class FallBack:
             self._since = 0
         self.acting = best
         self._begin()
-        return Change(acting=best, gained=1 - math.sqrt(max(1 - gained / before, 0.0)))
+        return ControllerChange(acting=best, gained=1 - math.sqrt(max(1 - gained / before, 0.0)))
 
 
 def _blur(rig: Rig, exposure: Exposure) -> float:

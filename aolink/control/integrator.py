@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from aolink.control.controller import Seen
-from aolink.control.modes import Modes, response_at_rest
+from aolink.control.modes import MirrorModes, response_at_rest
 from aolink.numerics.arrays import FloatArray
 from aolink.rig import Rig
 
@@ -20,7 +20,7 @@ class Integrator:
     def __init__(self, rig: Rig) -> None:
         self._gain, self._leak, self._rest = rig.control.gain, rig.control.leak, rig.mirror.park
         self._axes = rig.plant.axes
-        modes = Modes.of(response_at_rest(rig.plant, rig.timing.exposure_steps))
+        modes = MirrorModes.of(response_at_rest(rig.plant, rig.timing.exposure_steps))
         self._reconstructor = modes.reconstructor(rig.control.least_singular_value)
         self._u = rig.mirror.park
 

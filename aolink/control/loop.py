@@ -13,7 +13,7 @@ import numpy as np
 
 from aolink.control.controller import Controller, ControllerRow, Seen
 from aolink.control.drift import Fit, FitMonitor
-from aolink.control.fall_back import Change, FallBack
+from aolink.control.fall_back import ControllerChange, FallBack
 from aolink.control.registry import find_controller
 from aolink.errors import AolinkError, ControlError
 from aolink.estimation import Estimate, Needs, Status
@@ -219,7 +219,7 @@ class ControlLoop:
             self._trusted = 0
         self.reason = reason
 
-    def _compare(self, exposure: Exposure, slopes: FloatArray, estimate: Estimate | None) -> Change | None:
+    def _compare(self, exposure: Exposure, slopes: FloatArray, estimate: Estimate | None) -> ControllerChange | None:
         """Let another controller act where this one is worse, or this one again where it is better."""
         if self._fall_back is None:
             return None
@@ -227,7 +227,7 @@ class ControlLoop:
             self._fall_back.interrupt()
             return None
         fall_back = self._fall_back
-        change: Change | None = self._ask(lambda: fall_back.see(exposure, slopes, estimate, self.fit))
+        change: ControllerChange | None = self._ask(lambda: fall_back.see(exposure, slopes, estimate, self.fit))
         if change is not None:
             self._controller = self._fall_back.controller()
         return change

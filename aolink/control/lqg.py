@@ -6,7 +6,7 @@ import numpy as np
 from scipy import linalg
 
 from aolink.control.controller import Seen
-from aolink.control.modes import Modes, reached, response_at_rest
+from aolink.control.modes import MirrorModes, reached, response_at_rest
 from aolink.errors import ControlError
 from aolink.numerics.arrays import FloatArray
 from aolink.rig import Plant, Rig
@@ -49,7 +49,7 @@ def lqr_gain(plant: Plant, effort: float, n_steps: int) -> FloatArray:
     """K of u = -K x for one copy of a plant, (n_inputs, n_states).
 
     It minimises the mean over fast steps of |C x|^2 + rho |u|^2, with rho = ``effort`` times the mean square gain of
-    the mirror modes (`Modes`). With x_1 the states that the inputs reach and x_2 the others, A = [A_1 A_12; 0 A_2] and
+    the `MirrorModes`. With x_1 the states that the inputs reach and x_2 the others, A = [A_1 A_12; 0 A_2] and
     C = [C_1 C_2]: P solves the Riccati equation of (A_1, B_1, C_1' C_1, rho), and S, which weighs x_1 against x_2,
 
         S = C_1' C_2 + (A_1 - B_1 K_1)' (P A_12 + S A_2),
@@ -65,7 +65,7 @@ def lqr_gain(plant: Plant, effort: float, n_steps: int) -> FloatArray:
     one, two = reached(plant)
     A1, A12, A2 = (plant.A[np.ix_(*pair)] for pair in ((one, one), (one, two), (two, two)))
     B, C1, C2 = plant.B[one], plant.C[:, one], plant.C[:, two]
-    gains = Modes.of(response_at_rest(plant, n_steps)).gains
+    gains = MirrorModes.of(response_at_rest(plant, n_steps)).gains
     R = effort * float(np.mean(gains**2)) * np.eye(plant.n_inputs)
     try:
         P = linalg.solve_discrete_are(A1, B, C1.T @ C1, R)

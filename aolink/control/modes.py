@@ -40,7 +40,7 @@ def response_at_rest(plant: Plant, n_steps: int) -> FloatArray:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Modes:
+class MirrorModes:
     """Singular value decomposition of a plant's response at rest, U diag(gains) V'."""
 
     slopes: FloatArray
@@ -51,7 +51,7 @@ class Modes:
     """V, inputs of each mode, (n_inputs, modes)."""
 
     @classmethod
-    def of(cls, response: FloatArray) -> Modes:
+    def of(cls, response: FloatArray) -> MirrorModes:
         """Mirror modes of a response (n_outputs, n_inputs), that of a plant or one measured by `aolink calibrate
         --interaction`."""
         U, gains, V = np.linalg.svd(response, full_matrices=False)

@@ -13,30 +13,34 @@ from aolink.rig.device_tables import Delay
 
 
 class Adapted:
-    """The common part of both adapters: a clock that is read at once, and events that wait to be taken."""
+    """The common part of both adapters: a clock that is read at once, and events that wait to be taken.
+
+    An adapter gives `read_clock`, and `clock_doubt_ns` where its driver corrects the clock.
+    """
 
     def __init__(self, name: str, driver: SimpleCamera | SimpleMirror, delay: Delay, now_ns: Callable[[], int]) -> None:
         self.name = name
         self.description = printable(driver.description)
         self.lacks = lacks_of(driver)
         self.clock = ClockRegression()
-        self._now_ns, self._delay_ns, self._delay_sd_ns = now_ns, round(delay.mean_s * 1e9), delay.sd_s * 1e9
-        self._events: list[Event] = []
+        self.now_ns, self.delay_ns, self.delay_sd_ns = now_ns, round(delay.mean_s * 1e9), delay.sd_s * 1e9
+        self.waiting: list[Event] = []
+        """Events that come with the next `poll`."""
 
-    def _read_clock(self) -> int:
+    def read_clock(self) -> int:
         """The device's clock, ns."""
         raise NotImplementedError
 
-    def _clock_doubt_ns(self) -> int:
+    def clock_doubt_ns(self) -> int:
         """The largest correction that the driver may make to the clock that it reads, ns."""
         return 0
 
     def query_clock(self, now_ns: int) -> None:
-        doubt_ns, sent_ns = self._clock_doubt_ns(), self._now_ns()
+        doubt_ns, sent_ns = self.clock_doubt_ns(), self.now_ns()
         with calling(self.name, "when it was asked for the time"):
-            device_ns = self._read_clock()
-        exchange = ClockExchange(sent_ns - doubt_ns, device_ns, device_ns, self._now_ns() + doubt_ns)
-        self._events.append(ClockSampled.add(self.clock, exchange))
+            device_ns = self.read_clock()
+        exchange = ClockExchange(sent_ns - doubt_ns, device_ns, device_ns, self.now_ns() + doubt_ns)
+        self.waiting.append(ClockSampled.add(self.clock, exchange))
 
     def host_ns(self, device_ns: int, since_zero_ns: int, now_ns: int) -> tuple[int, float]:
         return self.clock.host_ns(device_ns)
@@ -44,6 +48,7 @@ class Adapted:
     def statistics(self) -> dict[str, int]:
         return {}
 
-    def _take_events(self) -> list[Event]:
-        events, self._events = self._events, []
+    def take_waiting(self) -> list[Event]:
+        """The events that waited, once."""
+        events, self.waiting = self.waiting, []
         return events

@@ -78,13 +78,13 @@ class AdaptedCamera(Adapted):
         if not self._tells_time:
             super().query_clock(now_ns)
 
-    def _read_clock(self) -> int:
+    def read_clock(self) -> int:
         device_ns = self._driver.time_ns()
         self._tells_time = device_ns is not None
         return self._monotonic_ns() if device_ns is None else int(device_ns)
 
     def start(self, first_step: int, exposures: int) -> bool:
-        now_ns = self._now_ns()
+        now_ns = self.now_ns()
         ahead_ns = first_step * self._step_ns - self._mirror.since_zero_ns(now_ns)
         if ahead_ns < 0:
             return False
@@ -99,7 +99,7 @@ class AdaptedCamera(Adapted):
 
     def stop(self) -> None:
         try:
-            self._events = self.poll()  # with those that were waiting
+            self.waiting = self.poll()  # with those that were waiting
         finally:
             self._running = False
             with calling(self.name, "when it was asked to stop"):
@@ -123,7 +123,7 @@ class AdaptedCamera(Adapted):
         """The events since the last call. An error that the driver raises comes after the frames before it."""
         if self._failed is not None:
             raise self._failed
-        events = self._take_events()
+        events = self.take_waiting()
         if hasattr(self._driver, "time_answers"):
             with calling(self.name, "when it was asked for the time"):
                 events += self._sampled(self._driver.time_answers())
@@ -131,7 +131,7 @@ class AdaptedCamera(Adapted):
             try:
                 with calling(self.name, "when it was asked for its frames"):
                     for frame in self._driver.frames():
-                        events += self._take(frame, self._now_ns())
+                        events += self._take(frame, self.now_ns())
             except AolinkError as error:
                 if not events:
                     raise
@@ -140,7 +140,7 @@ class AdaptedCamera(Adapted):
 
     def _sampled(self, answers: Iterable[ClockAnswer]) -> list[Event]:
         """The clock's answers, converted to the host's clock, which is compared with `time.monotonic_ns` now."""
-        before_ns, now_ns, after_ns = self._monotonic_ns(), self._now_ns(), self._monotonic_ns()
+        before_ns, now_ns, after_ns = self._monotonic_ns(), self.now_ns(), self._monotonic_ns()
         exchanges = (
             ClockExchange(
                 each.asked_ns + now_ns - after_ns, each.camera_ns, each.camera_ns, each.answered_ns + now_ns - before_ns
@@ -251,7 +251,7 @@ class AdaptedCamera(Adapted):
         # Ids begin anew with each frame from before the session: the camera's own count goes on.
         count = frame_id if raw.number is None else raw.number
         arrived_ns, sd_ns = self._arrivals.add(count, self._arrival_of(raw))
-        return arrived_ns - self._delay_ns - raw.exposure_ns, math.hypot(sd_ns, self._delay_sd_ns)
+        return arrived_ns - self.delay_ns - raw.exposure_ns, math.hypot(sd_ns, self.delay_sd_ns)
 
     def _arrival_of(self, raw: SimpleFrame) -> int:
         return self._monotonic_ns() if raw.arrived_ns is None else raw.arrived_ns

@@ -72,7 +72,7 @@ class AdaptedMirror(Adapted):
     def outage_s(self) -> float:
         return 0.0 if self._left_ns is None else (time.monotonic_ns() - self._left_ns) / 1e9
 
-    def _read_clock(self) -> int:
+    def read_clock(self) -> int:
         with self._call("when it was asked for the time"):
             return int(self._driver.time_ns())
 
@@ -80,26 +80,26 @@ class AdaptedMirror(Adapted):
         super().query_clock(now_ns)
         self.last_sent_ns = now_ns
 
-    def _clock_doubt_ns(self) -> int:
+    def clock_doubt_ns(self) -> int:
         # A driver that infers its device's clock corrects it by up to this much. Without a queue the clock is the
         # host's.
         return 0 if Lacks.QUEUE in self.lacks else round(self._driver_sigma_ns())
 
     def since_zero_ns(self, host_ns: int) -> int:
-        return self.clock.device_ns(host_ns)[0] - self._delay_ns
+        return self.clock.device_ns(host_ns)[0] - self.delay_ns
 
     def step_sigma_ns(self, host_ns: int) -> float:
         clock_ns, driver_ns = self.clock.device_ns(host_ns)[1], self._driver_sigma_ns()
         if Lacks.QUEUE in self.lacks:
-            return math.hypot(clock_ns, self._delay_sd_ns, driver_ns)
-        return math.hypot(max(clock_ns, driver_ns), self._delay_sd_ns)  # the first has part of the second
+            return math.hypot(clock_ns, self.delay_sd_ns, driver_ns)
+        return math.hypot(max(clock_ns, driver_ns), self.delay_sd_ns)  # the first has part of the second
 
     def _driver_sigma_ns(self) -> float:
         """The driver's own standard deviation of the inputs' times, ns.
 
         For a mirror without a queue, that is how late its inputs are; the rig file may give it instead.
         """
-        if self._delay_ns and Lacks.QUEUE in self.lacks:
+        if self.delay_ns and Lacks.QUEUE in self.lacks:
             return 0.0
         with self._call("when it was asked for its timing"):
             return float(getattr(self._driver, "timing_sigma_ns", 0.0))
@@ -128,7 +128,7 @@ class AdaptedMirror(Adapted):
             self._commanded.update((first_step + k, (block.block_id, rows[k])) for k in range(ack.late_steps, len(u)))
         self._next = first_step if self._next is None else self._next
         self.last_sent_ns = now_ns
-        self._events.append(CommandAnswered(ack, block))
+        self.waiting.append(CommandAnswered(ack, block))
         return block
 
     def withdraw(self, step: int) -> int:
@@ -139,7 +139,7 @@ class AdaptedMirror(Adapted):
 
     def poll(self) -> list[Event]:
         """The events since the last call."""
-        events = self._take_events()
+        events = self.take_waiting()
         with self._call("when it was asked what it applied"):
             self._polled_ns = time.monotonic_ns()
             for first_step, u, *rest in self._driver.applied():

@@ -20,7 +20,7 @@ from aolink.wire.signing import read_key
 
 
 @dataclass(frozen=True)
-class Found:
+class FoundDevice:
     """A device that has reported its identity."""
 
     port: str
@@ -90,7 +90,7 @@ def list_ports() -> list[tuple[str, str]]:
     return sorted((port.device, port.description or "") for port in serial_ports.comports())
 
 
-def identify_port(port: str, key: str | Path | None = None) -> Found:
+def identify_port(port: str, key: str | Path | None = None) -> FoundDevice:
     """Ask the device behind a port for its identity, with packets signed by a key file. Raises PortError and
     DeviceError."""
     hub, secret = Hub(), read_key(key) if key else None
@@ -107,7 +107,7 @@ def identify_port(port: str, key: str | Path | None = None) -> Found:
     else:
         parked = ", parked by its watchdog" if mirror.latched else ", parked" if mirror.parked else ""
         geometry = f"{mirror.n_inputs} inputs, queue of {mirror.queue_steps} steps{parked}"
-    return Found(
+    return FoundDevice(
         port=port,
         kind=pb.Identity.Kind.Name(identity.kind).lower(),
         model=identity.model,

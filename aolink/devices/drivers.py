@@ -61,6 +61,18 @@ def calling(kind: str, when: str) -> Iterator[None]:
         raise DeviceError(f"the driver of the {kind} failed {when}: {error!r}") from error
 
 
+class Failure:
+    """The error that has ended a driver's thread: the session gets it when it calls the driver next."""
+
+    def __init__(self) -> None:
+        self.error: Exception | None = None
+
+    def check(self) -> None:
+        """Raise the error, if there is one."""
+        if self.error is not None:
+            raise self.error
+
+
 def load_driver(kind: Kind, name: str) -> Callable[..., Any]:
     """The class of a driver. Raises DeviceError where there is none of this name, or it cannot be loaded."""
     point = _others(kind).get(name)

@@ -10,6 +10,7 @@ from collections.abc import Iterable
 import numpy as np
 from numpy.typing import NDArray
 
+from aolink.devices.drivers import Failure
 from aolink.devices.interfaces import lacks_of
 from aolink.devices.outages import Outages
 from aolink.devices.simple import DirectMirror, Held
@@ -54,7 +55,7 @@ class PacedMirror:
         """Times from the beginning of a step until the device's answer to its input was read, for the newest inputs."""
         self._outages = Outages(max(rig.timing.fast_step_ns // 8, _LEAST_PERIOD_NS))
         self._parked = self._closed = False
-        self._failed: Exception | None = None
+        self._failure = Failure()
         self._thread = threading.Thread(target=self._play, name="aolink-paced-mirror", daemon=True)
         self._thread.start()
 
@@ -70,7 +71,7 @@ class PacedMirror:
 
     def send(self, first_step: int, u: NDArray[np.float64]) -> int:
         with self._changed:
-            self._raise_failure()
+            self._failure.check()
             self._parked = False
             late = min(max(self._next - first_step, 0), len(u))
             self._queue.update(enumerate(u[late:], first_step + late))
@@ -78,7 +79,7 @@ class PacedMirror:
 
     def applied(self) -> Iterable[Held]:
         with self._changed:
-            self._raise_failure()
+            self._failure.check()
             held, self._held = self._held, []
             first, self._reported = self._reported, self._reported + len(held)
         if not held:
@@ -121,7 +122,7 @@ class PacedMirror:
                 self._put(step, u)
             except Exception as error:  # the session gets the error when it asks next
                 with self._changed:
-                    self._failed = error
+                    self._failure.error = error
                 return
 
     def _wait_for_step(self) -> int | None:
@@ -159,7 +160,3 @@ class PacedMirror:
                     self._held.append((self._now, self._queue.pop(self._next, None) is not None))
                     self._next += 1
                 self._now = taken
-
-    def _raise_failure(self) -> None:
-        if self._failed is not None:
-            raise self._failed

@@ -57,14 +57,15 @@ class Estimator:
             for k, exposure in enumerate(batch.exposures):
                 if matters(exposure, self.rig.timing.fast_step_ns):
                     if k:
-                        yield from self._steps(Batch(self.rig, batch.exposures[:k]))
+                        yield from self.steps_as_aligned(Batch(self.rig, batch.exposures[:k]))
                         batch = Batch(self.rig, batch.exposures[k:])
                     self._considering = _Considering(self, exposure)
                     break
-        made = self._steps(batch)
+        made = self.steps_as_aligned(batch)
         yield from made if self._considering is None else self._considering.estimates(batch, made)
 
-    def _steps(self, batch: Batch) -> Iterator[Estimate]:
+    def steps_as_aligned(self, batch: Batch) -> Iterator[Estimate]:
+        """`steps` as if the exposures' alignment had no error."""
         measured = Measurements(self.rig, batch.exposures, self.filter.needs)
         k = 0
         while k < len(batch.exposures):

@@ -78,8 +78,8 @@ class WanderingEstimator(Estimator):
     def shared(self) -> list[object]:
         return [*super().shared, *self._copied]
 
-    def _steps(self, batch: Batch) -> Iterator[Estimate]:
-        series = [each._steps(Batch(each.rig, batch.exposures)) for each in self._each]
+    def steps_as_aligned(self, batch: Batch) -> Iterator[Estimate]:
+        series = [each.steps_as_aligned(Batch(each.rig, batch.exposures)) for each in self._each]
         for exposure in batch.exposures:
             estimates, evidence = [], []
             for copy, made in zip(self._each, series, strict=True):

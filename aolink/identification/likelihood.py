@@ -25,7 +25,7 @@ import numpy as np
 from scipy import linalg, special
 
 from aolink.estimation.model.quadrature import blocks, gauss
-from aolink.identification.models import Disturbance
+from aolink.identification.models import DisturbanceProcesses
 from aolink.identification.readings import Readings
 from aolink.numerics.arrays import BoolArray, FloatArray, Indices
 
@@ -89,7 +89,9 @@ class Likelihood:
         """The same readings with another response to the inputs, (outputs, slots, N + 1)."""
         return Likelihood(replace(self.seen, response=response), self.length)
 
-    def __call__(self, model: Disturbance, noise: float = 1.0, wider: float = 0.0, nodes: int | None = None) -> float:
+    def __call__(
+        self, model: DisturbanceProcesses, noise: float = 1.0, wider: float = 0.0, nodes: int | None = None
+    ) -> float:
         """Log-likelihood, -inf where the model gives no valid covariance.
 
         Parameters
@@ -104,7 +106,7 @@ class Likelihood:
         return float(self.of_outputs(model, noise, wider, nodes).sum())
 
     def of_outputs(
-        self, model: Disturbance, noise: float = 1.0, wider: float = 0.0, nodes: int | None = None
+        self, model: DisturbanceProcesses, noise: float = 1.0, wider: float = 0.0, nodes: int | None = None
     ) -> FloatArray:
         """The log-likelihood of each output, (outputs,)."""
         nodes = nodes or self.nodes(model)
@@ -118,7 +120,7 @@ class Likelihood:
             return np.full(len(out), -math.inf)
         return out if np.isfinite(out).all() else np.full(len(out), -math.inf)
 
-    def nodes(self, model: Disturbance) -> int:
+    def nodes(self, model: DisturbanceProcesses) -> int:
         """Nodes in an exposure that the model's paths need."""
         fastest = max(float(np.abs(process.poles.imag).max()) for process in model.processes) / (2 * math.pi)
         wanted = math.ceil(_FEWEST_NODES / 2 + _NODES_PER_CYCLE * fastest * self.exposure_s)
@@ -155,7 +157,7 @@ class Likelihood:
             ]
         return self._blocks[nodes]
 
-    def _of_means(self, model: Disturbance, nodes: int, noise: float, out: FloatArray) -> FloatArray:
+    def _of_means(self, model: DisturbanceProcesses, nodes: int, noise: float, out: FloatArray) -> FloatArray:
         """Add the log-density of each output's means to ``out``; the constants of the outputs that make it largest."""
         rows, weights = self._rule(nodes)
         seen = self.seen
@@ -211,7 +213,7 @@ class Likelihood:
             ]  # fmt: skip
         return self._means[nodes]
 
-    def _given_means(self, model: Disturbance, nodes: int, usable: BoolArray, noise: float) -> _GivenMeans:
+    def _given_means(self, model: DisturbanceProcesses, nodes: int, usable: BoolArray, noise: float) -> _GivenMeans:
         rows, weights = self._rule(nodes)
         seen = self.seen
         at = np.asarray(rows @ np.arange(float(seen.n_steps))) * seen.step_s
@@ -235,7 +237,7 @@ def _taken(values: FloatArray, where: Sequence[tuple[int, slice]]) -> FloatArray
     return np.array([values[at] for at in where])
 
 
-def _stationary(model: Disturbance, apart: FloatArray, at: FloatArray) -> FloatArray:
+def _stationary(model: DisturbanceProcesses, apart: FloatArray, at: FloatArray) -> FloatArray:
     """Covariances of the stationary processes at places ``at`` of an exposure with those of exposures ``apart``, s.
 
     ``apart`` (m,) begins with zero; (m, nodes, nodes), the later exposure's nodes first.
@@ -248,7 +250,7 @@ def _stationary(model: Disturbance, apart: FloatArray, at: FloatArray) -> FloatA
     return out
 
 
-def _walk(model: Disturbance) -> float:
+def _walk(model: DisturbanceProcesses) -> float:
     """Sum of the intensities of a model's random walks."""
     return sum(process.walk for process in model.processes)
 

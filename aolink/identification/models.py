@@ -183,7 +183,7 @@ class StateSpace:
     """Stationary covariance, (n_states, n_states); that of the first state of a random walk is ``start_variance``."""
 
 
-class Disturbance(Protocol):
+class DisturbanceProcesses(Protocol):
     """The interface of a model for a likelihood: independent processes, whose sum is the disturbance."""
 
     @property

@@ -47,7 +47,7 @@ class _Stationary(Covariance):
 
 @dataclass(frozen=True, eq=False)
 class RigModel:
-    """The disturbance of one output by a rig file; a `aolink.identification.models.Disturbance`."""
+    """The disturbance of one output by a rig file; a `aolink.identification.models.DisturbanceProcesses`."""
 
     processes: tuple[Covariance, ...]
 

@@ -20,8 +20,8 @@ from aolink.exposure import Exposure, Exposures
 from aolink.importing.film import Film
 from aolink.importing.frames import (
     Account,
+    FilmLight,
     ImportedExposure,
-    Light,
     Settings,
     counts_of,
     default_scale,
@@ -63,7 +63,7 @@ def imported(film: Film, rig: Rig, settings: Settings, account: Account) -> Iter
             f"{film.name} has frames of {film.shape[0]} x {film.shape[1]} pixels, the rig file {rig.name} describes"
             f" {rows} x {columns}: change its [sensor], or follow objects with --track N"
         )
-    light = Light(film, settings)
+    light = FilmLight(film, settings)
     offset = rig.sensor.black_level if settings.invert or settings.subtract_median else 0.0
     scale = settings.scale or default_scale(film, rig)
     inputs = _Inputs(film, rig, settings, periods)

@@ -77,7 +77,7 @@ class Account:
     notes: tuple[str, ...] = ()
 
 
-class Light:
+class FilmLight:
     """Pixel values as light: the gamma curve undone, background taken off, dark made bright."""
 
     def __init__(self, film: Film, settings: Settings) -> None:

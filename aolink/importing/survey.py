@@ -11,7 +11,7 @@ from scipy import ndimage, optimize
 
 from aolink.errors import ImportingError
 from aolink.importing.film import Film
-from aolink.importing.frames import Light, Settings
+from aolink.importing.frames import FilmLight, Settings
 from aolink.importing.tracker import FIRST_FRAMES, WEIGHT, Objects, Tracker, trackpy_locator
 from aolink.numerics.arrays import BoolArray, FloatArray, IntArray
 from aolink.optics.kernel import pixel_masses
@@ -108,7 +108,7 @@ def survey(film: Film, settings: Settings, objects: Objects, progress: Callable[
     ImportingError
         None of the objects can be followed.
     """
-    light = Light(film, settings)
+    light = FilmLight(film, settings)
     tracker = Tracker(objects, trackpy_locator(objects.sd))
     every, half = max(1, film.count // _SAMPLES), math.ceil(4 * objects.sd)
     places, last, together = [], [], []

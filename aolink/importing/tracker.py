@@ -12,7 +12,7 @@ from scipy import ndimage, optimize
 
 from aolink.errors import FrameError, ImportingError
 from aolink.importing.film import Film
-from aolink.importing.frames import Light, Settings
+from aolink.importing.frames import FilmLight, Settings
 from aolink.numerics.arrays import BoolArray, FloatArray, IntArray
 from aolink.optics.centroid import weighted_centroid
 from aolink.optics.maxima import cut_windows, find_maxima, flatten, spot_sd
@@ -188,7 +188,7 @@ def find_objects(film: Film, settings: Settings) -> Objects:
     """
     if settings.places and len(settings.places) != settings.track:
         raise ImportingError(f"{len(settings.places)} places are given for --track {settings.track}: give one for each")
-    light, frames = Light(film, settings), []
+    light, frames = FilmLight(film, settings), []
     for frame in film.frames():
         frames.append(light.of(frame)[0])
         if len(frames) == FIRST_FRAMES:

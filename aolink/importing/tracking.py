@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from aolink.errors import ImportingError
 from aolink.exposure import Truth
 from aolink.importing.film import Film
-from aolink.importing.frames import Account, ImportedExposure, Light, Settings, counts_of, grouped, rig_frame
+from aolink.importing.frames import Account, FilmLight, ImportedExposure, Settings, counts_of, grouped, rig_frame
 from aolink.importing.survey import Survey, reach, survey
 from aolink.importing.tracker import WEIGHT, find_objects
 from aolink.numerics.arrays import BoolArray, FloatArray
@@ -50,7 +50,7 @@ def tracked(
     known = survey(film, settings, find_objects(film, settings))
     account.notes += tuple(known.notes())
     windows = _Windows(rig, sensor, known)
-    light, step, area = Light(film, settings), 0, sensor.pixel_size
+    light, step, area = FilmLight(film, settings), 0, sensor.pixel_size
     for group in grouped(film, settings.frames_per_exposure, periods):
         shown = [light.of(frame) for frame in group.frames]
         mean = np.mean([one for one, _ in shown], axis=0)

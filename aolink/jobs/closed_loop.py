@@ -19,7 +19,7 @@ from aolink.recording.reader import Recording
 from aolink.rig import Rig
 from aolink.session.replay import would_command
 from aolink.simulation.devices import FIRMWARE
-from aolink.simulation.model import RigModel, exposure_of
+from aolink.simulation.model import RigPhysics, exposure_of
 
 _SIMULATED = re.compile(rf" ([0-9a-f]{{8}})-(\d+) \({re.escape(FIRMWARE)}\)$")
 """Serial number and firmware of a simulated camera, in its description."""
@@ -63,7 +63,7 @@ def closed_loop(
     ControlError, EstimatorError
         There is no such controller or estimator, or it cannot work on this rig.
     """
-    timing, model = rig.timing, RigModel(rig, seed)
+    timing, model = rig.timing, RigPhysics(rig, seed)
     loop = ControlLoop(rig, controller) if controller else None
     driver = Driver(rig, [estimator] if estimator else [])
     model.start_camera(0, exposures)

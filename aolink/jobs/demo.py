@@ -18,7 +18,7 @@ from aolink.errors import AolinkError, DeviceError, ExportError, ViewerError
 from aolink.estimation import estimator_rows
 from aolink.exposure import residual_rms
 from aolink.files import writing
-from aolink.recording.deblur import Summary, write_deblurred
+from aolink.recording.deblur import RestoredCounts, write_deblurred
 from aolink.recording.reader import Recording
 from aolink.recording.reestimate import first_difference, reestimate
 from aolink.rig import Rig
@@ -44,7 +44,7 @@ class DemoResult:
     residuals: Mapping[str, float] = field(default_factory=dict)
     """True slopes at the fast rate where the loop was closed, root mean square, slope units, by the controller's name;
     "open" for none. Each controller has a recording of its name beside the session's."""
-    deblurred: Summary | None = None
+    deblurred: RestoredCounts | None = None
     """Summary of the restored pictures; None where the rig has no picture sensor."""
     deblurred_by: str = ""
     """Estimator whose path they were restored with."""

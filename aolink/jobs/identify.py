@@ -52,7 +52,7 @@ class Wanted:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Found:
+class IdentifiedModel:
     """The identified model of one output, or of all outputs that share it."""
 
     output: str
@@ -73,7 +73,7 @@ class Found:
 class Result:
     """All outputs, and the text of the rig file that they make."""
 
-    found: tuple[Found, ...]
+    found: tuple[IdentifiedModel, ...]
     text: str
 
 
@@ -144,7 +144,7 @@ def outputs_of(seen: Readings, which: Sequence[int]) -> list[int]:
     return [seeing[k] for k in at]
 
 
-def _of_output(rig: Rig, output: str, seen: Sequence[Readings], wanted: Wanted, tell: Tell | None) -> Found:
+def _of_output(rig: Rig, output: str, seen: Sequence[Readings], wanted: Wanted, tell: Tell | None) -> IdentifiedModel:
     def space(kinds: Sequence[str]) -> Space:
         return space_of(
             kinds, seen, rig.sensor.kernel.variance, with_noise=wanted.noise, with_kernel=wanted.kernel,
@@ -173,7 +173,7 @@ def _of_output(rig: Rig, output: str, seen: Sequence[Readings], wanted: Wanted, 
         if each.name.endswith("frequency_hz") and len(each.pieces) > 1:
             rest = ", ".join(f"{piece.best:.4g}" for piece in each.pieces if not piece.low <= each.best <= piece.high)
             notes.append(f"{each.name}: {rest} Hz explains the exposures nearly as well: an alias that remains")
-    return Found(
+    return IdentifiedModel(
         output=output, model=replace(whole, processes=whole.processes[1 if plant else 0 :]), plant=plant, noise=noise,
         wider=wider, parameters=sets, tried=tuple(candidates), log_likelihood=tops[0].log_likelihood,
         exposures=sum(int(each.usable.any(axis=0).sum()) for each in seen), notes=tuple(notes),

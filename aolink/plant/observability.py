@@ -28,7 +28,7 @@ _UNSEEN = 1e-9
 
 
 @dataclass(frozen=True, kw_only=True)
-class Mode:
+class Eigenmode:
     """An eigenmode of the plant: an eigenvalue of A (of a complex pair, the one above the real axis)."""
 
     eigenvalue: complex
@@ -55,17 +55,17 @@ class ObservabilityReport:
     """Dimension of the observable subspace of (A, C), at the fast rate."""
     centroid_rank: int
     """The same for (A^N, C-bar), the means over exposures; remark 1 holds where it equals ``rank``, and it need not."""
-    modes: tuple[Mode, ...]
+    modes: tuple[Eigenmode, ...]
     o2_needs: str
     """The condition under which an estimator of the second moment alone (`o2`) works."""
 
     @property
-    def unseen(self) -> tuple[Mode, ...]:
+    def unseen(self) -> tuple[Eigenmode, ...]:
         """Eigenmodes that are not observable at the fast rate."""
         return tuple(m for m in self.modes if not m.seen)
 
     @property
-    def lost_by_centroid(self) -> tuple[Mode, ...]:
+    def lost_by_centroid(self) -> tuple[Eigenmode, ...]:
         """Eigenmodes that are observable at the fast rate but not from the means over exposures."""
         return tuple(m for m in self.modes if m.seen and not m.seen_by_centroid)
 
@@ -88,7 +88,7 @@ def observability(plant: Plant, n_steps: int, fast_step_s: float) -> Observabili
             continue
         radius = abs(value)
         modes.append(
-            Mode(
+            Eigenmode(
                 eigenvalue=complex(value),
                 frequency_hz=float(abs(np.angle(value))) / (2 * math.pi * fast_step_s),
                 time_constant_s=math.inf if radius >= 1 - 1e-12 else -fast_step_s / math.log(max(radius, 1e-300)),

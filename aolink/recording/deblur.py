@@ -34,7 +34,7 @@ _AHEAD = 4
 
 
 @dataclass(kw_only=True)
-class Summary:
+class RestoredCounts:
     """How many pictures were restored, and how well where the true scene is known."""
 
     exposures: int = 0
@@ -52,7 +52,7 @@ class Summary:
 def write_deblurred(
     recording: Recording, path: Path, *, estimator: str, method: str = DEFAULT_METHOD, overwrite: bool = False,
     workers: int = 0, progress: Progress = no_progress,
-) -> Summary:  # fmt: skip
+) -> RestoredCounts:  # fmt: skip
     """Copy a recording with its pictures restored.
 
     Everything else stays, byte for byte; restored pictures that it has are replaced, and estimates of ``estimator``
@@ -92,9 +92,9 @@ def _written(
     held: tuple[Exposure, Estimate, RestoredPictures] | None,
     estimator: str,
     progress: Progress,
-) -> Summary:
+) -> RestoredCounts:
     true_scene = recording.true_scene
-    summary, log_times = Summary(), dict[int, int]()
+    summary, log_times = RestoredCounts(), dict[int, int]()
     left_out: tuple[str, ...] = (topics.RESTORED,)
     if estimator not in recording.estimators:
         left_out += (topics.estimation_topic(estimator),)  # the estimates are new, and belong to all exposures
@@ -164,7 +164,7 @@ def _messages(done: RestoredPictures, time_ns: int) -> Iterator[tuple[str, Messa
 
 
 def _score(
-    summary: Summary, rig: Rig, true_scene: NDArray[np.uint16] | None, exposure: Exposure, estimate: Estimate,
+    summary: RestoredCounts, rig: Rig, true_scene: NDArray[np.uint16] | None, exposure: Exposure, estimate: Estimate,
     done: RestoredPictures,
 ) -> None:  # fmt: skip
     summary.exposures += 1

@@ -45,7 +45,7 @@ class GrowingRecording(Recording):
         """Names of the schemas by their ids."""
         super().__init__(place, rig=rig)
 
-    def _survey(self, *, check: bool) -> str | None:
+    def survey(self, *, check: bool) -> str | None:
         """Read up to the rig file, which a session writes before any message."""
         for record in self._coming:
             if isinstance(record, Attachment) and record.name == topics.RIG_ATTACHMENT:
@@ -54,18 +54,18 @@ class GrowingRecording(Recording):
                 raise RecordingError(f"{self.path} has messages before its rig file: it can only be read when finished")
         return None
 
-    def _own_messages(
+    def own_messages(
         self, wanted: Collection[str], low: int = 0, high: int = 1 << 64, chunks: slice = slice(None)
     ) -> Iterator[RawMessage]:
         for record in self._coming:
             if isinstance(record, Schema):
                 self._names[record.id] = record.name
             elif isinstance(record, Channel):
-                self._channels[record.id] = (record.topic, self._names.get(record.schema_id, ""))
+                self.channels[record.id] = (record.topic, self._names.get(record.schema_id, ""))
             elif isinstance(record, Metadata):
-                self._note([record])
-            elif isinstance(record, McapMessage) and record.channel_id in self._channels:
-                topic, schema = self._channels[record.channel_id]
+                self.note_metadata([record])
+            elif isinstance(record, McapMessage) and record.channel_id in self.channels:
+                topic, schema = self.channels[record.channel_id]
                 if topic in wanted and low <= record.log_time < high:
                     yield RawMessage(topic, schema, record.log_time, record.sequence, record.data)
 
@@ -77,13 +77,13 @@ class GrowingRecording(Recording):
             position, ended, written = len(MAGIC), False, True
             while not ended:
                 before = position
-                position, records, ended = grown(file, position, self._lose)
+                position, records, ended = grown(file, position, self.lose)
                 yield from records
                 if position > before:
                     continue
                 if not written:
                     what = f"it was cut off: it ends at byte {position}, without an index"
-                    self._lose(Loss(position, 0, what))
+                    self.lose(Loss(position, 0, what))
                     return
                 # Records written between the last reading and the writer's end are still read.
                 if written := _is_being_written(path):

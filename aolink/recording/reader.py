@@ -82,6 +82,9 @@ class Recording(Series):
     A complete file is read by its index. One that was cut off or damaged is scanned for its undamaged parts; `losses`
     lists the others.
 
+    A subclass that finds its messages in another way gives `survey` and `own_messages`, and tells of what it finds with
+    ``channels``, `note_metadata` and `lose`.
+
     Parameters
     ----------
     path:
@@ -125,7 +128,7 @@ class Recording(Series):
         self._losses: dict[int, Loss] = {}
         self._unusable: dict[tuple[str, str], dict[tuple[int, int], int]] = {}
         """Messages that are not of their kind, by topic and kind of error: sequence, log time and length."""
-        self._channels: dict[int, tuple[str, str]] = {}
+        self.channels: dict[int, tuple[str, str]] = {}
         """Topic and name of the schema, by the channel's id."""
         self.schemas: dict[str, Schema] = {}
         """Schemas by name, as they are in the file."""
@@ -136,7 +139,7 @@ class Recording(Series):
         self._left_out: frozenset[str] = frozenset()
         """Topics that are read from side files instead."""
         self._second_rig_text: str | None = None
-        rig_text = self._survey(check=check)
+        rig_text = self.survey(check=check)
         if rig_text is None:
             raise RecordingError(f"{self.path} is an MCAP file but not a recording of aolink: it holds no rig file")
         self._rig_text = rig_text
@@ -273,20 +276,21 @@ class Recording(Series):
     ) -> Iterator[RawMessage]:
         """The messages as bytes, with those of other software too, selected as by `messages`; with an index, from one
         of its chunks on."""
-        own = self._own_messages(wanted, start_ns, end_ns, slice(first_chunk, None))
+        own = self.own_messages(wanted, start_ns, end_ns, slice(first_chunk, None))
         if not self._side:
             return own
         others = (each.raw_messages(*wanted, start_ns=start_ns, end_ns=end_ns) for each in self._side)
         timed = heapq.merge(*map(in_time, (own, *others)), key=lambda each: each[0])
         return (raw for _, raw in timed)
 
-    def _own_messages(
+    def own_messages(
         self, wanted: Collection[str], low: int = 0, high: int = _END_OF_TIME, chunks: slice = slice(None)
     ) -> Iterator[RawMessage]:
-        """The messages of the file itself."""
+        """The messages of the file itself, as bytes: those of these topics (of all, if none is named) whose log time is
+        from ``low`` to below ``high``; with an index, only those in these of its chunks."""
         channels = {
             k: names
-            for k, names in self._channels.items()
+            for k, names in self.channels.items()
             if (not wanted or names[0] in wanted) and names[0] not in self._left_out
         }
         for record in self._records(channels, low, high, chunks):
@@ -362,7 +366,7 @@ class Recording(Series):
         while index is not None and number - back > 0:
             first = number - back
             chunk = index.chunk_of(first)
-            infos = self._own_messages((topics.EXPOSURE,), chunks=slice(chunk, chunk + 1))
+            infos = self.own_messages((topics.EXPOSURE,), chunks=slice(chunk, chunk + 1))
             info = next(islice(map(self.decoded, infos), first - index.before[chunk], None), None)
             if not isinstance(info, schemas_pb2.ExposureInfo):
                 break
@@ -384,13 +388,13 @@ class Recording(Series):
         """The index of frames; None where the file has no index, or one without the messages' places."""
         if self._index is None or self._losses or self.counts.get(topics.EXPOSURE) != self.n_frames:
             return None
-        frames = {channel for channel, (topic, _) in self._channels.items() if topic == topics.EXPOSURE}
+        frames = {channel for channel, (topic, _) in self.channels.items() if topic == topics.EXPOSURE}
         index = FrameIndex.of(self._index, frames)
         return index if index is not None and index.before[-1] == self.n_frames else None
 
     def _runs_in(self, chunk: int) -> Iterator[StepRun]:
         """The commands and reports in a chunk."""
-        for raw in self._own_messages(tuple(topics.RUNS), chunks=slice(chunk, chunk + 1)):
+        for raw in self.own_messages(tuple(topics.RUNS), chunks=slice(chunk, chunk + 1)):
             message = self.decoded_run(raw) or self.decoded(raw)
             if isinstance(message, Run | Applied | CommandBlock):
                 yield raw.topic, message.first_step + message.n_steps
@@ -502,7 +506,7 @@ class Recording(Series):
             self.encodings |= each.encodings
         self.rig, self.rig_is_recorded = self._side[0].rig, True
 
-    def _survey(self, *, check: bool) -> str | None:
+    def survey(self, *, check: bool) -> str | None:
         """Find out what is in the file: from its index, or else by a scan. Gives the text of the rig file."""
         with open_recording(self.path) as file:
             summary = None if check else read_summary(file)
@@ -527,19 +531,19 @@ class Recording(Series):
                     ids[record.id] = record.name
                     self.schemas[record.name] = record
             elif isinstance(record, Channel):
-                before = self._channels.get(record.id)
+                before = self.channels.get(record.id)
                 if sure or before is None:  # its schema may have been in a chunk that is lost
                     kind = ids.get(record.schema_id, before[1] if before else "")
-                    self._channels[record.id] = (record.topic, kind)
+                    self.channels[record.id] = (record.topic, kind)
                     self.encodings[record.topic] = record.message_encoding
             elif isinstance(record, Attachment):
                 self._attach(record)
             elif isinstance(record, Metadata):
                 noted.append(record)
-        self._note(noted)
+        self.note_metadata(noted)
         for channel_id, number in held.items():
-            if channel_id in self._channels:
-                self.counts[self._channels[channel_id][0]] = number
+            if channel_id in self.channels:
+                self.counts[self.channels[channel_id][0]] = number
         attached = self.attachments.get(topics.RIG_ATTACHMENT)
         return self._second_rig_text if attached is None else attached.decode(errors="replace")
 
@@ -550,7 +554,7 @@ class Recording(Series):
         others = sorted(summary.others, key=lambda each: each.offset)
         with open_recording(self.path, [(each.offset, each.length) for each in others]) as file:
             for each in others:
-                if (found := record_at(file, each, self._lose)) is not None:
+                if (found := record_at(file, each, self.lose)) is not None:
                     yield found, True
 
     def _attach(self, record: Attachment) -> None:
@@ -558,7 +562,7 @@ class Recording(Series):
         if (held := sum(map(len, self.attachments.values()))) > limits().attachment_bytes:
             raise exceeded(f"{self.path} holds attachments of {held} bytes", "attachment_bytes")
 
-    def _note(self, records: Sequence[Metadata]) -> None:
+    def note_metadata(self, records: Sequence[Metadata]) -> None:
         """Keep the facts in the file's metadata."""
         for name, values in unsealed(records):
             if values is None:
@@ -572,8 +576,8 @@ class Recording(Series):
             elif name == topics.CHANNEL_METADATA and values.get("id", "").isdigit():
                 number = int(values["id"])
                 # The chunk that names the channel, or the one that holds its schema, may be lost.
-                if not self._channels.get(number, ("", ""))[1]:
-                    self._channels[number] = (values.get("topic", ""), values.get("schema", ""))
+                if not self.channels.get(number, ("", ""))[1]:
+                    self.channels[number] = (values.get("topic", ""), values.get("schema", ""))
 
     def _records(self, channels: Collection[int], low: int, high: int, chunks: slice) -> Iterator[McapRecord]:
         """Records in the order of the file, at least all messages of some channels between two log times."""
@@ -590,13 +594,14 @@ class Recording(Series):
         budget = Budget(str(self.path), self.size)
         with open_recording(self.path, [(each.chunk_start_offset, each.chunk_length) for each in wanted]) as file:
             for index in wanted:
-                yield from chunk_at(file, index, self._lose, budget)
+                yield from chunk_at(file, index, self.lose, budget)
 
     def _scanned(self) -> Iterator[tuple[McapRecord, bool]]:
         with open_recording(self.path) as file:
-            yield from scan(file, self._lose)
+            yield from scan(file, self.lose)
 
-    def _lose(self, loss: Loss) -> None:
+    def lose(self, loss: Loss) -> None:
+        """Add to `losses`; of several at one place, the first counts."""
         self._losses.setdefault(loss.offset, loss)
 
 

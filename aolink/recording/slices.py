@@ -60,7 +60,7 @@ class RecordingSlice(Series):
             return RecordingSlice(self.recording, self.numbers[index])
         return self.recording[self.numbers[index]]
 
-    def _title(self) -> str:
+    def title(self) -> str:
         numbers = self.numbers
         step = f":{numbers.step}" if numbers.step > 1 else ""
         return f"Recording {self.path.name}[{numbers.start}:{numbers.stop}{step}]"

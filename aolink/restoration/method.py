@@ -15,7 +15,7 @@ from scipy import ndimage
 from aolink.numerics.arrays import BoolArray, FloatArray
 from aolink.restoration import spectrum
 from aolink.restoration.inverse import Direction
-from aolink.restoration.psf import Line, Psf, along_line
+from aolink.restoration.psf import ProjectedPsf, Psf, along_line
 from aolink.restoration.scanner import Scanner
 
 
@@ -55,7 +55,7 @@ class Blurred:
         return max(spectrum.noise_variance(self.power_spectrum), floor**2)
 
     @cached_property
-    def line(self) -> Line:
+    def line(self) -> ProjectedPsf:
         """The straight line that is nearest to a PSF on the plane."""
         return along_line(self.psf)
 

@@ -231,7 +231,8 @@ def _path_root(covariance: ArrayLike, size: int) -> FloatArray:
 def _axis(positions: FloatArray, width: FloatArray) -> tuple[FloatArray, FloatArray, int]:
     """Masses in pixels and their derivatives by position, (n_steps, points, pixels), and the pixel of no displacement.
 
-    Positions (n_steps, points), widths (n_steps,).
+    Positions (n_steps, points), widths (n_steps,). `aolink.optics.kernel.pixel_masses` has the same integrals, and
+    derivatives that differ in their last bits: these stand alone so that restored pictures stay as they are.
     """
     reach = _REACH * float(width.max()) / math.sqrt(2)
     low = min(0, math.floor(positions.min() - reach))
@@ -281,7 +282,7 @@ def line_matrix(values: FloatArray, columns: int) -> FloatArray:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Line:
+class ProjectedPsf:
     """Projection of a PSF on the plane onto a straight line."""
 
     angle_rad: float
@@ -291,7 +292,7 @@ class Line:
     """Root mean square distance of the light from the line, without the width of the pixels."""
 
 
-def along_line(psf: Psf) -> Line:
+def along_line(psf: Psf) -> ProjectedPsf:
     """Project a PSF on the plane onto its principal axis; each pixel's light goes to the two nearest taps."""
     values, total = psf.values, psf.values.sum()
     y, x = (np.indices(values.shape) - np.array(psf.origin)[:, None, None]).astype(np.float64)
@@ -311,7 +312,7 @@ def along_line(psf: Psf) -> Line:
         return np.asarray(near + np.bincount(tap.ravel() + 1, (light * part).ravel(), size))
 
     modes = np.array([project(mode) for mode in psf.modes]).reshape(len(psf.modes), size)
-    return Line(
+    return ProjectedPsf(
         angle_rad=math.atan2(direction[1], direction[0]),
         psf=_trimmed(project(values), modes if len(modes) else np.zeros((1, size)), (-low,)),
         # A line that is drawn on pixels strays by the variance of a pixel's own width, 1/12 of its square.

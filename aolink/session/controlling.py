@@ -23,7 +23,7 @@ MARGIN_S = 0.003
 
 
 @dataclass(frozen=True, kw_only=True)
-class Change:
+class ControlEffect:
     """The effect of an exposure on the session."""
 
     message: pb.Control
@@ -78,13 +78,13 @@ class Controlling:
         if applied.u:
             self.loop.applied(applied.first_step, np.array(applied.u).reshape(applied.n_steps, self._n_inputs))
 
-    def see(self, exposure: Exposure, estimate: Estimate | None, earliest_step: int) -> Change:
+    def see(self, exposure: Exposure, estimate: Estimate | None, earliest_step: int) -> ControlEffect:
         """Take the next exposure, or its estimate. Raises ControlError where the controller fails."""
         act = self.loop.see(exposure, estimate, earliest_step)
         self.cause_frame = act.frame_id
         self.report.add(act, self._step_s)
         message = convert.control_message(act, self.loop.name, self.estimator)
-        return Change(message=message, first_step=act.first_step, warning=self._news(act))
+        return ControlEffect(message=message, first_step=act.first_step, warning=self._news(act))
 
     def _news(self, act: Act) -> str:
         """The changes of the loop's state with an exposure, in words."""

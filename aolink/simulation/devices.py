@@ -17,12 +17,12 @@ from google.protobuf.message import Message
 from numpy.typing import NDArray
 
 from aolink.rig import Rig
-from aolink.simulation.model import CameraFrame, RigModel
+from aolink.simulation.model import CameraFrame, RigPhysics
 from aolink.wire import messages_pb2 as pb
 from aolink.wire.packet import MAX_CHUNK, PROTOCOL_VERSION, schema_hash
 from aolink.wire.truth import truth_message
 
-Line = Literal["camera", "mirror"]
+LineName = Literal["camera", "mirror"]
 FIRMWARE = "aolink simulated rig 1"
 _REMEMBERED_BLOCKS = 256
 _PACKET_INPUTS = 512  # numbers in an `Applied` of one packet
@@ -34,7 +34,7 @@ _HISTORY_INPUTS = 1 << 20  # the most numbers that are remembered, beside one qu
 class Outgoing:
     """A message for the host, and the fast step at whose end it leaves (None: at once)."""
 
-    line: Line
+    line: LineName
     message: Message
     after_step: int | None = None
 
@@ -54,7 +54,7 @@ class SimulatedDevices:
     def __init__(self, rig: Rig, seed: int | None = None, *, virtual_time: bool, step_zero_ns: int) -> None:
         self.rig = rig
         self.outbox: list[Outgoing] = []
-        self._model = RigModel(rig, seed)
+        self._model = RigPhysics(rig, seed)
         self._virtual_time = virtual_time
         self._step_zero_ns = step_zero_ns
         self._serial_number = f"{rig.digest[:8]}-{rig.simulation.seed if seed is None else seed}"
@@ -115,7 +115,7 @@ class SimulatedDevices:
             end = min(end, frame_end) if frame_end > self.step else end
         return end
 
-    def handle(self, line: Line, message: Message, sequence: int) -> None:
+    def handle(self, line: LineName, message: Message, sequence: int) -> None:
         """Act on a message from the host; the answers are in the outbox."""
         if isinstance(message, pb.Identify):
             self._begin_session(line, message.nonce)
@@ -138,7 +138,7 @@ class SimulatedDevices:
             name = type(message).__name__
             self._say(line, pb.Ack(sequence=sequence, code=pb.NOT_SUPPORTED, text=f"a {line} does not take {name}"))
 
-    def _begin_session(self, line: Line, nonce: int) -> None:
+    def _begin_session(self, line: LineName, nonce: int) -> None:
         """Drop the state that an earlier host left behind."""
         self.outbox = [o for o in self.outbox if o.line != line]
         identity = self._identity(line, nonce)
@@ -190,10 +190,10 @@ class SimulatedDevices:
             self._send_frame(frame)
         self.outbox.sort(key=lambda o: -1 if o.after_step is None else o.after_step)
 
-    def _say(self, line: Line, message: Message, after_step: int | None = None) -> None:
+    def _say(self, line: LineName, message: Message, after_step: int | None = None) -> None:
         self.outbox.append(Outgoing(line, message, after_step))
 
-    def _identity(self, line: Line, nonce: int) -> pb.Identity:
+    def _identity(self, line: LineName, nonce: int) -> pb.Identity:
         rig = self.rig
         identity = pb.Identity(
             nonce=nonce,

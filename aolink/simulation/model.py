@@ -34,7 +34,7 @@ class CameraFrame:
     truth: Truth
 
 
-class RigModel:
+class RigPhysics:
     """Plant, mirror and camera of a rig, advanced in fast steps.
 
     Frames depend on the rig, the seed, the inputs and the camera's start, and not on how the steps are split into calls
@@ -201,7 +201,7 @@ def simulate(
         inputs = rig.mirror.quantise(rig.drive.inputs(0, n_steps, timing.fast_step_s))
     elif inputs.ndim != 2 or inputs.shape[0] < n_steps or inputs.shape[1] != rig.n_inputs:
         raise ValueError(f"inputs have shape {inputs.shape}, expected at least ({n_steps}, {rig.n_inputs})")
-    model = RigModel(rig, seed)
+    model = RigPhysics(rig, seed)
     if n_exposures:
         model.start_camera(0, n_exposures)
     frames = model.advance(inputs[:n_steps])

@@ -18,7 +18,7 @@ from google.protobuf.message import DecodeError, Message
 
 from aolink.errors import RigError
 from aolink.rig import Faults, Rig
-from aolink.simulation.devices import Line, Outgoing, SimulatedDevices
+from aolink.simulation.devices import LineName, Outgoing, SimulatedDevices
 from aolink.simulation.faults import Way
 from aolink.simulation.streams import VERSIONS, Stream, refusal_event
 from aolink.wire import messages_pb2 as pb
@@ -55,7 +55,7 @@ class LineEnd:
     none.
     """
 
-    def __init__(self, line: Line, stream: Stream, faults: Faults, seed: np.random.SeedSequence) -> None:
+    def __init__(self, line: LineName, stream: Stream, faults: Faults, seed: np.random.SeedSequence) -> None:
         self.line, self.stream = line, stream
         self.taken = 0
         """Bytes from this session's Identify on that have been handled, lost and damaged ones included."""
@@ -186,7 +186,7 @@ class RigServer:
     def __init__(
         self,
         rig: Rig,
-        streams: dict[Line, Stream],
+        streams: dict[LineName, Stream],
         *,
         seed: int | None = None,
         real_time: bool = False,
@@ -196,7 +196,7 @@ class RigServer:
         if simulation.faults.vanish_rate and not real_time:
             raise RigError("simulation.faults.vanish_rate: ports vanish in real time only: add --real-time")
         seeds = np.random.SeedSequence(simulation.seed if seed is None else seed).spawn(8)[5:]
-        self._lines: dict[Line, LineEnd] = {
+        self._lines: dict[LineName, LineEnd] = {
             line: LineEnd(line, stream, simulation.faults, seeds[i]) for i, (line, stream) in enumerate(streams.items())
         }
         self._latency_rng = np.random.default_rng(seeds[2])
@@ -207,7 +207,7 @@ class RigServer:
         self._step_zero_ns = self._start_ns + round(simulation.clock_offset_s * 1e9)
         self._now_ns = self._start_ns  # virtual time
         self._last_valid_ns = self._start_ns
-        self._sent_ns: dict[Line, int] = {}
+        self._sent_ns: dict[LineName, int] = {}
         self._late_rate, self._chunk_loss_rate = simulation.faults.late_rate, simulation.faults.chunk_loss_rate
         self._late: list[tuple[int, pb.CommandBlock, int]] = []
         """Blocks that a fault holds back, each with the step at which it comes and its sequence number."""

@@ -22,7 +22,7 @@ from typing import Protocol
 from google.protobuf.message import DecodeError
 
 from aolink.errors import PortError
-from aolink.simulation.devices import Line
+from aolink.simulation.devices import LineName
 from aolink.wire import messages_pb2 as pb
 from aolink.wire.packet import (
     DELIMITER,
@@ -252,7 +252,7 @@ def refusal_event(why: str) -> pb.Event:
 def open_streams(
     listen: str | None, *, key: bytes | None = None, allow_remote: bool = False, unsigned: bool = False,
     links: Path | None = None,
-) -> dict[Line, Stream]:  # fmt: skip
+) -> dict[LineName, Stream]:  # fmt: skip
     """Two pseudo terminals, or two TCP ports on ``listen`` = HOST:PORT (the mirror's is the next one; 0: any).
 
     With ``key``, of 32 bytes, they take and send signed packets only. ``links`` is a folder for links to the terminals,
@@ -264,7 +264,7 @@ def open_streams(
         The address cannot be listened on, or other machines could reach it and ``allow_remote`` is not given, or
         neither ``key`` nor ``unsigned`` is.
     """
-    names: tuple[Line, Line] = ("camera", "mirror")
+    names: tuple[LineName, LineName] = ("camera", "mirror")
     camera, mirror = (Signing(key, name, to_host=True) if key else None for name in names)
     if listen is None:
         return {

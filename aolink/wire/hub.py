@@ -62,7 +62,8 @@ class Hub:
         """Memory for messages that the session has not taken yet; a device that sends more ends the session."""
         self._epoch_ns = time.time_ns() - time.monotonic_ns()
         self._virtual_ns = 0
-        self._pending: list[tuple[Link, Received]] = []
+        self.pending: list[tuple[Link, Received]] = []
+        """Messages that the next `wait` gives first."""
 
     def now_ns(self) -> int:
         """Host time, ns since 1970: steady within a session; on virtual time the rig sets it."""
@@ -91,7 +92,7 @@ class Hub:
                     " (a pseudo terminal, or a TCP port of 127.0.0.1): run it with --real-time, or through a tunnel"
                 )
         self.virtual = True
-        self._pending += self._receive_until_dealt_with()
+        self.pending += self._receive_until_dealt_with()
         self.virtual_since_ns = self._virtual_ns = max(link.handed.host_ns for link in self.links if link.handed)
         if not 0 < self._virtual_ns < _MOST_HOST_NS:
             raise DeviceError(
@@ -110,7 +111,7 @@ class Hub:
 
     def wait(self, timeout_s: float) -> list[tuple[Link, Received]]:
         """The messages that came, in order of time; in real time, wait for them for up to ``timeout_s``."""
-        pending, self._pending = self._pending, []
+        pending, self.pending = self.pending, []
         if self.virtual:
             pending += self._receive_until_dealt_with()
             # Time moves here and nowhere else: the time at a send must not depend on the messages that have come by
@@ -151,8 +152,8 @@ class Hub:
             while True:
                 if link.lost is not None:
                     raise link.lost
-                kept = self._pending
-                self._pending = []
+                kept = self.pending
+                self.pending = []
                 answer = None
                 for source, received in self.wait((deadline_ns - self.now_ns()) / 1e9):
                     message = received.message
@@ -167,7 +168,7 @@ class Hub:
                             kept = [each for each in kept if each[0] is not link]
                     else:
                         kept.append((source, received))
-                self._pending = kept
+                self.pending = kept
                 self._keep_to_budget(before)
                 if answer is not None:
                     return answer
@@ -188,7 +189,7 @@ class Hub:
         """
         others = [each for each in self.links if each is not link]
         if not all(self._has_dealt_with(others, each) for each in self.links):
-            self._pending += self._receive_until_dealt_with()
+            self.pending += self._receive_until_dealt_with()
 
     def _receive_until_dealt_with(self) -> list[tuple[Link, Received]]:
         """All messages that came until the rig had handled everything that was sent."""

@@ -25,12 +25,12 @@ def shaken(tmp_path_factory):
 def test_a_model_goes_into_a_rig_file(aolink, shaken, tmp_path):
     out = tmp_path / "identified.toml"
     done = aolink("identify", shaken, "-o", out, "--model", "ornstein-uhlenbeck", "--json")
-    told = json.loads(done.stdout)["outputs"][0]
-    assert told["exposures"] == 24
-    assert set(told["parameters"]) == {"correlation_s", "intensity"}
+    printed = json.loads(done.stdout)["outputs"][0]
+    assert printed["exposures"] == 24
+    assert set(printed["parameters"]) == {"correlation_s", "intensity"}
     model = must_be(DisturbanceModel, must_be(Disturbance, load_rig(out).disturbance).model)
     assert model.A.shape == (1, 1)
-    variance = told["parameters"]["intensity"]["value"] * told["parameters"]["correlation_s"]["value"] / 2
+    variance = printed["parameters"]["intensity"]["value"] * printed["parameters"]["correlation_s"]["value"] / 2
     assert model.initial_covariance[0, 0] == pytest.approx(variance, rel=1e-3)
 
 

@@ -11,7 +11,7 @@ from scipy import linalg
 
 from aolink.control import Seen
 from aolink.control.lqg import LQG, lqr_gain
-from aolink.control.modes import Modes, response_at_rest
+from aolink.control.modes import MirrorModes, response_at_rest
 from aolink.errors import ControlError
 from aolink.numerics.arrays import FloatArray
 from aolink.rig import Plant, load_rig, parse_rig
@@ -103,7 +103,7 @@ def test_modes_reconstruct_what_the_strong_ones_can_make() -> None:
     rng = np.random.default_rng(4)
     left, right = np.linalg.qr(rng.standard_normal((6, 3)))[0], np.linalg.qr(rng.standard_normal((3, 3)))[0]
     response = left @ np.diag([2.0, 1.0, 1e-3]) @ right.T
-    R = Modes.of(response).reconstructor(0.01)
+    R = MirrorModes.of(response).reconstructor(0.01)
     slopes = response @ right[:, :2] @ [0.3, -0.2]
     assert np.allclose(response @ (R @ slopes), slopes)
     assert np.allclose(R @ left[:, 2], 0)

@@ -24,7 +24,7 @@ from aolink.devices.native import NativeCamera, NativeMirror
 from aolink.errors import AolinkError, DeviceError
 from aolink.recording import convert
 from aolink.rig import load_rig
-from aolink.simulation.devices import Line, SimulatedDevices
+from aolink.simulation.devices import LineName, SimulatedDevices
 from aolink.wire import messages_pb2 as pb
 from aolink.wire.hub import Hub
 from aolink.wire.link import Received
@@ -46,7 +46,7 @@ class Host:
         self.now = hub.now_ns()
         device = SimulatedDevices(RIG, virtual_time=False, step_zero_ns=self.now)
         identities = []
-        lines: tuple[Line, Line] = ("camera", "mirror")
+        lines: tuple[LineName, LineName] = ("camera", "mirror")
         for line in lines:
             device.handle(line, pb.Identify(nonce=1), 0)
             identity = device.outbox.pop().message

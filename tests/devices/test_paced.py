@@ -66,15 +66,15 @@ class StopsTheHost(Device):
 
 def reports(mirror: PacedMirror, end: int, first: int = 0) -> list[tuple[float, bool]]:
     """What the mirror held in each step from ``first`` to ``end``, and whether it was late."""
-    told: list[tuple[float, bool]] = []
-    while first + len(told) < end:
+    reported: list[tuple[float, bool]] = []
+    while first + len(reported) < end:
         for held in mirror.applied():
             assert isinstance(held, Held)
-            assert held.first_step == first + len(told)
+            assert held.first_step == first + len(reported)
             assert held.late is not None
-            told += zip(held.u[:, 0].tolist(), held.late.tolist(), strict=True)
+            reported += zip(held.u[:, 0].tolist(), held.late.tolist(), strict=True)
         time.sleep(0.002)
-    return told
+    return reported
 
 
 def test_each_step_gets_its_input_or_is_late(rig: Rig) -> None:
@@ -83,15 +83,15 @@ def test_each_step_gets_its_input_or_is_late(rig: Rig) -> None:
     wanted = np.linspace(0.0101, 0.0211, 12)
     first = mirror.time_ns() // rig.timing.fast_step_ns + 4
     assert mirror.send(first, wanted[:, None]) == 0
-    told = reports(mirror, first + 14)
+    reported = reports(mirror, first + 14)
     mirror.close()
     rest = float(rig.mirror.park[0])
     before = rest
-    for (held, late), u in zip(told[first : first + 12], wanted, strict=True):
+    for (held, late), u in zip(reported[first : first + 12], wanted, strict=True):
         assert held == (before if late else round(u, 3))
         before = held if not late else round(u, 3) if round(u, 3) in np.round(device.given, 3) else before
-    assert not any(late for _, late in told[:first])
-    assert told[first + 13][0] == rest  # nothing is queued: the safe input
+    assert not any(late for _, late in reported[:first])
+    assert reported[first + 13][0] == rest  # nothing is queued: the safe input
     assert set(np.round(device.given, 6)) <= {*np.round(wanted, 6), rest}
     assert device.closed == 1
     assert mirror.timing_sigma_ns > 0
@@ -106,10 +106,10 @@ def test_a_device_that_is_busy_goes_on_with_the_newest_step(rig: Rig) -> None:
     while mirror.time_ns() // rig.timing.fast_step_ns < first + 8:
         time.sleep(0.005)
     device.free.set()
-    told = reports(mirror, first + 12)
+    reported = reports(mirror, first + 12)
     mirror.close()
-    assert all(late for _, late in told[first : first + 6])  # it held the safe input all the time
-    assert {held for held, _ in told[first : first + 6]} == {float(rig.mirror.park[0])}
+    assert all(late for _, late in reported[first : first + 6])  # it held the safe input all the time
+    assert {held for held, _ in reported[first : first + 6]} == {float(rig.mirror.park[0])}
     assert not {0.002, 0.003, 0.004, 0.005} & set(np.round(device.given, 3).tolist())  # what is over is not sent
 
 
@@ -118,9 +118,9 @@ def test_a_host_that_is_held_up_does_not_make_the_device_late(rig: Rig) -> None:
     mirror = PacedMirror(rig, StopsTheHost())
     first = mirror.time_ns() // rig.timing.fast_step_ns + 5
     mirror.send(first, np.linspace(0.001, 0.03, 30)[:, None])
-    told = reports(mirror, first + 30)
+    reported = reports(mirror, first + 30)
     mirror.close()
-    during = told[first + 8 : first + 18]
+    during = reported[first + 8 : first + 18]
     assert all(late for _, late in during)  # their own inputs were not sent
     assert {held for held, _ in during} == {0.001}
 
@@ -158,12 +158,12 @@ def test_the_steps_in_which_it_is_being_parked_hold_the_input_before(rig: Rig) -
     step_ns = rig.timing.fast_step_ns
     first = mirror.time_ns() // step_ns + 3
     mirror.send(first, np.full((50, 1), 0.01))
-    told = reports(mirror, first + 3)
+    reported = reports(mirror, first + 3)
     asked = mirror.time_ns() // step_ns
     device.park = lambda: time.sleep(0.2)  # type: ignore[method-assign] # ten steps
     safe = mirror.park()
-    told += reports(mirror, safe + 3, len(told))
+    reported += reports(mirror, safe + 3, len(reported))
     mirror.close()
     assert safe - asked >= 10
-    assert {held for held, _ in told[asked + 1 : safe]} == {0.01}
-    assert {held for held, _ in told[safe:]} == {float(rig.mirror.park[0])}
+    assert {held for held, _ in reported[asked + 1 : safe]} == {0.01}
+    assert {held for held, _ in reported[safe:]} == {float(rig.mirror.park[0])}

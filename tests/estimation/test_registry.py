@@ -112,8 +112,8 @@ def test_an_installed_package_adds_an_estimator(aolink, with_example, tmp_path):
         "from aolink.colours import by_rank, estimator_colour;"
         "print(ESTIMATOR_NAMES[:3], estimator_colour('threshold'), by_rank(['o3', 'threshold', 'o1']))"
     )
-    told = subprocess.run([sys.executable, "-c", asked], env=with_example, capture_output=True, text=True, check=True)
-    assert told.stdout == "('open-loop', 'o1', 'threshold') (250, 250, 120) ['o1', 'threshold', 'o3']\n"
+    done = subprocess.run([sys.executable, "-c", asked], env=with_example, capture_output=True, text=True, check=True)
+    assert done.stdout == "('open-loop', 'o1', 'threshold') (250, 250, 120) ['o1', 'threshold', 'o3']\n"
     # Without the package the recording is there, and its estimates have a colour and come last.
     assert by_rank(["threshold", "o3"]) == ["o3", "threshold"]
     assert estimator_colour("threshold") != (250, 250, 120)

@@ -27,7 +27,7 @@ from aolink.optics.sensor import Kernel
 from aolink.recording.reader import Recording
 from aolink.rig import Rig, load_rig, parse_light, parse_rig
 from aolink.session import record
-from aolink.simulation.model import RigModel
+from aolink.simulation.model import RigPhysics
 
 Run = Callable[..., subprocess.CompletedProcess[str]]
 LIVELY = load_rig("section-vi-lively")
@@ -45,7 +45,7 @@ def shoot(rig: Rig, seed: int, lights: str, frames: int = 100) -> tuple[list[Fra
     """Frames under one light after the other, and where the spot was under the last one."""
     row = parse_light(lights, "lights")
     rig = dataclasses.replace(rig, simulation=dataclasses.replace(rig.simulation, light=row))
-    model, shot = RigModel(rig, seed), []
+    model, shot = RigPhysics(rig, seed), []
     for light in row:
         model.start_camera(model.step, frames)
         taken = model.advance(np.zeros((frames * rig.timing.frame_period_steps, 1)))
@@ -231,8 +231,8 @@ def test_what_was_not_shown_is_not_known_and_said_so() -> None:
 
 def test_shot_noise_that_is_not_seen_takes_only_an_impossible_value_out() -> None:
     shot = shoot(camera(0), 1, "dark,flat:8,still")[0]
-    for told, expected in ((0.0, None), (1e9, None), (10.0, 0.0)):
-        found = calibrate(camera(told), shot).photoelectrons
+    for photoelectrons, expected in ((0.0, None), (1e9, None), (10.0, 0.0)):
+        found = calibrate(camera(photoelectrons), shot).photoelectrons
         assert (found and found.value) == expected
 
 

@@ -108,15 +108,15 @@ def test_a_frequency_that_is_an_alias_of_its_neighbours_is_not_to_wander(swings:
 
 def test_the_numbers_that_a_rig_comes_to_are_stated() -> None:
     """By hand for section-vi: sd of the kernel sigma/sqrt(2), noise sqrt(V/D), peak erf(D/2/sigma)/D = 10.41."""
-    told = found("info")
-    assert "a fast step of 1 ms (1 kHz); exposures of 200 steps, 200 ms, one every 200 ms (5 Hz)" in told["timing"]
-    assert "40 pixels of 0.05 over the field [-1, 1]" in told["sensor"]
-    assert "is 0.0354, 0.707 pixels" in told["sensor"]
+    info = found("info")
+    assert "a fast step of 1 ms (1 kHz); exposures of 200 steps, 200 ms, one every 200 ms (5 Hz)" in info["timing"]
+    assert "40 pixels of 0.05 over the field [-1, 1]" in info["sensor"]
+    assert "is 0.0354, 0.707 pixels" in info["sensor"]
     assert (
         "signal to noise 7.36 in the brightest pixel of a resting spot (20820 counts over 2828)"
-        in (told["sensor.noise_density"])
+        in (info["sensor.noise_density"])
     )
-    assert "blocks of 50 steps, 50 ms; the device queues 400 ms" in told["mirror"]
+    assert "blocks of 50 steps, 50 ms; the device queues 400 ms" in info["mirror"]
 
 
 @pytest.mark.parametrize("name", builtin_rigs())

@@ -44,9 +44,9 @@ def test_the_overview_has_what_the_series_has() -> None:
         np.testing.assert_allclose(view.scores[name].path_rmse, np.sqrt(np.mean(np.square(errors))))
     moved = [np.std(each.truth.path) for each in series if each.truth is not None]
     np.testing.assert_allclose(view.moved, moved)
-    told = view.telling()
-    assert told[int(np.argmax(moved))].startswith("the largest blur")
-    assert any("moments is furthest from the truth" in why for why in told.values())
+    reasons = view.telling()
+    assert reasons[int(np.argmax(moved))].startswith("the largest blur")
+    assert any("moments is furthest from the truth" in why for why in reasons.values())
 
 
 def test_the_overview_is_of_a_slice_and_of_some_estimators() -> None:

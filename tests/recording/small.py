@@ -54,11 +54,11 @@ def write_small(
                 run = Applied(first_step=first, n_steps=steps, u=[0.0] * (steps * known.n_inputs))
                 messages.append(("/mirror/applied", run))
             if truth and made.truth is not None:
-                told = Truth(frame_id=number + 1, axes=known.plant.axes, n_outputs=known.n_outputs)
-                told.start_state.extend(made.truth.start_state.ravel())
-                told.end_state.extend(made.truth.end_state.ravel())
-                told.path.extend(made.truth.path.ravel())
-                messages.append(("/truth", told))
+                truth_message = Truth(frame_id=number + 1, axes=known.plant.axes, n_outputs=known.n_outputs)
+                truth_message.start_state.extend(made.truth.start_state.ravel())
+                truth_message.end_state.extend(made.truth.end_state.ravel())
+                truth_message.path.extend(made.truth.path.ravel())
+                messages.append(("/truth", truth_message))
             for topic, message in messages:
                 sequence += 1
                 writer.write_message(topic, message, now, now, sequence)

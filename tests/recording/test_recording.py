@@ -180,17 +180,17 @@ def test_estimates_survive_the_recording(recorded: Session) -> None:
             assert ours.status == theirs.status
 
 
-@pytest.mark.parametrize("room", ["wire/messages", "wire/runs", "recording/schemas"])
-def test_the_generated_classes_are_those_of_the_proto_files(room: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("schema", ["wire/messages", "wire/runs", "recording/schemas"])
+def test_the_generated_classes_are_those_of_the_proto_files(schema: str, tmp_path: Path) -> None:
     import importlib
 
     from grpc_tools import protoc
 
     root, target = Path(aolink.__file__).parent.parent, tmp_path / "set"
-    assert protoc.main(["", f"-I{root}", f"--descriptor_set_out={target}", f"{root}/aolink/{room}.proto"]) == 0
+    assert protoc.main(["", f"-I{root}", f"--descriptor_set_out={target}", f"{root}/aolink/{schema}.proto"]) == 0
     (compiled,) = descriptor_pb2.FileDescriptorSet.FromString(target.read_bytes()).file
     generated = descriptor_pb2.FileDescriptorProto()
-    importlib.import_module(f"aolink.{room.replace('/', '.')}_pb2").DESCRIPTOR.CopyToProto(generated)
+    importlib.import_module(f"aolink.{schema.replace('/', '.')}_pb2").DESCRIPTOR.CopyToProto(generated)
     compiled.ClearField("source_code_info")
     for message in compiled.message_type:
         for field in message.field:

@@ -69,8 +69,8 @@ def test_the_reason_is_in_the_table_in_info_and_in_json(aolink: Run, tmp_path: P
     assert result.stdout.count("no spot: the brightest stretch is") == 1
     assert "(frame 1, the first)" in result.stdout
     assert result.stderr.startswith("aolink: dark.mcap: o3 only predicted: none of 3 exposures gave")
-    told = " ".join(aolink("info", "out.mcap").stdout.split())
-    assert "o3: 3 of 3 exposures input invalid: no spot: the brightest stretch is" in told
+    printed = " ".join(aolink("info", "out.mcap").stdout.split())
+    assert "o3: 3 of 3 exposures input invalid: no spot: the brightest stretch is" in printed
     (unused,) = json.loads(aolink("info", "out.mcap", "--json").stdout)["estimates"]["o3"]["unused"]
     assert (unused["exposures"], unused["status"], unused["first_frame"]) == (3, "INPUT_INVALID", 1)
     again = json.loads(aolink("estimate", "out.mcap", "--json").stdout)["o3"]
@@ -122,10 +122,10 @@ def test_frames_of_another_camera_are_one_clear_error(tmp_path: Path) -> None:
 
 def test_info_has_date_and_units_and_json_has_numbers(aolink: Run, tmp_path: Path) -> None:
     write_small(tmp_path / "s.mcap", 6)
-    told = aolink("info", "s.mcap").stdout
-    assert "2023-11-14 22:13:20 UTC" in told
-    assert " 1 s " in told
-    assert " kB " in told
+    printed = aolink("info", "s.mcap").stdout
+    assert "2023-11-14 22:13:20 UTC" in printed
+    assert " 1 s " in printed
+    assert " kB " in printed
     facts = json.loads(aolink("info", "s.mcap", "--json").stdout)
     assert facts["start_ns"] == 1_700_000_000_000_000_000
     assert facts["start_utc"] == "2023-11-14T22:13:20+00:00"

@@ -34,8 +34,8 @@ def picture(tmp_path: Path) -> np.ndarray:
 def test_a_picture_is_deblurred(aolink: Run, tmp_path: Path, picture: np.ndarray) -> None:
     done = aolink("deblur", "--image", "in.png", "--psf", "psf.csv", "-o", "out.png", "--json")
     assert done.returncode == 0, done.stderr
-    told, expected = json.loads(done.stdout), restore(picture, np.full(7, 2.0))
-    assert told["noise_sd"] == pytest.approx(expected.noise_sd)
+    printed, expected = json.loads(done.stdout), restore(picture, np.full(7, 2.0))
+    assert printed["noise_sd"] == pytest.approx(expected.noise_sd)
     assert (read_picture(tmp_path / "out.png") == expected.image).all()
     again = aolink("deblur", "--image", "in.png", "--psf", "psf.csv", "-o", "out.png")
     assert again.returncode == 10
@@ -75,10 +75,10 @@ def test_transparency_is_no_light(tmp_path: Path, picture: np.ndarray) -> None:
     Image.fromarray(np.dstack([colours, alpha])).save(tmp_path / "in.png")
     (tmp_path / "psf.csv").write_text(",".join(["1"] * 7))
     out = tmp_path / "out.png"
-    told = CliRunner().invoke(
+    printed = CliRunner().invoke(
         app, ["deblur", "--image", str(tmp_path / "in.png"), "--psf", str(tmp_path / "psf.csv"), "-o", str(out)]
     )
-    assert told.exit_code == 0, told.output
+    assert printed.exit_code == 0, printed.output
     found = read_picture(out)
     assert (found[..., 3] == alpha).all()
     assert (found[..., :3] == restore(colours, np.ones(7)).image).all()
@@ -87,8 +87,8 @@ def test_transparency_is_no_light(tmp_path: Path, picture: np.ndarray) -> None:
 def test_the_inverse_says_how_it_scanned(tmp_path: Path, picture: np.ndarray) -> None:
     (tmp_path / "psf.csv").write_text("0.2 0.5 1")
     files = ["--image", str(tmp_path / "in.png"), "--psf", str(tmp_path / "psf.csv")]
-    told = CliRunner().invoke(app, ["deblur", *files, "-o", str(tmp_path / "o.png"), "--method", "inverse"])
-    assert told.output.endswith(": inverse, scanned backwards\n")
+    printed = CliRunner().invoke(app, ["deblur", *files, "-o", str(tmp_path / "o.png"), "--method", "inverse"])
+    assert printed.output.endswith(": inverse, scanned backwards\n")
 
 
 def test_a_folder_that_is_not_there(tmp_path: Path) -> None:

@@ -49,9 +49,9 @@ def test_a_method_of_another_package_restores_a_picture(
 def test_the_help_names_the_methods_of_other_packages_and_what_is_wrong_with_one(
     aolink: Run, with_packages: dict[str, str]
 ) -> None:  # fmt: skip
-    told = aolink("deblur", "--help", env=with_packages)
-    assert told.returncode == 0
-    text = " ".join(told.stdout.replace("│", " ").split())
+    help_page = aolink("deblur", "--help", env=with_packages)
+    assert help_page.returncode == 0
+    text = " ".join(help_page.stdout.replace("│", " ").split())
     for name in METHODS:
         assert f"{name} ({find_method(name).summary})" in text
     assert "richardson_lucy (for counted light)" in text
@@ -85,7 +85,7 @@ def test_a_parameter_that_a_method_does_not_take_is_refused(method: str, paramet
         restore(np.ones((9, 9)), np.ones(2), method=method, **parameters)
 
 
-def test_the_rooms_page_names_every_method() -> None:
+def test_the_page_names_every_method() -> None:
     page = (Path(aolink.restoration.__file__).parent / "README.md").read_text()
     rows = [line.split("|")[1] for line in page.splitlines() if line.startswith("| `")]
     assert [name for row in rows for name in re.findall(r"`(\w+)`", row)] == list(METHODS)

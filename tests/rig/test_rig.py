@@ -347,7 +347,7 @@ def test_the_list_of_keys_is_that_of_the_keys_that_the_readers_ask_for() -> None
     assert asked == KEYS
 
 
-def test_the_rooms_page_names_every_key() -> None:
+def test_the_page_names_every_key() -> None:
     page = (Path(tables.__file__).parent / "README.md").read_text()
     top = {"control", "drive", "lenslets", "mirror", "plant", "scene", "sensor", "simulation", "timing"}
     named = set(re.findall(r"\b[A-Za-z_0-9]+\b", "".join(re.findall(r"`[^`]+`", page))))

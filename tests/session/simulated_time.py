@@ -31,7 +31,7 @@ from aolink.rig import Rig
 from aolink.session.controlling import Controlling
 from aolink.session.loop import Inputs, SessionLoop
 from aolink.session.report import Report
-from aolink.simulation.devices import Line
+from aolink.simulation.devices import LineName
 from aolink.simulation.server import RigServer
 from aolink.simulation.streams import Stream
 from aolink.wire import messages_pb2 as pb
@@ -131,9 +131,9 @@ class SimulatedTimeHub(Host):
         """What the mirror really held: the command's block and the source, by fast step, ..."""
         self.held_inputs: dict[int, list[float]] = {}
         """... and the inputs."""
-        names: tuple[Line, Line] = ("camera", "mirror")
+        names: tuple[LineName, LineName] = ("camera", "mirror")
         self.to_device, self.to_host = ({name: Way(self) for name in names} for _ in range(2))
-        streams: dict[Line, Stream] = {name: End(name, self.to_device[name], self.to_host[name]) for name in names}
+        streams: dict[LineName, Stream] = {name: End(name, self.to_device[name], self.to_host[name]) for name in names}
         self.server = RigServer(rig, streams, seed=seed, real_time=True, clock_ns=lambda: self.clock_ns)
         self.ends = {name: End(name, self.to_host[name], self.to_device[name]) for name in names}
         """The host's."""
@@ -154,7 +154,7 @@ class SimulatedTimeHub(Host):
         self.at.sort(key=itemgetter(0))
 
     def wait(self, timeout_s: float) -> list[tuple[Link, Received]]:
-        pending, self._pending = self._pending, []
+        pending, self.pending = self.pending, []
         for thread in threading.enumerate():
             if thread.name == "aolink-reopening":  # which takes no time on the simulated clock
                 thread.join()

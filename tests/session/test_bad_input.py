@@ -276,14 +276,14 @@ def test_a_rig_killed_in_the_middle(start_aolink: Start, tmp_path: Path) -> None
     rig.communicate()
     _, errors = process.communicate(timeout=30)
     assert process.returncode == 3
-    told = re.fullmatch(
+    match = re.fullmatch(
         r"aolink: lost /dev/pts/\d+: .*; is the device still there\?;"
         r" the (\d+) exposure\(s\) that had come by then are saved in a.mcap\n",
         errors,
     )
-    assert told, errors
+    assert match, errors
     recording = Recording(tmp_path / "a.mcap")
-    assert len(list(recording.exposures())) == int(told[1])
+    assert len(list(recording.exposures())) == int(match[1])
     assert recording.complete
     assert recording.metadata["ended"].startswith("error: lost /dev/pts/")
     assert len(recording.estimates("o3")) > 0

@@ -409,9 +409,9 @@ def test_the_command_deblurs_a_recording(aolink: Run, session: Path, tmp_path: P
     shutil.copy(session, tmp_path / "a.mcap")
     done = aolink("deblur", "a.mcap", "-e", "o1", "--method", "gauss_markov", "-o", "b.mcap", "--json")
     assert done.returncode == 0, done.stderr
-    told = json.loads(done.stdout)
-    assert (told["exposures"], told["scenes_restored"], told["missing"]) == (EXPOSURES, EXPOSURES, {})
-    assert told["psnr_restored_db"] >= told["psnr_restored_least_db"]
+    printed = json.loads(done.stdout)
+    assert (printed["exposures"], printed["scenes_restored"], printed["missing"]) == (EXPOSURES, EXPOSURES, {})
+    assert printed["psnr_restored_db"] >= printed["psnr_restored_least_db"]
     again = aolink("deblur", "a.mcap", "-e", "o1", "-o", "b.mcap")
     assert again.returncode == 5
     assert "b.mcap exists and is not overwritten" in again.stderr

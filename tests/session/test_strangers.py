@@ -100,11 +100,11 @@ def test_a_signed_session_over_tcp_is_not_to_be_played_again(
         listener.close()
         with socket.create_connection(listener.device, 20) as stranger:
             stranger.sendall(listener.heard)
-            told = stranger.recv(65_536)
+            received = stranger.recv(65_536)
         found = aolink("devices", mirror, *key, "--json")
     assert result.returncode == 0, result.stderr
     assert len(listener.heard) > 2000
-    (packet,) = PacketDecoder().feed(told)
+    (packet,) = PacketDecoder().feed(received)
     assert b"this Identify is sent again, or old" in packet.payload
     assert json.loads(found.stdout)[0]["geometry"].endswith("parked")
     assert not re.search(keys[0].read_text(), (tmp_path / "a.mcap").read_bytes().decode("latin-1"))

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from aolink.rig import load_rig
-from aolink.simulation.devices import Line, SimulatedDevices
+from aolink.simulation.devices import LineName, SimulatedDevices
 from aolink.wire import messages_pb2 as pb
 from aolink.wire.packet import MAX_PAYLOAD
 
@@ -23,7 +23,7 @@ def devices() -> SimulatedDevices:
     return SimulatedDevices(RIG, virtual_time=True, step_zero_ns=0)
 
 
-def ask(device: SimulatedDevices, message: Message, line: Line = "mirror", sequence: int = 0) -> Any:
+def ask(device: SimulatedDevices, message: Message, line: LineName = "mirror", sequence: int = 0) -> Any:
     """Hand over a message; gives the answer, which is the only thing that leaves and is of the question's kind."""
     device.handle(line, message, sequence)
     (answer,) = device.outbox

@@ -11,7 +11,7 @@ from aolink.rig import load_rig, parse_rig
 from aolink.rig.disturbance import Disturbance
 from aolink.rig.optical_plant import Optics
 from aolink.simulation.disturbance import DisturbancePlayer
-from aolink.simulation.model import RigModel, simulate
+from aolink.simulation.model import RigPhysics, simulate
 from tests.conftest import without_pupil
 from tests.kinds import must_be, truth_of
 from tests.structure_function import structure_function
@@ -103,16 +103,16 @@ def test_recorded_disturbances_that_do_not_fit_are_refused(tmp_path, content, sa
         np.save(tmp_path / "wind.npy", content)
     rig = parse_rig(TILT.toml.split("[disturbance]")[0] + '[disturbance]\nrecorded = "wind.npy"\n', tmp_path)
     with pytest.raises(RigError, match=says):
-        RigModel(rig)
+        RigPhysics(rig)
 
 
 def test_a_table_that_is_above_the_limit_is_refused(tmp_path, monkeypatch):
     np.savetxt(tmp_path / "wind.csv", np.zeros((100, 2)), delimiter=",")
     rig = parse_rig(TILT.toml.split("[disturbance]")[0] + '[disturbance]\nrecorded = "wind.csv"\n', tmp_path)
-    RigModel(rig)
+    RigPhysics(rig)
     monkeypatch.setenv("AOLINK_LIMITS", "unpacked_bytes=1000")
     with pytest.raises(RigError, match=r"wind\.csv has \d+ bytes, which is above the limit of 1000"):
-        RigModel(rig)
+        RigPhysics(rig)
 
 
 def test_steps_do_not_depend_on_how_they_are_asked_for():

@@ -10,7 +10,7 @@ import pytest
 from google.protobuf.message import Message
 
 from aolink.rig import load_rig
-from aolink.simulation.devices import Line
+from aolink.simulation.devices import LineName
 from aolink.simulation.server import RigServer
 from aolink.simulation.streams import PtyStream, Stream, TcpStream
 from aolink.wire import messages_pb2 as pb
@@ -24,7 +24,7 @@ SOUND: list[Message] = [
     pb.CameraControl(run=True, exposures=1), pb.ClockQuery(query_id=1, host_send_ns=1_767_225_600_000_000_000),
     pb.Part(type=3, total=5000, data=b"x" * 4000), pb.Park(), pb.Rearm(), pb.Event(), pb.VirtualTime(),
 ]  # fmt: skip
-LINES: tuple[Line, ...] = ("camera", "mirror")
+LINES: tuple[LineName, ...] = ("camera", "mirror")
 DEADLINE_S = 20.0
 
 
@@ -32,13 +32,15 @@ class Served:
     """A rig and the host's ends of its two lines, in one thread."""
 
     def __init__(self, *, real_time: bool, tcp: bool) -> None:
-        self._streams: dict[Line, Stream] = {line: TcpStream("127.0.0.1", 0) if tcp else PtyStream() for line in LINES}
+        self._streams: dict[LineName, Stream] = {
+            line: TcpStream("127.0.0.1", 0) if tcp else PtyStream() for line in LINES
+        }
         self.server = RigServer(RIG, self._streams, real_time=real_time)
         self.links = {
             line: Link(line, SerialPort(stream.name), time.monotonic_ns) for line, stream in self._streams.items()
         }
 
-    def identity(self, line: Line, nonce: int) -> pb.Identity:
+    def identity(self, line: LineName, nonce: int) -> pb.Identity:
         """Ask who is there, and serve until it has answered."""
         self.links[line].send(pb.Identify(nonce=nonce))
         end = time.monotonic() + DEADLINE_S

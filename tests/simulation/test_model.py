@@ -13,7 +13,7 @@ from aolink.optics.camera import pixel_noise_sd, shot_gain, to_density
 from aolink.optics.kernel import exposure_density
 from aolink.plant.lifting import lift
 from aolink.rig import Rig, load_rig, parse_light
-from aolink.simulation.model import CameraFrame, RigModel, simulate
+from aolink.simulation.model import CameraFrame, RigPhysics, simulate
 from tests.kinds import line_of, truth_of
 
 RIG = load_rig("section-vi")
@@ -43,10 +43,10 @@ def same(a: CameraFrame, b: CameraFrame) -> bool:
 def test_frames_do_not_depend_on_how_the_steps_are_cut(cuts, start):
     rig = with_timing(RIG, 20, 33)
     u = rig.drive.inputs(0, 300, 1e-3)
-    whole = RigModel(rig, 7)
+    whole = RigPhysics(rig, 7)
     whole.start_camera(start)
     expected = whole.advance(u)
-    pieces = RigModel(rig, 7)
+    pieces = RigPhysics(rig, 7)
     pieces.start_camera(start)
     bounds = [0, *sorted(cuts), 300]
     frames = [f for a, b in itertools.pairwise(bounds) for f in pieces.advance(u[a:b])]
@@ -65,7 +65,7 @@ def test_without_noise_the_path_is_the_recursion():
 
 
 def test_the_output_is_sampled_before_the_input_acts():
-    model = RigModel(STILL, 1)
+    model = RigPhysics(STILL, 1)
     model.start_camera(0, 1)
     (frame,) = model.advance(np.full((200, 1), 0.05))
     assert frame.truth.path[0, 0] == 0.0
@@ -94,7 +94,7 @@ def test_states_scatter_as_the_lifted_covariance_says():
 def test_first_states_scatter_as_the_initial_covariance_says():
     states = []
     for seed in range(2000):
-        model = RigModel(with_timing(RIG, 1, 1), seed)
+        model = RigPhysics(with_timing(RIG, 1, 1), seed)
         model.start_camera(0, 1)
         states.append(model.advance(np.zeros((1, 1)))[0].truth.start_state[0])
     ratio = np.var(states, axis=0) / RIG.plant.initial_covariance.diagonal()
@@ -121,7 +121,7 @@ def test_seeds_make_the_difference_and_nothing_else():
 
 
 def test_the_camera_does_not_disturb_the_plant():
-    with_camera, without = RigModel(RIG, 2), RigModel(RIG, 2)
+    with_camera, without = RigPhysics(RIG, 2), RigPhysics(RIG, 2)
     with_camera.start_camera(0, 1)
     u = np.zeros((500, 1))
     with_camera.advance(u)
@@ -134,7 +134,7 @@ def test_the_camera_does_not_disturb_the_plant():
 
 
 def test_the_camera_stops_when_told_and_after_its_exposures():
-    model = RigModel(with_timing(RIG, 10, 10))
+    model = RigPhysics(with_timing(RIG, 10, 10))
     model.start_camera(0)
     assert len(model.advance(np.zeros((35, 1)))) == 3
     model.stop_camera()
@@ -144,7 +144,7 @@ def test_the_camera_stops_when_told_and_after_its_exposures():
 
 
 def test_the_camera_does_not_start_in_the_past():
-    model = RigModel(RIG)
+    model = RigPhysics(RIG)
     model.advance(np.zeros((10, 1)))
     with pytest.raises(ValueError, match="fast step 9 has gone by"):
         model.start_camera(9)
@@ -189,7 +189,7 @@ def with_light(rig: Rig, lights: str, **sensor: Any) -> Rig:
 
 def shots(rig: Rig, starts: int, frames: int) -> tuple[np.ndarray, np.ndarray]:
     """Densities and paths under each light, (starts, frames, pixels) and (starts, frames, steps)."""
-    model, taken = RigModel(rig, 11), []
+    model, taken = RigPhysics(rig, 11), []
     for _ in range(starts):
         model.start_camera(model.step, frames)
         taken.append(model.advance(np.zeros((frames * rig.timing.frame_period_steps, 1))))
@@ -232,8 +232,8 @@ def test_photoelectrons_are_poisson(light):
 
 
 def test_without_photoelectrons_and_in_motion_nothing_is_drawn_for_them():
-    plain, lit = RigModel(RIG, 3), RigModel(with_light(RIG, "moving,moving"), 3)
-    noisy = RigModel(with_light(RIG, "moving", photoelectrons=1e12), 3)
+    plain, lit = RigPhysics(RIG, 3), RigPhysics(with_light(RIG, "moving,moving"), 3)
+    noisy = RigPhysics(with_light(RIG, "moving", photoelectrons=1e12), 3)
     frames = []
     for model in (plain, lit, noisy):
         model.start_camera(0, 2)

@@ -18,7 +18,7 @@ from aolink.optics.sensor import Kernel
 from aolink.restoration import motion_psf
 from aolink.rig import Rig, load_rig, parse_rig
 from aolink.rig.scene_table import read_scene_picture
-from aolink.simulation.model import RigModel, simulate
+from aolink.simulation.model import RigPhysics, simulate
 from aolink.simulation.scene import SceneCamera
 from tests.kinds import must_be, truth_of
 
@@ -115,7 +115,7 @@ def test_noise_is_as_the_rig_file_says() -> None:
 
 def test_bits_do_not_depend_on_how_steps_are_cut() -> None:
     u = RIG.mirror.quantise(RIG.drive.inputs(0, 400, RIG.timing.fast_step_s))
-    whole, cut = RigModel(RIG), RigModel(RIG)
+    whole, cut = RigPhysics(RIG), RigPhysics(RIG)
     for model in (whole, cut):
         model.start_camera(0)
     frames = whole.advance(u)

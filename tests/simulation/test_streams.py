@@ -169,9 +169,9 @@ def test_a_signed_port_serves_only_who_has_the_key() -> None:
     for wrong, why in ((IDENTIFY, b"is not signed"), (other, b"is signed with another key")):
         with connect(stream) as stranger:
             stranger.sendall(wrong + COMMAND)
-            told = answer(stream, stranger)
-            assert (told.version, mirror.refusal(told)) == (2, "")
-            assert why in told.payload
+            packet = answer(stream, stranger)
+            assert (packet.version, mirror.refusal(packet)) == (2, "")
+            assert why in packet.payload
             stranger.sendall(signed)  # who has made a mistake may try again at once
             assert taken(stream, lambda data: data != b"") == b"\0" + signed
     stream.close()
@@ -180,9 +180,9 @@ def test_a_signed_port_serves_only_who_has_the_key() -> None:
 def test_a_signed_identify_is_told_where_no_key_is_known(stream: TcpStream) -> None:
     with connect(stream) as host:
         host.sendall(encode_message(pb.Identify(nonce=7), 0, Signing(KEY, "mirror", to_host=False)))
-        told = answer(stream, host)
-    assert told.version == 1
-    assert b"this Identify is signed" in told.payload
+        packet = answer(stream, host)
+    assert packet.version == 1
+    assert b"this Identify is signed" in packet.payload
 
 
 def test_a_host_that_is_not_there_is_refused() -> None:

@@ -91,8 +91,8 @@ def test_a_file_of_something_else_is_one_line(tmp_path: Path, text: str) -> None
 
 def test_rows_that_take_minutes_are_rows(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(str(TOOLS))
-    rooms = importlib.import_module("bench_rows.rooms")
-    assert {name for names in rooms.ROWS.values() for name in names} >= rooms.LONG
+    groups = importlib.import_module("bench_rows.groups")
+    assert {name for names in groups.ROWS.values() for name in names} >= groups.LONG
 
 
 def test_a_curve_knows_its_power_and_is_drawn(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

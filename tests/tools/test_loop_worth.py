@@ -19,7 +19,7 @@ from aolink.rig import Rig, load_rig
 from tests.needs import needed
 
 if TYPE_CHECKING:
-    from bench_rows.disturbances import Disturbance
+    from bench_rows.disturbances import DisturbanceRun
     from bench_rows.loop_worth import Cell
 
 needed("pyrtc")
@@ -32,7 +32,7 @@ def tools(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(str(TOOLS))
 
 
-def played(cell: Cell, known: Disturbance, folder: Path) -> Rig:
+def played(cell: Cell, known: DisturbanceRun, folder: Path) -> Rig:
     """The cell's rig, which hardly any noise is in, with these slopes."""
     np.save(folder / "slopes.npy", known.slopes[:, None])
     table = '[disturbance]\nplant_noise = false\nrecorded = "slopes.npy"\n\n[simulation]'

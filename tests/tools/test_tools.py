@@ -124,7 +124,7 @@ def test_a_word_that_no_row_has_is_an_error() -> None:
 
 
 @pytest.mark.parametrize(
-    "room",
+    "group",
     [
         "estimation",
         "optics",
@@ -142,14 +142,14 @@ def test_a_word_that_no_row_has_is_an_error() -> None:
         "loop_worth",
     ],
 )
-def test_every_row_that_is_written_is_in_the_table(room: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_every_row_that_is_written_is_in_the_table(group: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(str(TOOLS))
-    if room == "restoration":
+    if group == "restoration":
         needed("skimage")
-    if room == "loop_worth":
+    if group == "loop_worth":
         needed("pyrtc")
-    rooms = importlib.import_module("bench_rows.rooms").ROWS
-    module = importlib.import_module(f"bench_rows.{room}")
+    groups = importlib.import_module("bench_rows.groups").ROWS
+    module = importlib.import_module(f"bench_rows.{group}")
     measuring = ("Row", "list[Row]")
     written = {
         name
@@ -157,7 +157,7 @@ def test_every_row_that_is_written_is_in_the_table(room: str, monkeypatch: pytes
         if function.__module__ == module.__name__ and function.__annotations__.get("return") in measuring
     }
     written = {name for name in written if not name.startswith("_")}
-    assert written == set(rooms[room])
+    assert written == set(groups[group])
 
 
 @pytest.mark.long

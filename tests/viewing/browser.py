@@ -61,12 +61,12 @@ class Tab:
                 if "error" in message:
                     raise NotNow(str(message["error"]))
                 return message["result"]
-            told, what = message.get("method"), message.get("params", {})
-            if told == "Runtime.exceptionThrown":
+            method, what = message.get("method"), message.get("params", {})
+            if method == "Runtime.exceptionThrown":
                 self.errors.append(str(what["exceptionDetails"]))
-            elif told == "Log.entryAdded" and what["entry"]["level"] == "error":
+            elif method == "Log.entryAdded" and what["entry"]["level"] == "error":
                 self.errors.append(f"{what['entry']['text']} {what['entry'].get('url', '')}")
-            elif told == "Runtime.consoleAPICalled" and what["type"] == "error":
+            elif method == "Runtime.consoleAPICalled" and what["type"] == "error":
                 self.errors.append(" ".join(str(each.get("value", each.get("description"))) for each in what["args"]))
 
     async def open(self, address: str) -> None:

@@ -47,8 +47,12 @@ class Drawn(Estimate):
     drawn_sd: np.ndarray
 
     @property
-    def _unfolded(self) -> tuple[np.ndarray, np.ndarray]:
-        return self.drawn, self.drawn_sd
+    def path(self) -> np.ndarray:
+        return self.drawn
+
+    @property
+    def path_sd(self) -> np.ndarray:
+        return self.drawn_sd
 
 
 @dataclass

@@ -30,7 +30,7 @@ _HIGHEST_HZ = 100.0
 
 
 @dataclass(frozen=True, eq=False)
-class Disturbance:
+class DisturbanceRun:
     """Slopes at each fast step, and the state from which one who has seen all of them up to a step predicts the next.
 
     Row k of ``states``, (steps, n), goes with ``slopes[k]``, which is C x(k); the prediction is x(k+1) = A x(k).
@@ -44,16 +44,16 @@ class Disturbance:
     """The model that an estimator is given."""
 
 
-def together(parts: Sequence[Disturbance]) -> Disturbance:
+def together(parts: Sequence[DisturbanceRun]) -> DisturbanceRun:
     """The sum of independent disturbances."""
-    return Disturbance(
+    return DisturbanceRun(
         np.sum([part.slopes for part in parts], axis=0), np.hstack([part.states for part in parts]),
         np.asarray(linalg.block_diag(*(part.A for part in parts))), np.hstack([part.C for part in parts]),
         ProcessSum(tuple(process for part in parts for process in part.model.processes)),
     )  # fmt: skip
 
 
-def line(frequency_hz: float, sd: float, steps: int, seed: int) -> Disturbance:
+def line(frequency_hz: float, sd: float, steps: int, seed: int) -> DisturbanceRun:
     """A resonance that noise drives. Its model is the true one."""
     model = ProcessSum((Process("resonance", (frequency_hz, DAMPING, sd)),))
     space, random = model.state_space(STEP_S), np.random.default_rng([seed, 1])
@@ -63,10 +63,10 @@ def line(frequency_hz: float, sd: float, steps: int, seed: int) -> Disturbance:
     for k, push in enumerate(pushes):
         states[k] = state
         state = space.A @ state + push
-    return Disturbance(states @ space.C[0], states, space.A, space.C, model)
+    return DisturbanceRun(states @ space.C[0], states, space.A, space.C, model)
 
 
-def turbulence(kind: str, sd: float, steps: int, past: int, seed: int) -> Disturbance:
+def turbulence(kind: str, sd: float, steps: int, past: int, seed: int) -> DisturbanceRun:
     """Tilt of two von Karman layers in frozen flow: ``own`` waves, or HCIPy's screens, ``hcipy``.
 
     It has no finite model. Two models are fitted to its true slopes in the first ``past`` steps: an autoregressive one,
@@ -77,7 +77,7 @@ def turbulence(kind: str, sd: float, steps: int, past: int, seed: int) -> Distur
     A = _autoregressive(slopes[:past], order)
     led = np.concatenate([np.full(order - 1, slopes[0]), slopes])
     states = np.lib.stride_tricks.sliding_window_view(led, order)[:, ::-1]
-    return Disturbance(slopes, states, A, np.eye(1, order), likeliest(slopes[:past]))
+    return DisturbanceRun(slopes, states, A, np.eye(1, order), likeliest(slopes[:past]))
 
 
 @lru_cache(maxsize=16)

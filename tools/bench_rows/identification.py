@@ -138,7 +138,7 @@ _CHANGED_AFTER = 80
 
 
 @dataclass(frozen=True)
-class Change:
+class DisturbanceChange:
     """A change of the disturbance of the rig `loop`, whose rig file keeps the old model."""
 
     name: str
@@ -153,12 +153,12 @@ class Change:
 
 
 _CHANGES = (
-    Change("line 10 % higher", frequency=1.1),
-    Change("line 10 % lower", frequency=0.9),
-    Change("line 20 % higher", frequency=1.2),
-    Change("line 20 % lower", frequency=0.8),
-    Change("gain of the noise times 3", sd=3.0),
-    Change("gain of the noise by 3", sd=1 / 3),
+    DisturbanceChange("line 10 % higher", frequency=1.1),
+    DisturbanceChange("line 10 % lower", frequency=0.9),
+    DisturbanceChange("line 20 % higher", frequency=1.2),
+    DisturbanceChange("line 20 % lower", frequency=0.8),
+    DisturbanceChange("gain of the noise times 3", sd=3.0),
+    DisturbanceChange("gain of the noise by 3", sd=1 / 3),
 )
 
 
@@ -208,7 +208,7 @@ def _frequency(offer: Offer) -> Identified:
     return next(each for each in found.parameters if each.name.endswith("frequency_hz"))
 
 
-def changed(change: Change, exposures: int, seed: int) -> list[Exposure]:
+def changed(change: DisturbanceChange, exposures: int, seed: int) -> list[Exposure]:
     """A log of the rig `loop` whose disturbance goes on from the state that it is in when its model changes."""
     rig, random = load_rig("loop"), np.random.default_rng(seed)
     slopes = _slopes([(rig, _CHANGED_AFTER), (change.rig(), max(exposures - _CHANGED_AFTER, 0) + 2)], random)

@@ -22,7 +22,7 @@ from aolink.identification import ProcessSum, identified_text, maxima, readings,
 from aolink.jobs.closed_loop import closed_loop
 from aolink.numerics.arrays import FloatArray
 from aolink.rig import Rig, load_rig, parse_rig
-from bench_rows.disturbances import STEP_S, Disturbance, line, together, turbulence
+from bench_rows.disturbances import STEP_S, DisturbanceRun, line, together, turbulence
 from bench_rows.rivals import PREDICTORS, predicted, with_true_state
 from bench_rows.row import Effort, Row
 
@@ -70,7 +70,7 @@ class Cell:
         """Standard deviation of the path, slope units."""
         return self.widths * _KERNEL_SD
 
-    def disturbance(self, steps: int, past: int, seed: int) -> Disturbance:
+    def disturbance(self, steps: int, past: int, seed: int) -> DisturbanceRun:
         """Slopes of that many fast steps, the first ``past`` of them known."""
         parts, sd = [], self.sd / math.sqrt(bool(self.turbulence) + bool(self.line))
         if self.turbulence:

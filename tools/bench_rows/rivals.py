@@ -14,7 +14,7 @@ from aolink.control.lqg import LQG
 from aolink.control.modes import reached, response_at_rest
 from aolink.numerics.arrays import FloatArray
 from aolink.rig import Rig
-from bench_rows.disturbances import Disturbance
+from bench_rows.disturbances import DisturbanceRun
 
 PREDICTORS = ("ar_kalman", "least_squares")
 
@@ -65,7 +65,7 @@ class Predicted(_MirrorFollowed):
 class TrueState(_MirrorFollowed):
     """`lqg` with the disturbance's true state at the end of each exposure in the place of an estimate."""
 
-    def __init__(self, rig: Rig, known: Disturbance) -> None:
+    def __init__(self, rig: Rig, known: DisturbanceRun) -> None:
         super().__init__(rig)
         n = len(known.A)
         plant = replace(
@@ -98,7 +98,7 @@ def predicted(name: str, centroids: FloatArray) -> ControllerRow:
     )  # fmt: skip
 
 
-def with_true_state(known: Disturbance) -> ControllerRow:
+def with_true_state(known: DisturbanceRun) -> ControllerRow:
     """The row of the controller for a loop whose first fast step has the first row of ``known``."""
     return ControllerRow(
         name="true-state", summary="the limit", build=lambda rig: TrueState(rig, known), needs_state=False

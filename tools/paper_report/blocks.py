@@ -40,14 +40,14 @@ class Table:
 
 
 @dataclass(frozen=True)
-class Picture:
+class PageFigure:
     """A figure in the page's own folder."""
 
     file: str
     caption: str
 
 
-Block = Heading | Text | Points | Table | Picture
+Block = Heading | Text | Points | Table | PageFigure
 
 _CSS = """
 body { font: 16px/1.5 system-ui, sans-serif; max-width: 62rem; margin: 2rem auto; padding: 0 1rem; color: #111; }

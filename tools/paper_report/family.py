@@ -59,7 +59,7 @@ Geometry = Literal["line", "plane", "plane, one plant"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Mode:
+class PlantProcess:
     """One process in a plant, independent of the others."""
 
     kind: Literal["resonance", "Ornstein-Uhlenbeck", "random walk"]
@@ -80,7 +80,7 @@ class Scene:
 
     seed: int
     geometry: Geometry
-    modes: tuple[Mode, ...]
+    modes: tuple[PlantProcess, ...]
     path_widths: float
     peak_snr: float
     steps: int
@@ -123,7 +123,7 @@ class Scene:
         return "; ".join(parts)
 
 
-def _of_mode(mode: Mode) -> str:
+def _of_mode(mode: PlantProcess) -> str:
     if mode.kind == "resonance":
         return f"{mode.swings:.3g} swings (damping {mode.damping:.2g})"
     return mode.kind if mode.kind == "random walk" else f"{mode.kind} ({mode.swings:.2g})"
@@ -155,20 +155,20 @@ def _between(rng: np.random.Generator, ends: tuple[float, float]) -> float:
     return float(np.exp(rng.uniform(*np.log(ends))))
 
 
-def _mode(rng: np.random.Generator, steps: int, period: int, share: float, path_sd: float) -> Mode:
+def _mode(rng: np.random.Generator, steps: int, period: int, share: float, path_sd: float) -> PlantProcess:
     sd, direction = path_sd * math.sqrt(share), float(rng.uniform(0, math.pi))
     kind = rng.choice(["resonance", "Ornstein-Uhlenbeck", "random walk"], p=[0.75, 0.15, 0.1])
     if kind == "random walk":
-        return Mode(kind=kind, swings=0.0, damping=0.0, sd=sd, direction=direction)
+        return PlantProcess(kind=kind, swings=0.0, damping=0.0, sd=sd, direction=direction)
     if kind == "Ornstein-Uhlenbeck":
         swings = 1 / (2 * math.pi * _between(rng, MEMORY))
-        return Mode(kind=kind, swings=swings, damping=1.0, sd=sd, direction=direction)
+        return PlantProcess(kind=kind, swings=swings, damping=1.0, sd=sd, direction=direction)
     fastest = min(SWINGS[1], steps / STEPS_IN_SWING)
     swings = _between(rng, (SWINGS[0], fastest))
     if rng.random() < 0.25:  # an alias of the frame rate: its phase at each frame's start is the same, or the opposite
         half_turns = max(1, round(2 * swings * period / steps))
         swings = min(half_turns / 2 * steps / period, fastest)
-    return Mode(kind=kind, swings=swings, damping=_between(rng, DAMPING), sd=sd, direction=direction)
+    return PlantProcess(kind=kind, swings=swings, damping=_between(rng, DAMPING), sd=sd, direction=direction)
 
 
 def _half_pixels(kernel_pixels: float, path_widths: float, command_sd: float) -> int:
@@ -197,7 +197,7 @@ def plant_of(scene: Scene, axes: int, exposures: int) -> Plant:
     )  # fmt: skip
 
 
-def _dynamics(mode: Mode, steps: int, run_steps: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _dynamics(mode: PlantProcess, steps: int, run_steps: int) -> tuple[FloatArray, FloatArray, FloatArray]:
     """A, B_w for noise of variance one, and the covariance at the start."""
     if mode.kind == "random walk":
         sd = mode.sd / math.sqrt(run_steps)

@@ -27,7 +27,7 @@ from aolink.rig import Rig
 from paper_report.ensemble import Cell, Measured, clean_exposures, errors, side_by_side, with_pixel_noise
 from paper_report.family import SWINGS, draw
 from paper_report.judge import LIMIT, Row
-from paper_report.limit import NAMES, Found
+from paper_report.limit import NAMES, SceneErrors
 from paper_report.limit import Scene as LimitScene
 from paper_report.numbers import Effort, Remark1, Remark2
 from paper_report.verdict import JUDGED, SCENE_INSIDE, by_estimator, ratios
@@ -313,7 +313,7 @@ def figure_limit(path: Path, table: Sequence[LimitScene], dpi: int) -> None:
     with _figure(path, dpi, (9.5, 2.0 + 0.36 * len(table)), 1, 2, sharey=True) as (figure, ((left, right),)):
         for name in NAMES:
             style = {"marker": _MARKERS[name], "color": _colour(name), "linestyle": "none", "markersize": 6.0}
-            found: list[Found] = [scene.found[name] for scene in table]
+            found: list[SceneErrors] = [scene.found[name] for scene in table]
             left.plot([each.path for each in found], rows, label=name, **style)
             if name != "sampled":
                 right.plot([max(each.distance, 0.01) for each in found], rows, **style)

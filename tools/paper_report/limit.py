@@ -18,7 +18,7 @@ from aolink.numerics.arrays import FloatArray
 from aolink.optics.sensor import SpotSensor
 from aolink.rig import Rig, load_rig
 from aolink.simulation.model import simulate
-from paper_report.blocks import Block, Heading, Picture, Table, Text
+from paper_report.blocks import Block, Heading, PageFigure, Table, Text
 from paper_report.ensemble import Measured, measure_errors, ratio, side_by_side, variant, with_pixel_noise
 from paper_report.numbers import Effort
 from paper_report.shake import shaken
@@ -29,7 +29,7 @@ BETTER_THAN_O1 = ("moments", "profile", "mixture")
 
 
 @dataclass(frozen=True)
-class Found:
+class SceneErrors:
     """One estimator in one scene."""
 
     path: float
@@ -56,7 +56,7 @@ class Scene:
     """One row of the table."""
 
     name: str
-    found: dict[str, Found]
+    found: dict[str, SceneErrors]
 
 
 def scenes(runs: int, count: int) -> Iterator[tuple[str, Rig, list[Exposure]]]:
@@ -146,7 +146,7 @@ def against_o1_section(table: Sequence[tuple[str, dict[str, Measured]]], effort:
 def _found(
     exposures: Sequence[Exposure], estimates: Sequence[Estimate], limits: tuple[list[Estimate], list[Estimate]],
     single: Sequence[NDArray[np.bool_]], skip: int, time_ms: float,
-) -> Found:  # fmt: skip
+) -> SceneErrors:  # fmt: skip
     path, end, nees, inside, product, variance = [], [], [], [], [], []
     for exposure, e, one, two in list(zip(exposures, estimates, *limits, strict=True))[skip:]:
         truth = exposure.truth
@@ -164,7 +164,7 @@ def _found(
     samples = axes * len(nees)
     low, high = (2 * float(special.gammaincinv(samples * states / 2, p)) / (samples * states) for p in (0.025, 0.975))
     alone = np.array(single[skip:])
-    return Found(
+    return SceneErrors(
         path=math.sqrt(np.mean(path)), end=math.sqrt(np.mean(end)), nees=float(np.mean(nees)) / states, nees_low=low,
         nees_high=high, inside=float(np.mean(inside)),
         distance=_root(np.array(product), np.array(variance)), time_ms=time_ms,
@@ -184,7 +184,7 @@ def _root(square: FloatArray, variance: FloatArray) -> float:
     return math.sqrt(max(0.0, float(square.mean() / variance.mean()))) if len(square) else math.nan
 
 
-def limit_section(table: Sequence[Scene], effort: Effort, picture: Picture) -> list[Block]:
+def limit_section(table: Sequence[Scene], effort: Effort, picture: PageFigure) -> list[Block]:
     """One table for each quantity, scenes down and estimators across."""
 
     def rows(text: str, names: Sequence[str] = NAMES) -> list[list[str]]:

@@ -13,7 +13,7 @@ from aolink.plant.lifting import lift
 from aolink.plant.observability import observability
 from aolink.rig import Rig
 from paper_report import figures
-from paper_report.blocks import Block, Heading, Picture, Points, Table, Text
+from paper_report.blocks import Block, Heading, PageFigure, Points, Table, Text
 from paper_report.ensemble import Cell, Measured
 from paper_report.judge import Row as JudgedRow
 from paper_report.limit import Scene, against_o1_section, limit_section
@@ -104,8 +104,8 @@ def build(results: Results) -> list[Block]:
     ]
 
 
-def _picture(file: str) -> Picture:
-    return Picture(file, FIGURES[file])
+def _picture(file: str) -> PageFigure:
+    return PageFigure(file, FIGURES[file])
 
 
 def _introduction(results: Results) -> list[Block]:

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from aolink.numerics.arrays import FloatArray
 from aolink.restoration import Psf, Scanner, first_order, largest_zero, restore
-from paper_report.blocks import Block, Heading, Picture, Points, Table, Text, as_html, as_markdown
+from paper_report.blocks import Block, Heading, PageFigure, Points, Table, Text, as_html, as_markdown
 
 # Values that he does not print: the blur and the noise's variances.
 BLUR = 5
@@ -194,7 +194,7 @@ def build(runs: int, captions: dict[str, str]) -> list[Block]:
             f" {BLUR} pixels, and of variance {', '.join(f'{v:g}' for v in NOISE_VARIANCES)}. Gains are means over"
             f" {runs} noises."
         ),
-        *(Picture(file, caption) for file, caption in captions.items()),
+        *(PageFigure(file, caption) for file, caption in captions.items()),
         Heading("Improvement"),
         Text(
             "ISNR in dB, against the blurred picture moved back by the PSF's centroid (aligned), and index for index"

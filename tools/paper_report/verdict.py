@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from aolink.numerics.arrays import FloatArray
-from paper_report.blocks import Block, Heading, Picture, Points, Table, Text
+from paper_report.blocks import Block, Heading, PageFigure, Points, Table, Text
 from paper_report.family import SEEDS
 from paper_report.judge import LIMIT, NAMES, Row
 
@@ -204,7 +204,7 @@ def _span(ends: tuple[float, float]) -> str:
     return f"{ends[0]:.2f} to {ends[1]:.2f}"
 
 
-def family_section(given: Sequence[Row], picture: Picture | None = None) -> list[Block]:
+def family_section(given: Sequence[Row], picture: PageFigure | None = None) -> list[Block]:
     """Quantiles over the family, the picture, and the goals."""
     rows = by_estimator(given)
     reporting = [row.seed in SEEDS["reporting"] for row in given]

@@ -12,10 +12,10 @@ from aolink.identification import UNITS, Identified
 
 if TYPE_CHECKING:
     from aolink.jobs.follow import Offer
-    from aolink.jobs.identify import Found
+    from aolink.jobs.identify import IdentifiedModel
 
 
-def found(one: Found) -> Iterator[Table]:
+def found(one: IdentifiedModel) -> Iterator[Table]:
     """The prediction scores of the models, where several were tried; and the parameters of the chosen one."""
     if one.tried:
         best = max(each.score for each in one.tried)

@@ -15,7 +15,7 @@ from aolink.recording import schemas_pb2 as pb
 
 if TYPE_CHECKING:
     from aolink.jobs.demo import DemoResult
-    from aolink.recording.deblur import Summary
+    from aolink.recording.deblur import RestoredCounts
     from aolink.session import EstimatorReport, Report
     from aolink.session.report import ControlReport
 
@@ -133,7 +133,7 @@ def _latency_ms(latencies: Sequence[pb.Latency], since: str, until: str) -> list
     return [len(values), *map(float, np.percentile(values, [50, 99]))] if values else [0.0]
 
 
-def deblurred(summary: Summary) -> dict[str, Any]:
+def deblurred(summary: RestoredCounts) -> dict[str, Any]:
     """The results for restored pictures; PSNRs are means over the scenes, None where the true scene is not known."""
     blurred, restored = summary.psnr_blurred, summary.psnr_restored
     return {
@@ -147,7 +147,7 @@ def deblurred(summary: Summary) -> dict[str, Any]:
     }
 
 
-def deblurred_lines(summary: Summary, estimator: str, method: str) -> list[str]:
+def deblurred_lines(summary: RestoredCounts, estimator: str, method: str) -> list[str]:
     """The results for restored pictures, in words."""
     facts = deblurred(summary)
     scenes = f"{facts['scenes_restored']} scenes" if facts["scenes_restored"] else "spots"

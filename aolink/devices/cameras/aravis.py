@@ -14,7 +14,7 @@ from contextlib import ExitStack, suppress
 from typing import Any
 
 from aolink.devices.cameras.aravis_library import Aravis, Refused
-from aolink.devices.cameras.aravis_stream import Picture, PictureStream
+from aolink.devices.cameras.aravis_stream import PictureStream, StreamPicture
 from aolink.devices.cameras.pictures import checked_corner
 from aolink.devices.cameras.pixel_formats import PIXEL_FORMATS, PixelFormat
 from aolink.devices.cameras.requests import Requests
@@ -359,7 +359,7 @@ class AravisCamera:
         feature = b"GevGVSPExtendedIDMode"
         return bool(self._get("is_feature_available", feature)) and self._get("get_string", feature) == b"On"
 
-    def _frame(self, picture: Picture) -> SimpleFrame | None:
+    def _frame(self, picture: StreamPicture) -> SimpleFrame | None:
         """The frame of a picture; None for one from before the session."""
         # A camera without a latch is timed by the arrival of its pictures, on the clock of SimpleFrame.arrived_ns.
         arrived_ns = time.monotonic_ns() - (time.time_ns() - picture.leader_ns)

@@ -27,7 +27,7 @@ _SOCKET_BYTES = 4 << 20
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Picture:
+class StreamPicture:
     """A picture as it arrived."""
 
     frame_id: int
@@ -89,7 +89,7 @@ class PictureStream:
             "packet-resend", self._aravis("arv_gv_stream_packet_resend_get_type"), "g_value_set_enum", int(resend)
         )
 
-    def pictures(self) -> Iterator[Picture]:
+    def pictures(self) -> Iterator[StreamPicture]:
         """The pictures that have arrived since the last call. Raises DeviceError for one of another size or format."""
         while buffer := self._aravis("arv_stream_try_pop_buffer", self._stream):
             memory = self._memory.pop(buffer)
@@ -134,7 +134,7 @@ class PictureStream:
         self._memory[buffer] = memory
         self._aravis("arv_stream_push_buffer", self._stream, buffer)
 
-    def _take(self, buffer: int, memory: NDArray[np.uint8]) -> Picture | None:
+    def _take(self, buffer: int, memory: NDArray[np.uint8]) -> StreamPicture | None:
         """The picture in a buffer that Aravis has given back; None where there is none to be had."""
         status, frame_id, stamp_ns, leader_ns = (
             self._aravis(f"arv_buffer_get_{what}", buffer)
@@ -153,7 +153,7 @@ class PictureStream:
             self._chunks_lost += lost
             mask = self._format.whole(np.repeat(arrived, self._block)[: self._payload], self._shape)
             pixels[~mask] = 0
-        return Picture(
+        return StreamPicture(
             frame_id=frame_id, stamp_ns=stamp_ns, leader_ns=leader_ns, pixels=pixels, mask=mask, chunks_lost=lost
         )  # fmt: skip
 

@@ -54,7 +54,7 @@ class FolderCamera(ThreadCamera):
 
     def start(self, start_ns: int, exposures: int) -> None:
         """Play ``exposures`` pictures (0: until stopped), the first one as if exposed from ``start_ns`` on."""
-        self._thread = FrameThread(lambda stopped: self._play(start_ns, exposures, stopped))
+        self.thread = FrameThread(lambda stopped: self._play(start_ns, exposures, stopped))
 
     def _play(self, start_ns: int, exposures: int, stopped: threading.Event) -> Iterator[SimpleFrame]:
         timing = self._rig.timing

@@ -84,11 +84,11 @@ class OpenCVCamera(ThreadCamera):
 
     def start(self, start_ns: int, exposures: int) -> None:
         """Read frames until stopped: those of a file from ``start_ns`` on, others as they come, also before it."""
-        self._thread = FrameThread(lambda stopped: self._read(start_ns, stopped))
+        self.thread = FrameThread(lambda stopped: self._read(start_ns, stopped))
 
     def close(self) -> None:
         """Release the camera, once the frame that is under way has come: the thread does it, where there is one."""
-        if self._thread is None:
+        if self.thread is None:
             self._capture.release()
         super().close()
 

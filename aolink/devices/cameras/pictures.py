@@ -69,22 +69,23 @@ class FrameThread(Arrived):
 class ThreadCamera:
     """The common part of cameras whose frames come from a thread, which begins when they are started."""
 
-    _thread: FrameThread | None = None
+    thread: FrameThread | None = None
+    """A driver's `start` puts it here."""
 
     def frames(self) -> list[SimpleFrame]:
         """The frames since the last call. Raises DeviceError where there are no more to come."""
-        return self._thread.take() if self._thread else []
+        return self.thread.take() if self.thread else []
 
     def stop(self) -> None:
         """Take no more frames."""
-        if self._thread:
-            self._thread.stop()
+        if self.thread:
+            self.thread.stop()
 
     def close(self) -> None:
         """End the thread, once the frame that is under way has come."""
-        if self._thread:
-            self._thread.stop()
-            self._thread.join()
+        if self.thread:
+            self.thread.stop()
+            self.thread.join()
 
 
 def checked_corner(corner: Sequence[int] | None) -> tuple[int, int] | None:

@@ -17,7 +17,7 @@ _SHOWN = 48
 """Bytes of a request or an answer that an error message shows."""
 
 
-class Line:
+class SerialLine:
     """A port that no other program uses, on which a device answers one request after another.
 
     Parameters

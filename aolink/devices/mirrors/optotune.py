@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aolink.devices.mirrors.keys import scale_per_input, text
-from aolink.devices.mirrors.line import Line, shown, usb_ports
+from aolink.devices.mirrors.line import SerialLine, shown, usb_ports
 from aolink.devices.simple import Lacks
 from aolink.errors import DeviceError
 from aolink.rig import Rig
@@ -72,7 +72,7 @@ class OptotuneMirror:
         self._unit_rad, self._park = scale_per_input("unit_rad", unit_rad, 2), rig.mirror.park
         self._check_reach(rig)
         with ExitStack() as opened:
-            self._line = Line("the Optotune mirror driver", text("port", port), _BAUD_RATE)
+            self._line = SerialLine("the Optotune mirror driver", text("port", port), _BAUD_RATE)
             opened.callback(self._line.close)
             self._start()
             model, serial_number, firmware = (self._ask(what) for what in ("GETID", "GETSN", "GETVERSION"))

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aolink.devices.mirrors.keys import per_input, scale_per_input, speed, text
-from aolink.devices.mirrors.line import Line, usb_ports
+from aolink.devices.mirrors.line import SerialLine, usb_ports
 from aolink.devices.simple import Lacks
 from aolink.errors import DeviceError, RigError
 from aolink.rig import Rig
@@ -85,7 +85,7 @@ class PiMirror:
         self._unanswered = ""
         """The command whose ERR? has not been answered."""
         with ExitStack() as opened:
-            self._line = Line("the PI controller", text("port", port), speed("baud_rate", baud_rate))
+            self._line = SerialLine("the PI controller", text("port", port), speed("baud_rate", baud_rate))
             opened.callback(self._line.close)
             self._identity = self._identify()
             self._check_axes()

@@ -16,8 +16,9 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from aolink.devices.drivers import Failure
 from aolink.devices.mirrors.keys import text
-from aolink.devices.mirrors.line import Line, shown
+from aolink.devices.mirrors.line import SerialLine, shown
 from aolink.devices.mirrors.resolution import check_resolution
 from aolink.devices.mirrors.sample_clock import SampleClock
 from aolink.devices.simple import Held, Lacks
@@ -136,7 +137,7 @@ class PlayzerX:
         self._park = codes_of(rig.mirror.park[None])
         self._laser: list[int] = []
         """Levels of its colours, once it is known how many it has."""
-        self._line = Line("the PlayzerX", text("port", port), BAUD_RATE)
+        self._line = SerialLine("the PlayzerX", text("port", port), BAUD_RATE)
         try:
             self.description, data_format = self._identify()
             self._laser = [laser] * _COLOURS[data_format]
@@ -162,7 +163,7 @@ class PlayzerX:
             """The first step of the samples that were handed over last."""
             self._changed = threading.Lock()
             self._closing = threading.Event()
-            self._failed: Exception | None = None
+            self._failure = Failure()
             self._line.tell(USB_INPUT + sample_rate(rate))
             self._begin()
             for _ in range(_WARM_UP):
@@ -190,14 +191,14 @@ class PlayzerX:
     def send(self, first_step: int, u: NDArray[np.float64]) -> int:
         codes = codes_of(u)
         with self._changed:
-            self._raise_failure()
+            self._failure.check()
             late = min(max(self._next - first_step, 0), len(u))
             self._commands.update(enumerate(codes[late:], first_step + late))
         return late
 
     def applied(self) -> Iterable[Held]:
         with self._changed:
-            self._raise_failure()
+            self._failure.check()
             first = self._next - len(self._steps)
             n_steps = max(self._taken - first, 0)
             reported, self._steps = self._steps[:n_steps], self._steps[n_steps:]
@@ -208,7 +209,7 @@ class PlayzerX:
 
     def park(self) -> int:
         with self._changed:
-            self._raise_failure()
+            self._failure.check()
             self._commands.clear()
             return self._next
 
@@ -219,7 +220,7 @@ class PlayzerX:
         try:
             self._leave_safe()
         except AolinkError:
-            if self._failed is None:  # otherwise the session knows of it already
+            if self._failure.error is None:  # otherwise the session knows of it already
                 raise
         finally:
             self._line.close()
@@ -268,7 +269,7 @@ class PlayzerX:
                 self._serve()
         except Exception as error:  # the session gets the error when it asks next
             with self._changed:
-                self._failed = error
+                self._failure.error = error
 
     def _serve(self) -> None:
         """Count the samples, and fill the queue."""
@@ -336,10 +337,6 @@ class PlayzerX:
             self._steps += [(each, False) for each in codes]
             self._batch, self._next, self._handed = steps.start, steps.stop, self._handed + n_samples
         self._line.tell(samples(codes, self._laser))
-
-    def _raise_failure(self) -> None:
-        if self._failed is not None:
-            raise self._failed
 
 
 def _checked_rate(rig: Rig) -> int:

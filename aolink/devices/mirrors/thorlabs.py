@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aolink.devices.mirrors.keys import per_input, scale_per_input, text
-from aolink.devices.mirrors.line import TIMEOUT_S, Line, shown, usb_ports
+from aolink.devices.mirrors.line import TIMEOUT_S, SerialLine, shown, usb_ports
 from aolink.devices.mirrors.resolution import check_resolution
 from aolink.devices.simple import Lacks
 from aolink.errors import AolinkError, DeviceError, RigError
@@ -54,7 +54,7 @@ class AptUnit:
         The extra ``thorlabs`` is not installed.
     """
 
-    def __init__(self, line: Line, address: int) -> None:
+    def __init__(self, line: SerialLine, address: int) -> None:
         with needs_extra("thorlabs", DeviceError):
             import thorlabs_apt_protocol
             from thorlabs_apt_protocol.parsing import id_to_func
@@ -174,10 +174,10 @@ class ThorlabsPiezo:
         self._scale, self._zero = (scale_per_input("unit", unit, rig.n_inputs), per_input("zero", zero, rig.n_inputs))
         self._closed_loop, self._travel_um, self._park = closed_loop, travel_um, rig.mirror.park
         with ExitStack() as opened:
-            self._lines: dict[str, Line] = {}
+            self._lines: dict[str, SerialLine] = {}
             for path, _ in places:
                 if path not in self._lines:
-                    self._lines[path] = Line("the Thorlabs unit", path, _BAUD_RATE)
+                    self._lines[path] = SerialLine("the Thorlabs unit", path, _BAUD_RATE)
                     opened.callback(self._lines[path].close)
             self._outputs: list[_Output] = []
             found = []
@@ -280,7 +280,7 @@ class ThorlabsAligner:
                 f" the Thorlabs aligner goes from {-_ALIGNER_VOLTS:g} to {_ALIGNER_VOLTS:g} V: correct one of them"
             )
         check_resolution(rig.mirror, np.abs(volt / self._scale), "the Thorlabs aligner")
-        self._line = Line("the Thorlabs aligner", text("port", port), _BAUD_RATE)
+        self._line = SerialLine("the Thorlabs aligner", text("port", port), _BAUD_RATE)
         with ExitStack() as opened:
             opened.callback(self._line.close)
             self._apt = AptUnit(self._line, _CUBE)
@@ -330,7 +330,7 @@ def _places(port: str | list[str], bays: list[int] | None, n_inputs: int) -> lis
     return [(text("port", path), _FIRST_BAY + bay if bay else _CUBE) for path, bay in zip(paths, numbers, strict=True)]
 
 
-def _greeted(line: Line, apt: AptUnit) -> str:
+def _greeted(line: SerialLine, apt: AptUnit) -> str:
     """Make a unit send nothing but answers; gives its description. Raises DeviceError."""
     apt.tell("hw_no_flash_programming")
     apt.tell("hw_stop_updatemsgs")

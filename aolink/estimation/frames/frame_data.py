@@ -46,6 +46,11 @@ class Measurement:
     usable: BoolArray | None = None
     """False for axes of which nothing was measured, (axes,); None if all were measured."""
 
+    @property
+    def single_block(self) -> FloatArray:
+        """The covariance where it is one block, (axes, n_measurements, n_measurements)."""
+        return self.covariance[:, 0] if self.covariance.ndim == 4 else self.covariance
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Densities:

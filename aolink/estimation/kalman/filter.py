@@ -261,8 +261,7 @@ class TwoStateFilter(BlurFilter):
             """(exposures * axes, ...) as (exposures, axes, ...)."""
             return np.ascontiguousarray(values.reshape(*shape, *values.shape[1:]))
 
-        R = measured.covariance[:, 0] if measured.covariance.ndim == 4 else measured.covariance
-        P = np.broadcast_to(self.prior.covariance, (self.plant.axes, 2, 2))
+        P, R = np.broadcast_to(self.prior.covariance, (self.plant.axes, 2, 2)), measured.single_block
         state, unseen = (np.array(each, order="C") for each in (self.prior.mean, self._unseen.mean))
         covariance, table = np.ascontiguousarray(_upper(P)), np.empty((*shape, two_state_runs.NUMBERS))
         count = two_state_runs.run(

@@ -64,8 +64,8 @@ def _updated(
     if gain is not None:
         moved = matmul_one_thread(gain, y)
         keep = np.eye(n) - matmul_one_thread(gain, H)
-        told = (gain.reshape(n, blocks, size).swapaxes(0, 1) @ R).swapaxes(0, 1).reshape(n, m)
-        covariance = congruence_one_thread(keep, P) + matmul_one_thread(told, np.ascontiguousarray(gain.T))
+        gain_R = (gain.reshape(n, blocks, size).swapaxes(0, 1) @ R).swapaxes(0, 1).reshape(n, m)
+        covariance = congruence_one_thread(keep, P) + matmul_one_thread(gain_R, np.ascontiguousarray(gain.T))
         covariance = symmetric(covariance)
     return mean + moved, covariance, S, nis
 
@@ -83,10 +83,10 @@ def stepped_gain(A: FloatArray, H: FloatArray, Q: FloatArray, R: FloatArray) -> 
     """
     blocks, size, _ = R.shape
     weighted = np.asarray(np.linalg.solve(R, H.reshape(blocks, size, -1)), dtype=np.float64).reshape(len(H), -1)
-    told = matmul_one_thread(np.ascontiguousarray(H.T), weighted)
-    told, P = symmetric(told), Q
+    information = matmul_one_thread(np.ascontiguousarray(H.T), weighted)
+    information, P = symmetric(information), Q
     for _ in range(_MOST_EXPOSURES):
-        before, after = P, inverse_by_cholesky(information_matrix(P) + told)
+        before, after = P, inverse_by_cholesky(information_matrix(P) + information)
         P = symmetric(congruence_one_thread(A, after) + Q)
         if np.abs(P - before).max() <= _SETTLED * np.abs(P).max():
             return matmul_one_thread(after, np.ascontiguousarray(weighted.T))

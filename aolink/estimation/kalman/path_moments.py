@@ -65,7 +65,7 @@ class PathMoments:
             expected, slope = many_moments(model, response, prior.mean, self.orders)
             update = information_update if n_states > MANY_STATES else blocked_update
             return update(prior, measured.value - expected, slope, measured.covariance, self.gain)
-        R = self._noise(measured)
+        R = measured.single_block
         if max(self.n_measurements, n_states) > entrywise.MOST_ROWS:
             expected, slope = predicted_moments(model, response, prior.mean, self.orders)
             return joseph_update(prior, measured.value - expected, slope, R, self.gain)
@@ -74,11 +74,6 @@ class PathMoments:
         if self.gain is None and self.n_measurements == n_states == 2:
             return two_state_update(prior, innovation, H, R)
         return small_update(prior, innovation, H, R, self.gain)
-
-    def _noise(self, measured: Measurement) -> FloatArray:
-        """Covariance of the measurements, (axes, n_measurements, n_measurements); a single block may stand for it."""
-        R = measured.covariance
-        return R[:, 0] if R.ndim == 4 else R
 
 
 class SecondOrderMoments(PathMoments):
@@ -94,7 +89,7 @@ class SecondOrderMoments(PathMoments):
         """One step of the second-order extended Kalman filter."""
         MP = batched.matmul(model.quadratic[None], prior.covariance[:, None])  # (axes, n_outputs, n, n)
         second = np.arange(self.n_measurements)[len(self.orders) - 1 :: len(self.orders)]
-        value, covariance = measured.value.copy(), self._noise(measured) + np.zeros((len(MP), 1, 1))
+        value, covariance = measured.value.copy(), measured.single_block + np.zeros((len(MP), 1, 1))
         value[:, second] -= np.einsum("aoii->ao", MP)
         covariance[:, second[:, None], second] += 2 * np.einsum("aoij,apji->aop", MP, MP)
         widened = replace(measured, value=value, covariance=covariance)

@@ -41,8 +41,8 @@ def _compressed_gain(model: ExposureModel, Q: FloatArray, R: FloatArray) -> Floa
     white = np.linalg.solve(root, model.mean_row.reshape(blocks, size, -1)).reshape(blocks * size, -1)
     rotation, H = np.linalg.qr(white)
     gain = _riccati_gain(model.transition, H, Q, np.eye(len(H)))
-    told = np.linalg.solve(root.swapaxes(1, 2), rotation.reshape(blocks, size, -1)).reshape(blocks * size, -1)
-    return None if gain is None else np.asarray(gain @ told.T)
+    rotated = np.linalg.solve(root.swapaxes(1, 2), rotation.reshape(blocks, size, -1)).reshape(blocks * size, -1)
+    return None if gain is None else np.asarray(gain @ rotated.T)
 
 
 def _riccati_gain(A: FloatArray, H: FloatArray, Q: FloatArray, R: FloatArray) -> FloatArray | None:

@@ -137,9 +137,9 @@ class JointPaths:
         lower, out = np.empty((self.size, self.size)), np.empty((self.size, self.size))
         of_shares = np.ascontiguousarray(of_shares)
         for c, own in enumerate(self._slices):
-            told = np.empty((len(self.patterns), own.stop))
-            compiled_loops().informed(of_shares, self._patterns, self._course_of, c, told)
-            lower[own, : own.stop] = matmul_one_thread(self._patterns[:, own].T, told)
+            informed = np.empty((len(self.patterns), own.stop))
+            compiled_loops().informed(of_shares, self._patterns, self._course_of, c, informed)
+            lower[own, : own.stop] = matmul_one_thread(self._patterns[:, own].T, informed)
         compiled_loops().spread_out(lower, self.order, out)
         return out
 

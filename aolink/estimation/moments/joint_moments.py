@@ -50,9 +50,9 @@ class JointObservation(ABC):
             some = slice(0, paths.size)
             before = Gaussian(mean[axis, some], covariance[axis, :n, :n])
             windows = by_spot(measured, axis)
-            t, P, *told = self.corrected(paths.foreseen(mean[axis, some], response, axis), before, windows)
+            t, P, *innovation = self.corrected(paths.foreseen(mean[axis, some], response, axis), before, windows)
             mean[axis, some], covariance[axis, some, some] = t, P
-            rest.append(told)
+            rest.append(innovation)
         new, S, nis = (np.stack(each) for each in zip(*rest, strict=True))
         return Update(Gaussian(mean, covariance), new, S, nis)
 
@@ -132,6 +132,8 @@ def by_spot(measured: SpotWindows, axis: int) -> SpotWindows:
 def _told(paths: JointPaths, fit: Regression, R: FloatArray, new: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Information and score of the coefficients from the sums of all spots."""
     weighted = np.linalg.solve(R, np.concatenate([fit.slope, new[..., None]], axis=2))
-    told = batched.transpose(fit.slope) @ weighted
-    shape = (len(told), 2, paths.functions.shape[1])
-    return paths.information(told[..., :-1].reshape(*shape, *shape[1:])), paths.score(told[..., -1].reshape(shape))
+    products = batched.transpose(fit.slope) @ weighted
+    shape = (len(products), 2, paths.functions.shape[1])
+    return paths.information(products[..., :-1].reshape(*shape, *shape[1:])), paths.score(
+        products[..., -1].reshape(shape)
+    )

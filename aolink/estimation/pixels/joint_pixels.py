@@ -77,18 +77,18 @@ class JointPixels:
         courses = np.column_stack([self.paths.functions, np.ones(len(self.paths.weights))])
         spots, m = len(path), courses.shape[1]
         log_likelihood, score = np.empty(spots), np.empty((spots, 2 * m))
-        told = np.empty((spots, 2 * m, 2 * m))
+        information = np.empty((spots, 2 * m, 2 * m))
         compiled_loops().looked_at(
             X, Y, np.array(self._terms), self.paths.weights, courses, self._area, self.y, self.mask, self._read,
-            self._gain, log_likelihood, score, told,
+            self._gain, log_likelihood, score, information,
         )  # fmt: skip
-        score, told = score.reshape(spots, 2, m), told.reshape(spots, 2, m, 2, m)
+        score, information = score.reshape(spots, 2, m), information.reshape(spots, 2, m, 2, m)
         return Linearised(
             log_likelihood=float(log_likelihood.sum()),
             score=score[..., :-1],
-            information=np.ascontiguousarray(told[:, :, :-1, :, :-1]),
-            displaced=told[:, :, :-1, :, -1],
-            of_displacement=told[:, :, -1, :, -1],
+            information=np.ascontiguousarray(information[:, :, :-1, :, :-1]),
+            displaced=information[:, :, :-1, :, -1],
+            of_displacement=information[:, :, -1, :, -1],
             displacement_score=score[..., -1],
         )
 
@@ -180,10 +180,10 @@ def displacements(
     (n_outputs,), its variance (n_outputs,), and its NIS.
     """
     spots, n = paths.spots, len(state_covariance)
-    told = at.of_displacement
-    most = np.einsum("sdd->s", told).max()
-    told = told + (_NO_LIGHT * most) * np.eye(2)
-    noise = np.linalg.inv(told)
+    information = at.of_displacement
+    most = np.einsum("sdd->s", information).max()
+    information = information + (_NO_LIGHT * most) * np.eye(2)
+    noise = np.linalg.inv(information)
     # How much each share displaces its spot, (spots, 2, 2, m), and so each coefficient.
     by_share = noise @ at.displaced.transpose(0, 3, 1, 2).reshape(spots, 2, -1)
     by_share = by_share.reshape(spots, 2, 2, -1)

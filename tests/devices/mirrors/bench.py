@@ -97,18 +97,18 @@ def check_paths(rig: Rig, estimated: Iterable[tuple[Exposure, Estimate]], within
     exposures at most.
     """
     plant, wrong, pairs, excused = rig.plant, np.zeros_like(rig.plant.initial_mean), list(estimated), 0
-    told_before = saw_before = rig.mirror.park
+    commanded_before = saw_before = rig.mirror.park
     for exposure, found in pairs:
         assert exposure.truth is not None or exposure.n_steps != rig.timing.exposure_steps
         allowance = 0.0
-        for told, saw in zip(exposure.inputs, spot_camera.saw[exposure.device_start_ns], strict=False):
+        for commanded, saw in zip(exposure.inputs, spot_camera.saw[exposure.device_start_ns], strict=False):
             allowance = max(allowance, np.abs(plant.C @ wrong).max())
-            off = saw - told
+            off = saw - commanded
             if np.abs(off).max() < _DRIVE_OF_A_STEP:
                 off = np.zeros_like(off)
             else:
-                assert np.array_equal(told, told_before) or np.array_equal(saw, saw_before)
-            wrong, told_before, saw_before = plant.A @ wrong + plant.B @ off, told, saw
+                assert np.array_equal(commanded, commanded_before) or np.array_equal(saw, saw_before)
+            wrong, commanded_before, saw_before = plant.A @ wrong + plant.B @ off, commanded, saw
         excused += allowance > within
         if exposure.truth is not None:
             path = exposure.truth.path

@@ -17,7 +17,7 @@ from typer.testing import CliRunner
 import aolink.cli.rigs  # noqa: F401 - its commands
 from aolink.cli.common import app
 from aolink.devices.discovery import find_drivers
-from aolink.devices.mirrors.line import Line
+from aolink.devices.mirrors.line import SerialLine
 from aolink.errors import DeviceError, PortError
 
 SHORT_S = 0.05
@@ -39,8 +39,8 @@ def device(ends: tuple[int, int]) -> int:
 
 
 @pytest.fixture
-def line(ends: tuple[int, int]) -> Iterator[Line]:
-    line = Line("the test's device", os.ttyname(ends[1]), 115_200)
+def line(ends: tuple[int, int]) -> Iterator[SerialLine]:
+    line = SerialLine("the test's device", os.ttyname(ends[1]), 115_200)
     yield line
     line.close()
 
@@ -58,14 +58,14 @@ def answering(device: int, *pieces: bytes) -> threading.Thread:
     return thread
 
 
-def test_an_answer_that_comes_in_pieces_is_one_answer(device: int, line: Line) -> None:
+def test_an_answer_that_comes_in_pieces_is_one_answer(device: int, line: SerialLine) -> None:
     thread = answering(device, b"4", b"2\r", b"\nmore")
     assert line.ask(b"what?\r\n", end=b"\r\n") == b"42"
     assert line.read_exactly(4) == b"more"
     thread.join()
 
 
-def test_what_came_before_the_request_is_no_answer_to_it(device: int, line: Line) -> None:
+def test_what_came_before_the_request_is_no_answer_to_it(device: int, line: SerialLine) -> None:
     os.write(device, b"stale\n")
     thread = answering(device, b"fresh\n")
     assert line.ask(b"?\n") == b"fresh"
@@ -73,7 +73,7 @@ def test_what_came_before_the_request_is_no_answer_to_it(device: int, line: Line
 
 
 @pytest.mark.parametrize(("came", "said"), [(b"", "nothing came"), (b"\xfe\x00", r"only '\\xfe\\x00' came")])
-def test_a_device_that_does_not_answer(device: int, line: Line, came: bytes, said: str) -> None:
+def test_a_device_that_does_not_answer(device: int, line: SerialLine, came: bytes, said: str) -> None:
     thread = answering(device, came)
     with pytest.raises(
         DeviceError, match=rf"the test's device at {line.url} does not answer 'A\?\\n' .* {said}: .*115"
@@ -84,13 +84,13 @@ def test_a_device_that_does_not_answer(device: int, line: Line, came: bytes, sai
         line.read_exactly(3, timeout_s=SHORT_S)
 
 
-def test_draining_gives_what_was_there_until_the_line_is_quiet(device: int, line: Line) -> None:
+def test_draining_gives_what_was_there_until_the_line_is_quiet(device: int, line: SerialLine) -> None:
     os.write(device, b"abc")
     assert line.drain(quiet_s=SHORT_S) == b"abc"
     assert line.drain() == b""
 
 
-def test_a_device_that_never_ends_its_answer_is_not_kept_in_memory(device: int, line: Line) -> None:
+def test_a_device_that_never_ends_its_answer_is_not_kept_in_memory(device: int, line: SerialLine) -> None:
     thread = answering(device, *[b"x" * 1000] * 70)
     with pytest.raises(DeviceError, match="bytes without an end came"):
         line.ask(b"?\n", timeout_s=30)
@@ -98,9 +98,9 @@ def test_a_device_that_never_ends_its_answer_is_not_kept_in_memory(device: int, 
     thread.join()
 
 
-def test_a_line_belongs_to_one_program(line: Line) -> None:
+def test_a_line_belongs_to_one_program(line: SerialLine) -> None:
     with pytest.raises(PortError, match="in use by another program"):
-        Line("another", line.url, 9600)
+        SerialLine("another", line.url, 9600)
 
 
 @pytest.fixture
@@ -140,9 +140,9 @@ def test_each_driver_lists_the_usb_ports_of_its_maker_and_no_others() -> None:
 
 @pytest.mark.usefixtures("usb")
 def test_the_command_shows_what_was_found_in_words_and_for_programs() -> None:
-    told = CliRunner().invoke(app, ["devices", "--json"])
-    assert told.exit_code == 0, told.output
-    said = json.loads(told.stdout)
+    done = CliRunner().invoke(app, ["devices", "--json"])
+    assert done.exit_code == 0, done.output
+    said = json.loads(done.stdout)
     drivers = {each["name"]: each["devices"] for each in said["drivers"] if each["kind"] == "mirror"}
     assert {name: [tuple(each) for each in drivers[name]] for name in FOUND} == FOUND
     assert {"port": "/dev/ttyUSB2", "description": "E-727"} in said["ports"]

@@ -101,26 +101,26 @@ def opened(device: simulators.PlayzerX, **keys: Any) -> PlayzerX:
 
 def poll(mirror: PlayzerX, until: Callable[[list[Held]], bool]) -> list[Held]:
     """What it says that it held, until that is enough."""
-    told: list[Held] = []
+    reported: list[Held] = []
     deadline = time.monotonic() + PATIENCE_S
-    while not until(told):
+    while not until(reported):
         assert time.monotonic() < deadline
         time.sleep(0.005)  # as a session does
-        told += mirror.applied()
-    return told
+        reported += mirror.applied()
+    return reported
 
 
 def use(device: simulators.PlayzerX) -> None:
     """Open it and ask it until it fails."""
     mirror = opened(device)
     try:
-        poll(mirror, lambda told: False)
+        poll(mirror, lambda reported: False)
     finally:
         mirror.close()
 
 
-def told_until(step: int) -> Callable[[list[Held]], bool]:
-    return lambda told: bool(told) and told[-1].first_step + len(told[-1].u) > step
+def reported_until(step: int) -> Callable[[list[Held]], bool]:
+    return lambda reported: bool(reported) and reported[-1].first_step + len(reported[-1].u) > step
 
 
 def inputs_of(device: simulators.PlayzerX, n_steps: int) -> NDArray[np.float64]:
@@ -138,9 +138,12 @@ def test_each_step_holds_its_command_and_the_safe_input_between(data_format: str
         u = np.column_stack([np.linspace(-1, 1, 60), np.linspace(0.5, 0, 60)])
         assert mirror.send(begin, u[:40]) == 0
         assert mirror.send(begin + 20, u[20:]) == 0  # instead of the steps that are not handed over yet
-        told = poll(mirror, told_until(begin + 80))
-        held, late = np.concatenate([each.u for each in told]), [each.late for each in told if each.late is not None]
-        assert [each.first_step for each in told] == [0, *np.cumsum([len(each.u) for each in told])[:-1]]
+        reported = poll(mirror, reported_until(begin + 80))
+        held, late = (
+            np.concatenate([each.u for each in reported]),
+            [each.late for each in reported if each.late is not None],
+        )
+        assert [each.first_step for each in reported] == [0, *np.cumsum([len(each.u) for each in reported])[:-1]]
         assert np.array_equal(held, inputs_of(device, len(held)))
         if not np.concatenate(late).any():  # the machine was not held up for so long
             assert np.abs(held[begin : begin + 60] - u).max() < 3e-4
@@ -159,8 +162,8 @@ def test_it_is_left_at_a_safe_input_that_is_not_the_origin_with_its_laser_off() 
         mirror = PlayzerX(rig_with(park="[0.25, -0.5]"), port=device.port, laser=200, ahead_s=STALL_S)
         begin = mirror.time_ns() // STEP_NS + 300
         mirror.send(begin, np.full((1000, 2), 0.75))
-        told = poll(mirror, told_until(begin + 20))
-        np.testing.assert_allclose(told[0].u[0], [0.25, -0.5], atol=3e-4)
+        reported = poll(mirror, reported_until(begin + 20))
+        np.testing.assert_allclose(reported[0].u[0], [0.25, -0.5], atol=3e-4)
         with device.lock:
             assert device.output == (3583, 3583, (200,))
         mirror.close()
@@ -172,7 +175,7 @@ def test_a_device_is_brought_from_what_it_was_left_in(behaviour: dict[str, Any])
     """Its analog input, and updates for another program between the answers."""
     with simulators.PlayzerX(**behaviour) as device:
         mirror = opened(device)
-        poll(mirror, told_until(100))
+        poll(mirror, reported_until(100))
         mirror.close()
         assert device.at_rest() == (*simulators.ORIGIN, (0,))
         assert device.every_s is None
@@ -184,8 +187,8 @@ def test_a_command_for_steps_that_are_handed_over_is_late() -> None:
         assert mirror.send(0, np.full((20, 2), 0.5)) == 20
         assert 0 < mirror.send(0, np.full((1000, 2), 0.5)) < 1000
         parked = mirror.park()
-        told = poll(mirror, told_until(parked + 5))
-        held = np.concatenate([each.u for each in told])
+        reported = poll(mirror, reported_until(parked + 5))
+        held = np.concatenate([each.u for each in reported])
         assert np.abs(held[parked:]).max() < 3e-4
         mirror.close()
 
@@ -197,12 +200,12 @@ def test_a_queue_that_runs_dry_is_said_and_survived(waiting: bool) -> None:
     Every step is told once, with what was really held.
     """
     for _ in range(5):
-        told, out, held_up_ns = ran_dry(waiting)
+        reported, out, held_up_ns = ran_dry(waiting)
         if held_up_ns < HELD_UP_NS:  # else the machine may have stopped the simulator in the middle of its samples
             break
-    held = np.concatenate([each.u for each in told])
-    late = np.concatenate([each.late for each in told if each.late is not None])
-    assert [each.first_step for each in told] == [0, *np.cumsum([len(each.u) for each in told])[:-1]]
+    held = np.concatenate([each.u for each in reported])
+    late = np.concatenate([each.late for each in reported if each.late is not None])
+    assert [each.first_step for each in reported] == [0, *np.cumsum([len(each.u) for each in reported])[:-1]]
     assert late.sum() > 50
     near = [np.abs(held[1:-1] - out[1 + k : len(out) - 1 + k]).max(axis=1) < 1e-9 for k in (-1, 0, 1)]
     dry = np.count_nonzero(np.diff(late.astype(int)) > 0)  # how often: a busy machine adds to it
@@ -216,17 +219,17 @@ def ran_dry(waiting: bool) -> tuple[list[Held], NDArray[np.float64], int]:
         outages = Outages(STEP_NS)
         begin = mirror.time_ns() // STEP_NS + 300
         assert mirror.send(begin, np.repeat(np.linspace(0.1, 0.9, 1000), 2).reshape(-1, 2)) == 0
-        told = poll(mirror, told_until(begin + 30))
+        reported = poll(mirror, reported_until(begin + 30))
         if not waiting:
             with device.lock:  # it hears nothing meanwhile, and goes on putting out samples
                 time.sleep(0.4)
         end = mirror.time_ns() // STEP_NS + (500 if waiting else 200)
-        told += poll(mirror, told_until(end))
-        out = inputs_of(device, sum(len(each.u) for each in told))
+        reported += poll(mirror, reported_until(end))
+        out = inputs_of(device, sum(len(each.u) for each in reported))
         held_up_ns = outages.total_ns()
         outages.close()
         mirror.close()
-    return told, out, held_up_ns
+    return reported, out, held_up_ns
 
 
 def session_rig(device: simulators.PlayzerX) -> Rig:
@@ -282,8 +285,8 @@ def test_a_device_that_is_not_as_it_should_be_is_one_line(behaviour: dict[str, A
 def test_a_slow_line_or_what_another_program_has_left_does_no_harm(behaviour: dict[str, Any]) -> None:
     with simulators.PlayzerX(**behaviour) as device:
         mirror = opened(device)
-        told = poll(mirror, told_until(100))
-        assert sum(len(each.u) for each in told) > 100
+        reported = poll(mirror, reported_until(100))
+        assert sum(len(each.u) for each in reported) > 100
         mirror.close()
 
 

@@ -106,7 +106,7 @@ class PlayzerX(SerialDevice):
         """What was put out until then."""
         self._set_rate(POWER_ON_RATE)
         super().__init__(faults)
-        os.write(self._device, left_over)
+        os.write(self.device, left_over)
 
     def requests_in(self, waiting: bytes) -> tuple[list[bytes], bytes]:
         return read_commands(waiting)

@@ -63,7 +63,7 @@ class SerialDevice:
         self._faults = faults
         self._answers = self._asked = self._told_to_move = 0
         """Counted from the move on with which the faults begin."""
-        self._device, self._host = pty.openpty()
+        self.device, self._host = pty.openpty()
         tty.setraw(self._host)
         self.port = os.ttyname(self._host)
         self._woken, self._wake = os.pipe()
@@ -112,15 +112,15 @@ class SerialDevice:
         waiting = b""
         try:
             while True:
-                ready, _, _ = select.select([self._device, self._woken], [], [], self.every_s)
+                ready, _, _ = select.select([self.device, self._woken], [], [], self.every_s)
                 if self._woken in ready:
                     return
                 if not ready:
-                    os.write(self._device, self.unasked())
+                    os.write(self.device, self.unasked())
                     continue
-                data = os.read(self._device, 4096)
+                data = os.read(self.device, 4096)
                 if self._speed() != self.baud_rate:
-                    os.write(self._device, bytes(byte ^ 0xA5 for byte in data[::2]))
+                    os.write(self.device, bytes(byte ^ 0xA5 for byte in data[::2]))
                     continue
                 requests, waiting = self.requests_in(waiting + data)
                 for request in requests:
@@ -135,7 +135,7 @@ class SerialDevice:
                     if answer and now < self._faults.silent_from:
                         self._send(answer)
         finally:
-            for descriptor in (self._device, self._host, self._woken):
+            for descriptor in (self.device, self._host, self._woken):
                 os.close(descriptor)
 
     def _misbehaves(self) -> bool:
@@ -151,8 +151,8 @@ class SerialDevice:
             self._answers += 1
             pieces = [answer[k : k + 1] for k in range(len(answer))] if self._faults.split else [answer]
         for piece in pieces:
-            os.write(self._device, piece)
+            os.write(self.device, piece)
 
     def _speed(self) -> int:
-        settings = fcntl.ioctl(self._device, _TCGETS2, bytes(44))
+        settings = fcntl.ioctl(self.device, _TCGETS2, bytes(44))
         return int(struct.unpack("=4IB19B2I", settings)[-1])

@@ -15,7 +15,7 @@ from aolink.estimation.moments.windowed import WindowedMoments
 from aolink.optics.frame import frame_density
 from aolink.optics.kernel import exposure_density
 from aolink.rig import Plant, Rig, load_rig, parse_rig
-from aolink.simulation.model import RigModel, simulate
+from aolink.simulation.model import RigPhysics, simulate
 from tests.kinds import line_of, truth_of
 
 LIVELY = load_rig("section-vi-lively")
@@ -155,7 +155,7 @@ def test_nothing_changes_where_exposures_start_with_a_step():
 
 def test_advancing_in_pieces_makes_the_same_frames():
     rig = shaken(0.5)
-    whole, pieces = RigModel(rig, 1), RigModel(rig, 1)
+    whole, pieces = RigPhysics(rig, 1), RigPhysics(rig, 1)
     for each in (whole, pieces):
         each.start_camera(0)
     together = whole.advance(np.zeros((40, 1)))

@@ -276,8 +276,10 @@ def test_shot_noise_by_the_rig_file_is_allowed_for():
     )
     rig = dataclasses.replace(RIG, plant=plant, sensor=sensor)
     exposures = simulate(rig, 210, seed=9)
-    told = dataclasses.replace(rig, sensor=dataclasses.replace(sensor, photoelectrons=0.0))
-    aware, unaware = (score(exposures, run(each, exposures, ["moments"])["moments"], 10) for each in (rig, told))
+    without_shot = dataclasses.replace(rig, sensor=dataclasses.replace(sensor, photoelectrons=0.0))
+    aware, unaware = (
+        score(exposures, run(each, exposures, ["moments"])["moments"], 10) for each in (rig, without_shot)
+    )
     assert aware.nis.mean == pytest.approx(4.0, abs=0.6)
     assert unaware.nis.mean > 1.3 * aware.nis.mean
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from aolink.control import ControllerRow, Modes, response_at_rest
+from aolink.control import ControllerRow, MirrorModes, response_at_rest
 
 SHARE = 0.15  # of the gain, for the second integrator
 FORGETS = 0.98  # of itself that the second one keeps: it must not wind up while the spot is lost
@@ -14,7 +14,7 @@ class DoubleIntegrator:
     def __init__(self, rig):
         self._gain, self._axes = rig.control.gain, rig.plant.axes
         response = response_at_rest(rig.plant, rig.timing.exposure_steps)
-        self._reconstructor = Modes.of(response).reconstructor(rig.control.least_singular_value)
+        self._reconstructor = MirrorModes.of(response).reconstructor(rig.control.least_singular_value)
         self._sum, self._u = np.zeros(rig.n_inputs), rig.mirror.park
 
     def see(self, seen):

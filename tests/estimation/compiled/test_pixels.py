@@ -1,9 +1,6 @@
-"""Compiled code against its twins in NumPy, on frames of every kind; and nothing left to compile in a session."""
+"""Compiled code for pixels and mixtures against its twins in NumPy, on frames of every kind."""
 
 import dataclasses
-import os
-import subprocess
-import sys
 from typing import Any
 
 import numpy as np
@@ -11,7 +8,6 @@ import pytest
 from scipy import linalg
 
 from aolink.estimation import exposure_model, make_estimator
-from aolink.estimation.compiled import forget_stale, make_ready, small
 from aolink.estimation.frames.frame_data import Needs, Profile, SpotWindows
 from aolink.estimation.frames.measure import measure
 from aolink.estimation.kalman.gaussian import Gaussian
@@ -39,21 +35,6 @@ from tests.estimation.pixels.plain import PlainView
 from tests.kinds import must_be, truth_of
 
 LIVELY = load_rig("section-vi-lively")
-
-
-def test_one_process_compiles_for_all_others_once_for_each_version_of_the_sources(tmp_path):
-    """What a process has compiled itself may differ in the last bit from what the others load."""
-    said, source = tmp_path / "said", tmp_path / "loops.py"
-    source.touch()
-    program = f"open({str(said)!r}, 'a').write('compiled ')"
-    make_ready(tmp_path, program)
-    make_ready(tmp_path, program)
-    assert said.read_text() == "compiled "
-    later = source.stat().st_mtime + 60
-    os.utime(source, (later, later))
-    make_ready(tmp_path, program + "; raise SystemExit(1)")  # it has failed, so that the next one tries again
-    make_ready(tmp_path, program)
-    assert said.read_text() == 3 * "compiled "
 
 
 def changed(rig, **sensor):
@@ -414,93 +395,6 @@ def test_components_are_merged_as_pair_by_pair(seed):
         *(np.concatenate([each, each], axis=1) for each in (m.log_weight - np.log(2), m.mean, m.covariance))
     )
     assert twice.reduced(16, 1e-6).mean.shape[1] == 8
-
-
-def test_small_matrices_are_those_of_numpy():
-    rng = np.random.default_rng(5)
-    for n in (1, 2, 5, 12):
-        a = rng.standard_normal((n, n))
-        a = a @ a.T + 0.1 * np.eye(n)
-        root, inverse, x = np.empty((n, n)), np.empty((n, n)), rng.standard_normal(n)
-        small.cholesky_into(a, root)
-        np.testing.assert_allclose(root, np.linalg.cholesky(a), rtol=1e-7, atol=1e-9)
-        small.lower_inverse_into(root, inverse)
-        np.testing.assert_allclose(inverse @ root, np.eye(n), atol=1e-9)
-        solved = x.copy()
-        small.cholesky_solve(root, solved)
-        np.testing.assert_allclose(a @ solved, x, rtol=1e-6, atol=1e-8)
-        solved = x.copy()
-        small.lower_solve(root, solved)
-        np.testing.assert_allclose(root @ solved, x, rtol=1e-6, atol=1e-8)
-        values, vectors, worked = np.empty(n), np.empty((n, n)), a.copy()
-        small.eigh(worked, values, vectors)
-        np.testing.assert_allclose(values, np.linalg.eigvalsh(a)[::-1], rtol=1e-9)
-        np.testing.assert_allclose(vectors @ a @ vectors.T, np.diag(values), atol=1e-9 * values[0])
-        np.testing.assert_allclose(vectors @ vectors.T, np.eye(n), atol=1e-12)
-    x = np.append(-np.geomspace(1e-9, 39, 200), 0.0)
-    np.testing.assert_allclose([small.decay(each) for each in x], np.exp(x), rtol=3e-9)
-    assert small.decay(-np.inf) == small.decay(-41.0) < 5e-18
-    assert np.isnan(small.decay(np.nan))
-
-
-FIRST_SESSION = """
-import dataclasses, sys
-from aolink.estimation import make_estimator
-from aolink.estimation.compiled import joint, line, mixtures, modes, moments, small
-from aolink.rig import load_rig
-from aolink.simulation.model import simulate
-
-def overloads():
-    each = [value for module in (small, line, modes, moments, mixtures, joint) for value in vars(module).values()]
-    return sum(len(value.signatures) for value in each if hasattr(value, "signatures"))
-
-rig, name = load_rig(sys.argv[1]), sys.argv[2]
-rig = dataclasses.replace(rig, sensor=dataclasses.replace(rig.sensor, noise_density=float(sys.argv[3])))
-assert overloads() == 0
-estimator = make_estimator(rig, name)
-before = overloads()
-several = 0
-for exposure in simulate(rig, int(sys.argv[4]), seed=2):
-    estimator.step(exposure)
-    several += estimator.several is not None and estimator.several[0]
-print(before, overloads(), several)
-"""
-
-
-def first_session(rig, name, noise, exposures):
-    """In a process of its own: this one has compiled before."""
-    arguments = [sys.executable, "-c", FIRST_SESSION, rig, name, str(noise), str(exposures)]
-    out = subprocess.run(arguments, capture_output=True, text=True, check=True).stdout
-    return map(int, out.split())
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("name", ["profile", "mixture"])
-def test_nothing_is_compiled_in_a_session(name):
-    before, after, several = first_session("section-vi-lively", name, 0.003, 30)
-    assert before == after > 4
-    assert several
-
-
-@pytest.mark.long
-@pytest.mark.parametrize(
-    ("rig", "name"), [("membrane-12x12", "profile"), ("membrane-12x12", "moments"), ("single-lenslet", "mixture")]
-)
-def test_nothing_is_compiled_in_a_session_of_spots(rig, name):
-    before, after, _ = first_session(rig, name, 1e-3, 4)
-    assert before == after > 2
-
-
-def test_machine_code_is_not_older_than_any_source(tmp_path):
-    kept = tmp_path / "__pycache__"
-    kept.mkdir()
-    files = kept / "of_old.nbi", tmp_path / "one.py", tmp_path / "two.py", kept / "of_new.nbi"
-    for age, name in enumerate(files):
-        name.touch()
-        os.utime(name, (age, age))
-    forget_stale(tmp_path)
-    assert [each.name for each in kept.iterdir()] == ["of_new.nbi"]
-    forget_stale(tmp_path / "not there")
 
 
 @pytest.mark.parametrize("updates", [PROFILE, MIXTURE])
