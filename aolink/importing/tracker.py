@@ -124,9 +124,10 @@ class Tracker:
 
     def _apart_again(self, light: FloatArray, pair: IntArray) -> FloatArray:
         """Where the lights of two objects that had come together are, (2, 2), in the order in which they moved least;
-        NaN while there are not two."""
-        half = math.ceil((_REACH * (1 + self._lost[pair[0]]) + _MEET) * self._sd)
-        (window,), (corner,) = cut_windows(light, self.places[pair].mean(axis=0, keepdims=True), half)
+        NaN while there are not two. Where there is one, the last known positions move with it."""
+        half = math.ceil((2 * _REACH + _MEET) * self._sd)
+        middle = self.places[pair].mean(axis=0)
+        (window,), (corner,) = cut_windows(light, middle[None], half)
         smooth = ndimage.gaussian_filter(window, self._sd / 2)
         y, x = np.nonzero(smooth == ndimage.maximum_filter(smooth, size=2 * math.ceil(self._sd) + 1))
         order = np.argsort(-smooth[y, x])
@@ -136,10 +137,13 @@ class Tracker:
         lights = separate(lights, _MEET * self._sd)
         others = np.delete(self.places, pair, axis=0)
         free = (np.linalg.norm(lights[:, None] - others, axis=2) > _MEET * self._sd).all(axis=1)
-        if free.sum() < 2:
+        lights = lights[free]
+        if len(lights) == 1:
+            self.places[pair] += lights[0] - middle
+        if len(lights) < 2:
             return np.full((2, 2), np.nan)
-        distance = np.linalg.norm(self.places[pair][:, None] - lights[free], axis=2)
-        return np.asarray(lights[free][optimize.linear_sum_assignment(distance)[1]])
+        distance = np.linalg.norm(self.places[pair][:, None] - lights, axis=2)
+        return np.asarray(lights[optimize.linear_sum_assignment(distance)[1]])
 
     def _nearest(self, light: FloatArray, near: FloatArray) -> FloatArray:
         """The object that trackpy locates nearest to each place; the place itself where it locates none near it."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -125,6 +126,24 @@ def test_objects_that_meet_are_left_out_until_they_part(tmp_path: Path) -> None:
     scored = [(e, truth_of(x)) for e, x in zip(estimates, exposures, strict=True) if x.truth is not None]
     inside = [np.abs(e.path - t.path) < 1.96 * np.hypot(e.path_sd, t.path_sd) for e, t in scored]
     assert np.mean(inside) > 0.85
+
+
+def test_objects_that_stay_together_on_a_long_way_are_found_again() -> None:
+    """They go together for forty of their standard deviations, a third of the film."""
+    rng = np.random.default_rng(4)
+    motion = random_walk(rng, 300, 2, 0.05)
+    apart = np.clip(np.abs(np.arange(300) - 150) - 50, 0, 20) / 20
+    way = np.clip(np.arange(300) - 100, 0, 100) * 0.72
+    motion += np.stack([way, 0 * way], axis=1)[:, None, None]
+    motion += apart[:, None, None, None] * np.array([[0.0, -8.0], [0.0, 8.0]])
+    film = spot_film(rng, motion, np.array([[16.0, 32.0], [16.0, 32.0]]), (64, 112))
+    settings = replace(SETTINGS, places=((16.0, 24.0), (16.0, 40.0)))
+    source = array_film(film.frames, "film")
+    known = survey(source, settings, find_objects(source, settings))
+    assert known.together[110:190].any(axis=(1, 2)).all()
+    assert np.isfinite(known.places[230:]).all()
+    errors = [np.abs(known.places[230:, order] - film.places[230:]).max() for order in ([0, 1], [1, 0])]
+    assert min(errors) < 0.5
 
 
 def test_an_object_that_passes_a_faded_one_is_followed_on() -> None:
