@@ -186,6 +186,11 @@ def _of_many_axes(name: str, limit_ms: float, effort: Effort) -> Row:
     return Row(figure, f"{step * 1e3:.0f} ms", f"limit {limit_ms:.0f} ms", limit_ms / step / 1e3, 1)
 
 
+def moments_of_many_axes(effort: Effort) -> Row:
+    """The windowed moments of 1800 independent spots."""
+    return _of_many_axes("moments", 100, effort)
+
+
 def profile_of_many_axes(effort: Effort) -> Row:
     """The modes of 1800 posteriors."""
     return _of_many_axes("profile", 100, effort)
@@ -194,6 +199,18 @@ def profile_of_many_axes(effort: Effort) -> Row:
 def mixture_of_many_axes(effort: Effort) -> Row:
     """1800 mixtures."""
     return _of_many_axes("mixture", 400, effort)
+
+
+def profile_of_tip_tilt(effort: Effort) -> Row:
+    """An exposure of one spot on a plane, whose two slopes one mirror moves."""
+    from aolink.estimation import make_estimator
+    from aolink.simulation.model import simulate
+
+    rig = load_rig("tip-tilt")
+    exposures = simulate(rig, effort.of(40, 8), seed=1)
+    profile = make_estimator(rig, "profile")
+    took = statistics.median([timed(lambda exposure=exposure: profile.step(exposure)) for exposure in exposures][5:])  # type: ignore[misc]
+    return Row("profile of tip-tilt", f"{1e3 * took:.0f} ms", "limit 200 ms", 0.2 / took, 1)
 
 
 def spots_under_turbulence(effort: Effort) -> list[Row]:
