@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -236,10 +237,13 @@ def _text(
         variance = motion.q / (1 - motion.a**2) / unit**2
         kind, initial = "Ornstein-Uhlenbeck process", f"[[{variance:.4g}, 0.0], [0.0, {_ANYWHERE}]]"
     memory = "" if walk else f": a = {motion.a:.5g} +- {motion.a_sd:.2g} a frame"
+    summary = (
+        f"{n} objects of {film.name}, each in a window of {side} pixels that follows it; slope unit: {unit:g} pixels"
+    )
     said = "".join(f"# Note: {note}.\n" for note in notes)
     return f"""# Written by `aolink rig --from {film.name}` from its single frames. +- is one standard deviation.
-{said}name = "{name}"
-summary = "{n} objects of {film.name}, each in a window of {side} pixels that follows it; slope unit: {unit:g} pixels"
+{said}name = {json.dumps(name)}
+summary = {json.dumps(summary)}
 
 [plant]               # a copy for each object along x and along y
 axes = {2 * n}

@@ -93,7 +93,8 @@ class FilmLight:
         values = frame.astype(np.float64)
         # A saturated background does not harm a dark object.
         bad = (values >= self.full_scale) & (self._is_integer and not settings.invert) | ~np.isfinite(values)
-        values[~np.isfinite(values)] = 0.0
+        if not (known := np.isfinite(values)).all():
+            values[~known] = np.median(values[known]) if known.any() else 0.0  # as dark as the ground
         if settings.gamma != 1.0:
             values = self.full_scale * np.maximum(values / self.full_scale, 0.0) ** settings.gamma
         if settings.subtract_median or settings.invert:
@@ -176,11 +177,11 @@ def counts_of(
     """Whole counts and the mask of the pixels that can be used, (rows, columns) each; the other pixels are counted in
     ``account``."""
     whole = np.rint(counts)
-    outside = (whole < 0) | (whole > rig.sensor.full_scale)
+    outside = ~((whole >= 0) & (whole <= rig.sensor.full_scale))  # also what is no number
     account.pixels += whole.size
     account.saturated += int(np.count_nonzero(~usable))
     account.clipped += int(np.count_nonzero(outside & usable))
-    return np.clip(whole, 0, rig.sensor.full_scale).astype(np.uint16), usable & ~outside
+    return np.clip(np.nan_to_num(whole), 0, rig.sensor.full_scale).astype(np.uint16), usable & ~outside
 
 
 def default_scale(film: Film, rig: Rig) -> float:

@@ -23,6 +23,8 @@ _STRETCH = 10
 """Number of successive sampled frames that are averaged to find light beside an object."""
 _ALONE = 1 / 3
 """Light beside an object that is less bright than this share of it does not matter."""
+_DRIFTS = 5.0
+"""Standard deviations of the mean step from which on it is a drift."""
 _REST = 2.5
 """Reach of an object's light, in standard deviations that include its walk in an exposure: light beyond belongs to
 other objects."""
@@ -79,6 +81,22 @@ class Survey:
                 f"objects {a + 1} and {b + 1} come together in frames {frames}: they are left out there, and which is"
                 " which is not known afterwards"
             )
+        steps = np.diff(self.places, axis=0)
+        drift, count = np.nanmean(steps, axis=(0, 1)), max(int(np.isfinite(steps).all(axis=2).sum()), 1)
+        if np.linalg.norm(drift) > _DRIFTS * math.sqrt(np.nanvar(steps) / count):
+            yield (
+                f"the objects drift together by {drift[0]:.3g},{drift[1]:.3g} pixels a frame: a first rig file knows of"
+                " no drift, and takes it for random motion; where an exposure's drift is more than its random motion,"
+                " light is cut off and estimates are wrong"
+            )
+        unseen = np.asarray(~np.isfinite(self.places).all(axis=2) & ~self.together.any(axis=2))
+        for number, gone in enumerate(unseen.T, 1):
+            if gone.any():
+                frames = _stretches(np.flatnonzero(gone), 1, len(gone))
+                yield (
+                    f"object {number} is not seen in frames {frames}: exposures with one of them have no true path, and"
+                    " its window is left out where it is never seen"
+                )
         for k, beside in enumerate(self.beside.T):
             stretches = np.flatnonzero(beside >= _ALONE)
             if not len(stretches):

@@ -57,6 +57,9 @@ def tracked(
         bad = np.any([wrong for _, wrong in shown], axis=0)
         blurs = _blurs(mean, known.last[max(group.first_frame - 1, 0)], known, len(shown))
         values, usable, own = windows.cut(mean, ~bad, blurs)
+        end = group.first_frame + len(shown)
+        seen = np.isfinite(known.places[group.first_frame : end]).all(axis=2)
+        usable &= np.asarray(seen.any(axis=0))[:, None, None]  # a window without its object shows nothing of it
         # Beyond an object's reach there is none of its light: light there belongs to others.
         values = np.where(own, values - known.ground[:, None, None], 0.0)
         density = values / known.light[:, None, None] / area
@@ -65,14 +68,14 @@ def tracked(
         account.frames += len(shown)
         account.exposures += 1
         frame = rig_frame(film, rig, settings, group.first_period // settings.frames_per_exposure, pixels, mask)
-        end = group.first_frame + len(shown)
         path = windows.positions(known.places[group.first_frame : end])
         inputs = np.tile(rig.mirror.park, (frame.last_step + 1 - step, 1))
         step = frame.last_step + 1
         inputs[-1] += windows.follow(known.places[end - 1])
         truth = None
         if len(path.T) == rig.timing.exposure_steps and np.isfinite(path).all():
-            after = windows.positions(known.places[end : end + 1])
+            follows = end < len(periods) and periods[end] == periods[end - 1] + 1
+            after = windows.positions(known.places[end : end + 1] if follows else known.places[:0])
             truth = Truth(
                 start_state=_state(rig, path[:, 0]), end_state=_state(rig, after[:, 0] if after.size else None),
                 path=path, path_sd=known.place_sd * sensor.pixel_width,
@@ -115,7 +118,7 @@ class _Windows:
         )
         self._per_shift = np.linalg.inv(gain) if self._moves else gain
         self._reach = reach(known, rig.timing.exposure_steps)
-        self._corners = self._about(known.places[0])
+        self._corners = self._about(known.last[0])
 
     def _about(self, places: FloatArray) -> NDArray[np.int64]:
         """First pixels of windows with places in their middles, (n, 2) as (x, y)."""
@@ -144,8 +147,9 @@ class _Windows:
         for k, other in np.argwhere((distance < 2 * self._reach) & ~np.eye(len(places), dtype=np.bool_)):
             shared[k] |= np.hypot(x[k] - places[other, 0], (y[k] - places[other, 1])[:, None]) <= self._reach
         away = np.hypot((x - places[:, :1])[:, None, :], (y - places[:, 1:])[:, :, None])
-        own = inside & (away <= self._reach)
-        return picture[at], ~inside | usable[at] & ~(own & shared), own
+        near = away <= self._reach
+        # Beyond the picture nothing is known of light that may be an object's own.
+        return picture[at], ~near | (inside & usable[at] & ~shared), inside & near
 
     def as_frame(self, windows: NDArray[Any]) -> NDArray[Any]:
         """Windows (n, side, side) as a frame of the sensor, (rows, columns)."""

@@ -134,6 +134,11 @@ class Url:
             raise RecordingError(f"cannot read {self}: {error}") from None
         return found
 
+    def _hidden(self, error: BaseException) -> str:
+        """The first line of an error, without what stands behind a question mark: it may be a signature."""
+        text = (str(error) or type(error).__name__).splitlines()[0]
+        return re.sub(r"\?[^\s'\")]*", "", text.replace(self.text, str(self)))
+
     @contextmanager
     def _asked(self) -> Iterator[None]:
         """Turn the exceptions of a file system of fsspec into one error: each file system has its own."""
@@ -147,17 +152,13 @@ class Url:
             if denied or type(error).__name__ in ("NoCredentialsError", "PartialCredentialsError"):
                 why = "no right to read it; give the credentials that its server wants, as AWS_PROFILE for s3"
             elif isinstance(cause, OSError) and not isinstance(cause, FileNotFoundError):
-                why = f"its server does not answer ({_first_line(cause)})"
+                why = f"its server does not answer ({self._hidden(cause)})"
             elif isinstance(error, FileNotFoundError):
-                what = "" if cause is error else f" ({_first_line(cause)})"
+                what = "" if cause is error else f" ({self._hidden(cause)})"
                 why = f"there is no such file, or it may not be listed{what}"
             else:
-                why = _first_line(error)
+                why = self._hidden(error)
             raise RecordingError(f"cannot read {self}: {why}") from None
-
-
-def _first_line(error: BaseException) -> str:
-    return (str(error) or type(error).__name__).splitlines()[0]
 
 
 class RangeFile(io.RawIOBase):

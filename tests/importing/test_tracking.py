@@ -161,6 +161,46 @@ def test_an_object_that_passes_a_faded_one_is_followed_on() -> None:
     assert np.sqrt(np.mean((known.places[:, 0] - film.places[:, 0]) ** 2)) < 0.1
 
 
+def test_an_object_that_leaves_is_said_and_its_window_left_out(walkers: SpotFilm, tmp_path: Path) -> None:
+    rng = np.random.default_rng(2)
+    frames = walkers.frames.copy()
+    rng_noise = rng.normal(size=frames[160:, :, 48:].shape)
+    frames[160:, :, 48:] = np.rint(1000 + 20 * rng_noise).astype(np.uint16)  # the second one is gone
+    source = array_film(frames, "film")
+    rig = parse_rig(first_rig(source, SETTINGS, 'a "quoted" name').text)
+    account = import_film(source, rig, SETTINGS, tmp_path / "a.mcap")
+    assert any("object 2 is not seen in frames 160 to 319" in note for note in account.notes)
+    exposures = list(Recording(tmp_path / "a.mcap").exposures())
+    columns = rig.sensor.shape[1] // 2
+    assert all(each.mask[:, :columns].any() for each in exposures)
+    assert all(each.mask[:, columns:].any() == (k < 20) for k, each in enumerate(exposures))
+
+
+def test_a_drift_of_all_objects_is_said() -> None:
+    rng = np.random.default_rng(2)
+    motion = random_walk(rng, 160, 2, 0.1)
+    motion[..., 0] += 0.08 * np.arange(160)[:, None, None]
+    source = array_film(spot_film(rng, motion, MIDDLES).frames, "film")
+    (note,) = [each for each in first_rig(source, SETTINGS, "film").notes if "drift" in each]
+    assert "by 0.0" in note
+
+
+def test_pixels_beyond_the_picture_are_no_darkness(tmp_path: Path) -> None:
+    """An object at the edge: its window hangs over, and what is there is unknown, not dark."""
+    rng = np.random.default_rng(2)
+    film = spot_film(rng, random_walk(rng, 80, 2, 0.2), np.array([[8.0, 32.0], [70.0, 30.0]]))
+    source = array_film(film.frames[:, :, 4:], "film")
+    settings = replace(SETTINGS, places=((4.0, 32.0), (66.0, 30.0)))
+    rig = parse_rig(first_rig(source, settings, "film").text)
+    import_film(source, rig, settings, tmp_path / "a.mcap")
+    exposures = list(Recording(tmp_path / "a.mcap").exposures())
+    assert any(not each.mask.all() for each in exposures)
+    (estimates,) = run(rig, exposures, ["profile"]).values()
+    errors = np.array([e.path - truth_of(x).path for e, x in zip(estimates, exposures, strict=True)])
+    spread = np.hypot([e.path_sd for e in estimates], truth_of(exposures[0]).path_sd)
+    assert np.mean(np.abs(errors) < 1.96 * spread) > 0.9
+
+
 def test_saturated_pixels_do_not_widen_the_kernel(walkers: SpotFilm) -> None:
     flat = np.minimum(walkers.frames, np.uint16(1700))
     full = np.where(flat == 1700, np.uint16(65535), flat)

@@ -125,6 +125,9 @@ def test_a_server_that_does_not_answer_is_no_missing_file(tmp_path: Path) -> Non
         with pytest.raises(RecordingError, match="its server does not answer") as error:
             Recording(url)
     assert "no such file" not in str(error.value)
+    with pytest.raises(RecordingError) as error:
+        Recording(f"{url}?signature=SECRET")
+    assert "SECRET" not in str(error.value)
 
 
 @pytest.mark.long
