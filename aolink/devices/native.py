@@ -206,6 +206,8 @@ class _Flight:
     """The time at which it was first sent."""
     last_ns: int = 0
     """Time of the last try."""
+    put_off_ns: int = 0
+    """The time at which a try was due and was not sent, because the one before it could still be answered."""
     timeouts: int = 0
     tries: dict[int, int] = field(default_factory=dict)
     """The time at which each try was sent, by the sequence number of its packet."""
@@ -213,10 +215,11 @@ class _Flight:
     def due_ns(self, timeout_ns: int) -> int:
         """The time of the next try: at every time-out; once more just before the first step; seldom once the block is
         over."""
+        since_ns = max(self.last_ns, self.put_off_ns)
         if self.last_ns >= self.over_ns:
-            return self.last_ns + _LATE_TIMEOUTS * timeout_ns
-        due_ns = self.last_ns + timeout_ns
-        return int(self.latest_ns) if self.last_ns < self.latest_ns < due_ns else due_ns
+            return since_ns + _LATE_TIMEOUTS * timeout_ns
+        due_ns = since_ns + timeout_ns
+        return int(self.latest_ns) if since_ns < self.latest_ns < due_ns else due_ns
 
 
 class NativeMirror(_NativeDevice):
@@ -341,8 +344,10 @@ class NativeMirror(_NativeDevice):
                 self.link.lose(PortError(gone))
                 return []
             flight.timeouts += 1
-            if self.link.transport.unsent():  # on a slow line the previous try has not even left
-                flight.last_ns = now_ns
+            # Where the line is slow the previous try has not even left, or its answer is not due yet. A line that is too
+            # busy would become busier with each try.
+            if self.link.transport.unsent() or (now_ns - flight.last_ns) / 1e9 < self.round_trip_s:
+                flight.put_off_ns = now_ns
                 continue
             self.retransmits += 1
             self._send(flight, now_ns)

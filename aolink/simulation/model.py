@@ -54,6 +54,7 @@ class RigPhysics:
         scatter = initial.standard_normal((plant.axes, plant.n_states, 1))
         self._state = plant.initial_mean + (psd_root(plant.initial_covariance) @ scatter)[..., 0]
         self._noise_input = plant.B_w @ psd_root(plant.process_noise)
+        self._transition = np.ascontiguousarray(plant.A.T)
         self._disturbance = DisturbancePlayer(rig, disturbed) if rig.disturbance else None
         self._scene = SceneCamera(rig, seen) if rig.scene else None
         if rig.disturbance and not rig.disturbance.plant_noise:
@@ -109,9 +110,8 @@ class RigPhysics:
         forcing = forcing[..., 0]
         states = np.empty((len(u) + 1, plant.axes, plant.n_states))
         states[0] = self._state
-        transition = np.ascontiguousarray(plant.A.T)
         for k in range(len(u)):
-            np.dot(states[k], transition, out=states[k + 1])
+            np.dot(states[k], self._transition, out=states[k + 1])
             states[k + 1] += forcing[k]
         self._state = states[-1].copy()
         return states

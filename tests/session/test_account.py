@@ -188,6 +188,20 @@ def test_a_slow_line_is_not_flooded(tmp_path: Path) -> None:
     assert run.mirror.round_trip_s == pytest.approx(0.06, rel=0.02)
 
 
+def test_no_block_is_sent_again_before_its_answer_is_due(tmp_path: Path) -> None:
+    """Where the round trip, .8 s, is longer than the longest time-out, only what is sent before the first answer has come
+    is sent again."""
+    rig = rig_with("queue_steps = 4000\nwatchdog_s = 8")
+    hub = SimulatedTimeHub(rig)
+    for way in (hub.to_device["mirror"], hub.to_host["mirror"]):
+        way.latency_ns = 400_000_000
+    run = run_session(hub, rig, tmp_path / "a.mcap", 40)
+    assert run.error is None
+    check_account(run)
+    blocks = run.report.steps_commanded // rig.mirror.block_steps
+    assert run.report.blocks_retransmitted < blocks / 2
+
+
 @pytest.mark.parametrize("loss", [0.0, 0.3])
 def test_a_line_of_921600_baud_carries_what_is_sent_again(loss: float, tmp_path: Path) -> None:
     """A block takes it 5 ms. While the mirror hears nothing for a while, no more piles up than the line can carry."""

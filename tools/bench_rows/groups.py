@@ -9,7 +9,7 @@ ROWS = {
         "frame_synthesis", "diffraction_synthesis", "picture_synthesis", "coupled_exposure", "cost_against_lenslets",
         "turbulence", "zonal_wavefront",
     ),
-    "wire": ("link_throughput", "frame_to_command", "commands_at_1_khz", "slow_estimator"),
+    "wire": ("link_throughput", "frame_to_command", "commands_at_1_khz", "slow_estimator", "live_membrane"),
     "clock": ("host_times",),
     "reach": ("bit_errors", "large_frames", "soak"),
     "devices": ("late_steps", "clock_sd"),

@@ -100,13 +100,19 @@ def view_start(effort: Effort) -> list[Row]:
         pairs = [
             (_until_first_part(path), timed(lambda: _run(sys.executable, "-c", peer))) for _ in range(effort.of(5))
         ]
-    ours, theirs = (statistics.median(each) for each in zip(*pairs, strict=True))
+    ours, theirs = (
+        statistics.median(each) for each in zip(*((took, other) for (took, _), other in pairs), strict=True)
+    )
+    most = max(memory for (_, memory), _ in pairs)
     what = "aolink view of an hour, from its start until the first part is with the viewer"
-    return [one, Row(what, f"{ours:.2f} s", f"limit 2 s; `{peer}` {theirs:.2f} s", 2 / ours, 1.0)]
+    return [
+        one, Row(what, f"{ours:.2f} s", f"limit 2 s; `{peer}` {theirs:.2f} s", 2 / ours, 1.0),
+        Row("its memory until then, at most", f"{most:.0f} MB", "limit 500 MB", 500 / most, 1.0),
+    ]  # fmt: skip
 
 
-def _until_first_part(path: Path) -> float:
-    """Time until the command, on a terminal, says that it has sent the first part, s."""
+def _until_first_part(path: Path) -> tuple[float, float]:
+    """Time until the command, on a terminal, says that it has sent the first part, s, and its largest memory, MB."""
     terminal, its = pty.openpty()
     start = time.perf_counter()
     with subprocess.Popen((*_COMMAND, "view", path, "--web"), stdout=its, stderr=its, stdin=its) as process:
@@ -115,7 +121,9 @@ def _until_first_part(path: Path) -> float:
         try:
             while _FIRST_PART not in said:
                 said += os.read(terminal, 4096)
-            return time.perf_counter() - start
+            took = time.perf_counter() - start
+            status = Path(f"/proc/{process.pid}/status").read_text()
+            return took, int(status.partition("VmHWM:")[2].split()[0]) / 1e3
         finally:
             process.terminate()
             process.wait()

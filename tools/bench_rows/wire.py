@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import multiprocessing
 import os
@@ -123,6 +124,45 @@ def slow_estimator(effort: Effort) -> Row:
         1.0 if with_slow <= lost else lost / with_slow,
         1.0,
     )
+
+
+def live_membrane(effort: Effort) -> Row:
+    """A session in real time of 288 states with three estimators, the simulator on the same cores: how far estimates are
+    behind, and whose processor time it is."""
+    from aolink.jobs.demo import simulated_rig
+    from aolink.rig import load_rig
+    from aolink.session import record
+
+    rig, names = load_rig("membrane-12x12"), ("o3", "moments", "profile")
+    period_ms = 1e3 * rig.timing.frame_period_steps * rig.timing.fast_step_s
+    with tempfile.TemporaryDirectory() as folder, simulated_rig(rig.name, "--real-time") as ports:
+        before, begun_s = _processor_s(), time.monotonic()
+        report = record(rig, *ports, Path(folder) / "a.mcap", estimators=names, exposures=effort.of(100, 4))
+        lasted_s, after = time.monotonic() - begun_s, _processor_s()
+    behind = [(each.estimated_ns - each.complete_ns) / 1e6 for each in report.latencies if each.estimated_ns]
+    skipped = sum(report.exposures_skipped.values())
+    shares = ", ".join(f"{name} {(after[name] - before[name]) / lasted_s:.0%}" for name in after)
+    each_took = ", ".join(f"{name} {statistics.median(each.took_ms):.0f}" for name, each in report.estimation.items())
+    median_ms, worst_ms = statistics.median(behind), max(behind)
+    return Row(
+        f"live session of 288 states, {report.exposures} exposures, {report.frames_lost} lost: first estimate after the"
+        f" frame; of a core: {shares}; an estimate: {each_took} ms; {skipped} skipped",
+        f"{median_ms:.0f} ms, worst {worst_ms:.0f}", f"a frame period, {period_ms:.0f} ms", period_ms / worst_ms, 1.0,
+    )  # fmt: skip
+
+
+def _processor_s() -> dict[str, float]:
+    """Processor time so far, s: of this process; of its children that have ended, which are a session's estimators; and
+    of those that run, which is the simulated rig."""
+    used, tick = os.times(), os.sysconf("SC_CLK_TCK")
+    running = 0.0
+    for path in Path("/proc").glob("[0-9]*/stat"):
+        with contextlib.suppress(OSError):  # a process that has ended meanwhile
+            fields = path.read_text().rpartition(")")[2].split()
+            if int(fields[1]) == os.getpid():
+                running += (int(fields[11]) + int(fields[12])) / tick
+    ended = used.children_user + used.children_system
+    return {"loop": used.user + used.system, "estimators": ended, "simulator": running}
 
 
 def frame_to_command(effort: Effort) -> Row:
