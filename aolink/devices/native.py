@@ -344,7 +344,7 @@ class NativeMirror(_NativeDevice):
                 self.link.lose(PortError(gone))
                 return []
             flight.timeouts += 1
-            # Where the line is slow the previous try has not even left, or its answer is not due yet. A line that is too
+            # On a slow line the previous try has not even left, or its answer is not due yet; and a line that is too
             # busy would become busier with each try.
             if self.link.transport.unsent() or (now_ns - flight.last_ns) / 1e9 < self.round_trip_s:
                 flight.put_off_ns = now_ns

@@ -189,7 +189,7 @@ def test_a_slow_line_is_not_flooded(tmp_path: Path) -> None:
 
 
 def test_no_block_is_sent_again_before_its_answer_is_due(tmp_path: Path) -> None:
-    """Where the round trip, .8 s, is longer than the longest time-out, only what is sent before the first answer has come
+    """Where the round trip, .8 s, is longer than the longest time-out, only what is sent before the first answer comes
     is sent again."""
     rig = rig_with("queue_steps = 4000\nwatchdog_s = 8")
     hub = SimulatedTimeHub(rig)

@@ -217,8 +217,8 @@ def record_long(path: Path, exposures: int, name: str = "section-vi-lively") -> 
 
 
 def reestimation_rate(effort: Effort) -> list[Row]:
-    """o3 over recordings of one axis, of 32, and of 200 outputs of one plant, against reading the same file and decoding
-    its frames, no more."""
+    """o3 over recordings of one axis, of 32, and of 200 outputs of one plant, against reading the same file and
+    decoding its frames, no more."""
     one = _reestimated("re-estimation with o3", "section-vi-lively", effort.of(1500), effort)
     many = _reestimated("re-estimation with o3 of 32 axes", "sh-4x4", effort.of(500), effort)
     coupled = _reestimated(
