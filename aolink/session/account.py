@@ -97,7 +97,8 @@ class Account:
         if ack is not None and ack.code in REFUSALS:
             self._count("steps_refused", steps, steps != _ENDED)
         elif ack is not None:
-            self._count("steps_late", steps[: ack.late_steps], np.isin(steps[: ack.late_steps], (_PASSED, _UNKNOWN)))
+            late = steps[: ack.late_steps]
+            self._count("steps_late", late, (late == _PASSED) | (late == _UNKNOWN))
             self._count("steps_superseded", steps, steps == _PASSED)
             self._count("steps_not_reported", steps, steps == _UNKNOWN)
         if (steps == _ENDED).all():
