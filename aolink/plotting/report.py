@@ -163,7 +163,7 @@ class _Session:
         return said
 
     def scores(self) -> str:
-        """The demo's table."""
+        """The table of scores, which `aolink estimate` prints too."""
         if self.view is None or not self.view.scores:
             return _note(self.problem or "No estimates.")
         return _score_table(self.view.scores)

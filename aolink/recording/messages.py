@@ -6,7 +6,7 @@ from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from google.protobuf.message import Message
 from mcap.records import Attachment, Channel, ChunkIndex, McapRecord, Metadata, Schema
@@ -59,7 +59,7 @@ class RecordedMessages:
     """
 
     def __init__(self, path: str | Path | Url, *, check: bool) -> None:
-        self.path = location(path)
+        self.path: Any = location(path)
         self.metadata: dict[str, str] = {}
         """Facts about the session, from its start and its end."""
         self.end_metadata: dict[str, str] = {}

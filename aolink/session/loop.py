@@ -8,11 +8,8 @@ mirror. The same loop runs in real time and on virtual time; on virtual time it 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import partial
 
-import numpy as np
 from foxglove_schemas_protobuf.Log_pb2 import Log
-from numpy.typing import NDArray
 
 from aolink.assembly import Assembler, Frame
 from aolink.devices.clock import QUERY_PERIOD_S, SUSPICION_PERIOD_S, WARM_UP_QUERIES
@@ -28,13 +25,13 @@ from aolink.devices.interfaces import (
     Vanished,
 )
 from aolink.errors import DeviceError, PortError
-from aolink.estimation import Driver, Estimate
-from aolink.exposure import Exposure
+from aolink.estimation import Driver
 from aolink.recording import topics
 from aolink.recording.writer import RecordingWriter
-from aolink.rig import MirrorDriver, Rig
+from aolink.rig import Rig
 from aolink.session.account import REFUSALS, Account
-from aolink.session.controlling import MARGIN_S, Controlling
+from aolink.session.commanding import Commanding, Inputs, lead_steps
+from aolink.session.controlling import Controlling
 from aolink.session.estimating import Estimating, InTheLoop
 from aolink.session.journal import Journal
 from aolink.session.live import LiveExposures, Show
@@ -42,10 +39,6 @@ from aolink.session.received import ReceivedFrames
 from aolink.session.report import EstimatorReport, LatencyBook, Report
 from aolink.wire import messages_pb2 as wire
 
-LEAD_BLOCKS = 3
-"""Command blocks that are queued on the device ahead of time; in a queue of more than eight blocks, all but five are
-filled."""
-_ROOM_BLOCKS = 5
 _START_DELAY_S = 0.25
 """In real time, the least time from the first command to its first step, s; with a long queue it is the queue's length,
 so that the queue is full then."""
@@ -63,18 +56,6 @@ ESTIMATES_S = 5.0
 """In real time, how long the session's end waits for estimates that are under way, s."""
 _NOT_YET = 1 << 63
 """The first fast step of a session that has not begun."""
-
-
-Inputs = Callable[[int, int], NDArray[np.float64]]
-"""First fast step since the session's start and number of steps -> inputs to command, (n_steps, n_inputs)."""
-
-
-def lead_steps(mirror: MirrorDriver) -> int:
-    """How far ahead of the device commands are sent, fast steps.
-
-    With a queue of more than eight blocks, estimators may take longer than the duration of three blocks.
-    """
-    return max(LEAD_BLOCKS * mirror.block_steps, mirror.queue_steps - _ROOM_BLOCKS * mirror.block_steps)
 
 
 class SessionLoop:
@@ -100,15 +81,12 @@ class SessionLoop:
         self._estimating = beside or InTheLoop(driver)
         if beside is not None:
             self.report.estimation |= {name: EstimatorReport() for name in beside.names}
-        self._inputs = inputs or partial(rig.drive.inputs, fast_step_s=rig.timing.fast_step_s)
         self._controlling = controlling
         if controlling is not None:
             self.report.control = controlling.report
         self._assembler = Assembler(rig)
         self._step_ns = rig.timing.fast_step_ns
         self._first_step = _NOT_YET
-        self._queued_until = 0
-        """First fast step for which no command was sent."""
         self._devices: list[Camera | Mirror] = [camera, mirror] if mirror.commanded else [camera]
         """The devices in the order in which their clocks are queried; the next one first."""
         self._last_query_ns = self._next_statistics_ns = 0
@@ -126,7 +104,10 @@ class SessionLoop:
         self._journal = Journal(writer, self.report, time)
         self._latencies = LatencyBook(self.report, self._journal.latency)
         self._frames = ReceivedFrames(rig, time, camera, mirror, self._journal, self._latencies)
-        control, serves = (None, "") if controlling is None else (self._control, controlling.estimator)
+        self._commanding = Commanding(
+            rig, time, mirror, inputs, controlling, self._assembler, self._account, self._journal, self._latencies
+        )
+        control, serves = (None, "") if controlling is None else (self._commanding.control, controlling.estimator)
         self._live = LiveExposures(rig, time, self._journal, self._latencies, self._estimating, show, control, serves)
 
     def run(self, exposures: int, stop: Callable[[], bool], progress: Callable[[int], None]) -> None:
@@ -139,14 +120,12 @@ class SessionLoop:
         timing, time = self._rig.timing, self._time
         if self._mirror.latched:
             self._rearm("in a session before")
-        self._first_step = self._queued_until = self._start_camera(self._soon, lambda first_step: exposures)
+        self._first_step = self._start_camera(self._soon, lambda first_step: exposures)
         if self._controlling is not None:
             self._controlling.begin(self._first_step)
         if exposures:
             self._end_step = self._first_step + (exposures - 1) * timing.frame_period_steps + timing.exposure_steps
-        # Queued before the first step is due, as far as the queue reaches.
-        reach = self._rig.mirror.queue_steps - lead_steps(self._rig.mirror)
-        self._send_commands(min(self._first_step, self._device_step() + reach))
+        self._commanding.begin(self._first_step, self._end_step)
         self._receive(0.0)
         self._last_frame_ns = time.now_ns()
         self._journal.log(f"session of {exposures or 'unlimited'} exposures from fast step {self._first_step}")
@@ -164,7 +143,7 @@ class SessionLoop:
         """Park the mirror and stop the camera, once; try both even if one cannot be reached."""
         if self._is_safe:
             return
-        self._is_safe = True
+        self._is_safe = self._commanding.ended = True
         try:
             self._parked_from = self._mirror.park()
         finally:
@@ -234,17 +213,6 @@ class SessionLoop:
             " too late: is the line or this machine so slow, do both devices count the same fast steps?"
         )
 
-    def _device_step(self) -> int:
-        """The fast step that the device is in by its clock; on virtual time, the step that it waits at."""
-        if self._time.virtual:
-            return self._queued_until
-        return self._mirror.since_zero_ns(self._time.now_ns()) // self._step_ns
-
-    def _reached_step(self) -> int:
-        """The first fast step that a command which is sent now reaches in time."""
-        margin = 0 if self._time.virtual else round(MARGIN_S * 1e9) // self._step_ns + 1
-        return self._device_step() + margin
-
     def _send_due(self) -> float:
         """Send what is due; gives the time until something is due again, s."""
         time = self._time
@@ -267,13 +235,12 @@ class SessionLoop:
             self._note_statistics(now)
             self._next_statistics_ns = now + round(_STATISTICS_PERIOD_S * 1e9)
         if is_there and not (time.virtual and self._mirror.in_flight):
-            self._send_commands(self._device_step())
+            self._commanding.send(self._live.newest_frame)
         if time.virtual:
             return 0.0
         due = [self._next_query_ns() - now, self._keep_alive_ns() - now]
-        if is_there and self._mirror.commanded and (self._end_step is None or self._queued_until < self._end_step):
-            ahead = self._queued_until - self._device_step() - lead_steps(self._rig.mirror)
-            due.append((max(ahead, 0) + 1) * self._step_ns)
+        if is_there and (due_steps := self._commanding.due_steps()) is not None:
+            due.append(due_steps * self._step_ns)
         if is_there and (due_ns := self._mirror.next_due_ns()) is not None:
             due.append(due_ns - now)
         return max(0, min(due)) / 1e9
@@ -295,7 +262,7 @@ class SessionLoop:
         out = f", {outage_s:.2f} s after its last command" if outage_s else ""
         parked = f"the mirror was parked by its watchdog {when}"
         self._journal.log(f"{parked}: re-armed at fast step {step}{out}", Log.WARNING)
-        self._queued_until = min(self._queued_until, step)  # the queued inputs are dropped
+        self._commanding.go_back_to(step)  # the queued inputs are dropped
 
     def _vanished(self, device: Device, why: str) -> None:
         if device not in self._absent:
@@ -320,8 +287,8 @@ class SessionLoop:
             else:
                 if self._mirror.latched:
                     self._rearm("while its port was gone")
-                self._queued_until = max(self._first_step, self._device_step() + self._rig.mirror.block_steps)
-                self._journal.log(f"commands to the mirror go on from fast step {self._queued_until}")
+                step = self._commanding.go_on()
+                self._journal.log(f"commands to the mirror go on from fast step {step}")
         except PortError:
             self._absent.append(device)  # it has vanished again, and the session waits for it as before
 
@@ -331,7 +298,7 @@ class SessionLoop:
         period = timing.frame_period_steps
 
         def begin() -> int:
-            soon = self._device_step() + round(_START_DELAY_S * 1e9) // self._step_ns
+            soon = self._commanding.device_step() + round(_START_DELAY_S * 1e9) // self._step_ns
             return first + max(0, -(-(soon - first) // period)) * period
 
         def left(first_step: int) -> int:
@@ -343,54 +310,20 @@ class SessionLoop:
         self._frames.camera_restarted()
         self._last_frame_ns = self._time.now_ns()
 
-    def _send_commands(self, device_step: int) -> None:
-        if not self._mirror.commanded:
-            return
-        block_steps, end_step = self._rig.mirror.block_steps, self._end_step
-        lead, control, cause = lead_steps(self._rig.mirror), self._controlling, self._live.newest_frame
-        if control is not None:  # queued inputs are sent anew after each exposure
-            lead, cause = LEAD_BLOCKS * block_steps, control.cause_frame
-        horizon = device_step + lead
-        if control is not None and self._time.virtual:
-            horizon = control.horizon(device_step)
-            end_step = horizon if end_step is None else min(end_step, horizon)
-        elif self._rig.mirror.slew_max_per_s and self._queued_until <= device_step and not self._time.virtual:
-            self._leave_out()
-        while self._queued_until < horizon and (end_step is None or self._queued_until < end_step):
-            first = self._queued_until
-            n_steps = block_steps if end_step is None else min(block_steps, end_step - first)
-            u = control.loop.inputs(first, n_steps) if control else self._inputs(first - self._first_step, n_steps)
-            now = self._time.now_ns()
-            block = self._mirror.send_block(first, u, cause, now)
-            if control is not None:
-                control.commanded(block)
-            self._account.commanded(block)
-            self._assembler.add_command(block)
-            self._journal.record(topics.COMMAND, block, now)
-            self._latencies.sent(block, self._time.now_ns())
-            self._queued_until += n_steps
-
-    def _leave_out(self) -> None:
-        """Leave out inputs that would come too late, so that the slew limit applies from the input that the mirror then
-        holds."""
-        first, step = self._queued_until, self._reached_step()
-        step = step if self._end_step is None else min(step, self._end_step)
-        if step <= first:
-            return
-        held, self._queued_until = self._mirror.go_on_from(first, step), step
-        if self._controlling is not None:
-            self._controlling.loop.commanded(first, held)
-
     def _is_over(self, exposures: int) -> bool:
         if self._time.virtual:
-            return self._end_step is not None and self._queued_until >= self._end_step and not self._mirror.in_flight
+            return (
+                self._end_step is not None
+                and self._commanding.queued_until >= self._end_step
+                and not self._mirror.in_flight
+            )
         now, timing = self._time.now_ns(), self._rig.timing
         if self._absent:
             self._last_frame_ns = now
             return False
         if self._end_step is not None:
             late_step = self._end_step + _GRACE_S * 1e9 / self._step_ns
-            if self.report.exposures >= exposures or self._device_step() > late_step:
+            if self.report.exposures >= exposures or self._commanding.device_step() > late_step:
                 return True
         patience_ns = 3 * timing.frame_period_steps * self._step_ns + (_GRACE_S + _START_DELAY_S) * 1e9
         # A camera and a mirror of one device are held up together, and the mirror is waited for that long.
@@ -421,7 +354,7 @@ class SessionLoop:
 
     def _collect_reports(self) -> None:
         """Request the reports that have not come, now that the mirror is parked."""
-        end, now = self._queued_until, self._time.now_ns()
+        end, now = self._commanding.queued_until, self._time.now_ns()
         end = end if self._parked_from is None else min(end, self._parked_from)
         self._take(self._mirror, self._mirror.await_reports(end, now), now)
         while (due_ns := self._mirror.next_due_ns()) is not None:
@@ -459,19 +392,6 @@ class SessionLoop:
         else:
             self._last_frame_ns = receive_ns
             self._live.take(self._assembler.add_frame(frame), receive_ns)
-
-    def _control(self, exposure: Exposure, estimate: Estimate | None, log_time_ns: int) -> None:
-        """Let the controller change the inputs that are not due yet: they are sent anew, and supersede the queued
-        ones."""
-        if self._controlling is None or self._is_safe:
-            return
-        change = self._controlling.see(exposure, estimate, self._reached_step())
-        if (first_step := change.first_step) < self._queued_until:
-            # No later than the first changed step: the limits apply from the input that the controller continues from.
-            self._queued_until = min(first_step, max(self._device_step() + 1, self._mirror.withdraw(first_step)))
-        self._journal.record(topics.CONTROL, change.message, log_time_ns)
-        if change.warning:
-            self._journal.warn(change.warning)
 
     def _take_applied(self, applied: wire.Applied, receive_ns: int) -> None:
         self._journal.record(topics.APPLIED, applied, receive_ns)
