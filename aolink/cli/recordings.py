@@ -194,7 +194,7 @@ def _estimate_many(
 
                 done = _printed(run_on(scheduler, todo, stop=stop, progress=tell))
             else:
-                done = _printed(batch.run(todo, workers, stop=stop, progress=tell))
+                done = _printed(batch.run_here(todo, workers, stop=stop, progress=tell))
         rows = batch.table_rows(done, None if side else folder)
         fill_table(partial, rows, table.suffix)
         if side and table.suffix == ".parquet":

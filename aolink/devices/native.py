@@ -109,10 +109,21 @@ class _NativeDevice:
         exchange = ClockExchange(sent_ns, reply.device_receive_ns, reply.device_send_ns, receive_ns)
         return [ClockSampled.add(self.clock, exchange, usable=usable)]
 
-    @staticmethod
-    def _say(event: pb.Event) -> list[Event]:
-        event.text = printable(event.text)
-        return [event]
+    def handle(self, received: Received) -> list[Event]:
+        """The events that follow from a message."""
+        message, receive_ns = received.message, received.receive_ns
+        if self.port.away:
+            return self._come_back(message, receive_ns)
+        if not self._gate.passes(self.link, message, receive_ns):
+            return []
+        if isinstance(message, pb.Event):
+            message.text = printable(message.text)
+            return [message]
+        return self._take(message, receive_ns)
+
+    def _take(self, message: Message, receive_ns: int) -> list[Event]:
+        """The events that follow from a message of this kind of device."""
+        raise NotImplementedError
 
     def _request(
         self,
@@ -166,14 +177,9 @@ class NativeCamera(_NativeDevice):
     def _broken_off(self) -> list[Frame]:
         return self._frames.flush()
 
-    def handle(self, received: Received) -> list[Event]:
-        message = received.message
-        if self.port.away:
-            return self._come_back(message, received.receive_ns)
-        if not self._gate.passes(self.link, message, received.receive_ns):
-            return []
+    def _take(self, message: Message, receive_ns: int) -> list[Event]:
         if isinstance(message, pb.FrameChunk):
-            frames = self._frames.add(message, received.receive_ns)
+            frames = self._frames.add(message, receive_ns)
             for frame in frames:
                 self._gate.check_frame(self.link.name, frame)
             return list(frames)
@@ -186,9 +192,7 @@ class NativeCamera(_NativeDevice):
                 return []
             self._gate.check_truth(self.link.name, truth, message.frame_id)
             return [truth]
-        if isinstance(message, pb.ClockReply):
-            return self._sample_clock(message, received.receive_ns)
-        return self._say(message) if isinstance(message, pb.Event) else []
+        return self._sample_clock(message, receive_ns) if isinstance(message, pb.ClockReply) else []
 
 
 @dataclass(slots=True)
@@ -381,21 +385,16 @@ class NativeMirror(_NativeDevice):
         self._reports.ask_anew(now_ns)
         self.latched, self.outage_s, self._answered_ns = self.identity.mirror.latched, 0.0, None
 
-    def handle(self, received: Received) -> list[Event]:
-        message = received.message
-        if self.port.away:
-            return self._come_back(message, received.receive_ns)
-        if not self._gate.passes(self.link, message, received.receive_ns):
-            return []
+    def _take(self, message: Message, receive_ns: int) -> list[Event]:
         if isinstance(message, pb.CommandAck):
-            return self._take_ack(message, received.receive_ns)
+            return self._take_ack(message, receive_ns)
         if isinstance(message, pb.Applied):
-            return list(self._reports.take(message, received.receive_ns))
+            return list(self._reports.take(message, receive_ns))
         if isinstance(message, pb.ClockReply):
             # While a block is sent again the line is busy in one direction, so such a sample is useless.
             clean = all(len(flight.tries) == 1 for flight in self._flights.values())
-            return self._sample_clock(message, received.receive_ns, usable=clean)
-        return self._say(message) if isinstance(message, pb.Event) else []
+            return self._sample_clock(message, receive_ns, usable=clean)
+        return []
 
     def _take_ack(self, ack: pb.CommandAck, receive_ns: int) -> list[Event]:
         flight = self._flights.get(ack.block_id) or self._withdrawn.get(ack.block_id)

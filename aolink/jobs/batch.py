@@ -260,7 +260,7 @@ def absolute(source: str) -> str:
     return source if isinstance(location(source), Url) else str(Path(source).absolute())
 
 
-def run(
+def run_here(
     todo: Sequence[Job | SideJob],
     workers: int,
     *,

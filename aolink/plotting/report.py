@@ -6,6 +6,7 @@ import base64
 import io
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from html import escape
 from importlib.metadata import version
 from pathlib import Path
@@ -162,7 +163,7 @@ class _Session:
         return said
 
     def scores(self) -> str:
-        """The demo's table."""
+        """The table of scores, which `aolink estimate` prints too."""
         if self.view is None or not self.view.scores:
             return _note(self.problem or "No estimates.")
         return _score_table(self.view.scores)
@@ -197,37 +198,12 @@ class _Session:
         caption = f"The picture of exposure {number}."
         return self.drawn(_WIDE, caption, lambda _, figure: plot_scene(self.recording, number, figure))
 
-    def blur(self) -> str:
-        return self.drawn(
-            _NARROW, "The camera's blur, and the positions of the spot.",
-            lambda view, figure: plot_blur(view, figure.subplots(), unit=self.unit),
-        )  # fmt: skip
-
-    def nis(self) -> str:
-        return self.drawn(
-            _NARROW, "NIS of each estimator; dashed: the bounds of 95 % of a consistent estimator's values.",
-            lambda view, figure: plot_nis(view, figure.subplots(), unit=self.unit),
-        )  # fmt: skip
-
-    def errors(self) -> str:
-        return self.drawn(
-            _NARROW, "Error of the path against the truth, a running mean.",
-            lambda view, figure: plot_errors(view, figure.subplots(), unit=self.unit),
-        )  # fmt: skip
-
-    def losses(self) -> str:
-        if self.view is not None and not incidents(self.view):
+    def over_session(self, title: str) -> str:
+        """One of the figures `_OVER_SESSION`."""
+        if title == "Losses" and self.view is not None and not incidents(self.view):
             return _note("No frame was lost or incomplete, no exposure was gated or skipped.")
-        return self.drawn(
-            _NARROW, "What was lost, gated or skipped, and when.",
-            lambda view, figure: plot_losses(view, figure.subplots(), unit=self.unit),
-        )  # fmt: skip
-
-    def latencies(self) -> str:
-        return self.drawn(
-            _NARROW, "When each step of the loop was done, and how long an estimate took (dashed).",
-            lambda view, figure: plot_latency(view, figure.subplots(), unit=self.unit),
-        )  # fmt: skip
+        caption, plot = _OVER_SESSION[title]
+        return self.drawn(_NARROW, caption, lambda view, figure: plot(view, figure.subplots(), unit=self.unit))
 
     def pupil(self) -> str:
         """Maps over the lenslets."""
@@ -237,14 +213,16 @@ class _Session:
         )  # fmt: skip
 
 
-_OVER_SESSION = {
-    "Blur and paths": _Session.blur,
-    "Consistency": _Session.nis,
-    "Errors": _Session.errors,
-    "Losses": _Session.losses,
-    "Latencies": _Session.latencies,
-}
-"""Figures over the session, by their titles."""
+_OVER_SESSION: dict[str, tuple[str, Callable[..., Any]]] = {
+    "Blur and paths": ("The camera's blur, and the positions of the spot.", plot_blur),
+    "Consistency": (
+        "NIS of each estimator; dashed: the bounds of 95 % of a consistent estimator's values.", plot_nis
+    ),
+    "Errors": ("Error of the path against the truth, a running mean.", plot_errors),
+    "Losses": ("What was lost, gated or skipped, and when.", plot_losses),
+    "Latencies": ("When each step of the loop was done, and how long an estimate took (dashed).", plot_latency),
+}  # fmt: skip
+"""Captions of the figures over the session and the functions that draw them, by their titles."""
 
 
 def _page(sessions: Sequence[_Session]) -> str:
@@ -258,7 +236,11 @@ def _page(sessions: Sequence[_Session]) -> str:
     if many:
         parts.append("<h2>Each of them</h2>")
         for each in sessions:
-            parts += [each.title(), *map(_note, each.lacks()), _row([each.blur(), each.scores()])]
+            parts += [
+                each.title(),
+                *map(_note, each.lacks()),
+                _row([each.over_session("Blur and paths"), each.scores()]),
+            ]
     else:
         parts.extend(_sections(sessions))
     body = "\n".join(parts)
@@ -280,11 +262,11 @@ def _sections(sessions: Sequence[_Session]) -> Iterable[str]:
     yield beside("The estimates", _Session.scores)
     yield beside("Inside the most telling exposures", _Session.exposures)
     if one:
-        figures = [draw(sessions[0]) for draw in _OVER_SESSION.values()]
+        figures = [sessions[0].over_session(title) for title in _OVER_SESSION]
         yield "<h2>Over the session</h2>" + _row(figures, "row pairs")
     else:
-        for title, draw in _OVER_SESSION.items():
-            yield beside(title, draw)
+        for title in _OVER_SESSION:
+            yield beside(title, partial(_Session.over_session, title=title))
     if any(has_pupil(each.recording) for each in sessions):
         yield beside("Over the pupil", _Session.pupil)
     if any(each.recording.rig.scene is not None or topics.RESTORATION in each.recording.counts for each in sessions):

@@ -22,7 +22,8 @@ from aolink.numerics.workers import processes
 from aolink.optics.scene import scene_motion
 from aolink.recording import convert, schemas_pb2, topics
 from aolink.recording.editing import RecordingCopy, recorded_estimate
-from aolink.recording.reader import RawMessage, Recording
+from aolink.recording.messages import RawMessage
+from aolink.recording.reader import Recording
 from aolink.recording.reestimate import check_has_exposures, reestimated
 from aolink.restoration import RestoredPictures, deblur, find_method
 from aolink.restoration.deblur import blurred_psnr, psnr

@@ -23,7 +23,8 @@ from aolink.files import open_unfinished, writing
 from aolink.recording import convert, topics
 from aolink.recording.lead import Lead
 from aolink.recording.mcap_file import McapFile, WriteOptions, schema_of
-from aolink.recording.reader import RawMessage, Recording, in_time
+from aolink.recording.messages import RawMessage, in_time
+from aolink.recording.reader import Recording
 from aolink.recording.scan import Loss
 from aolink.recording.writer import begin_recording
 

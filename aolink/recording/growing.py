@@ -11,7 +11,8 @@ from mcap.records import Message as McapMessage
 from aolink import files
 from aolink.errors import RecordingError
 from aolink.recording import topics
-from aolink.recording.reader import RawMessage, Recording
+from aolink.recording.messages import RawMessage
+from aolink.recording.reader import Recording
 from aolink.recording.remote import Url, location
 from aolink.recording.scan import MAGIC, Loss, grown, open_recording
 from aolink.rig import Rig

@@ -1,4 +1,4 @@
-"""The reader of recordings: messages, exposures, estimates."""
+"""The reader of recordings: decoded messages, exposures that are made of them, estimates."""
 
 from __future__ import annotations
 
@@ -6,30 +6,27 @@ import hashlib
 import heapq
 import json
 from collections import deque
-from collections.abc import Collection, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
 from functools import cached_property, lru_cache
 from itertools import count, islice
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple, overload
+from typing import TYPE_CHECKING, overload
 
 import numpy as np
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from google.protobuf.message import DecodeError, Message
-from mcap.records import Attachment, Channel, ChunkIndex, McapRecord, Metadata, Schema
-from mcap.records import Message as McapMessage
 from numpy.typing import NDArray
 
 from aolink.errors import RecordingError, RigError
 from aolink.estimation import Estimate, ExposureModel, exposure_model
 from aolink.exposure import Exposure
-from aolink.limits import Budget, exceeded, limits, load_array
+from aolink.limits import load_array
 from aolink.recording import convert, schemas_pb2, topics
 from aolink.recording.exposures import Companions, ExposureAssembly
 from aolink.recording.frame_index import FrameIndex, StepRun
-from aolink.recording.mcap_file import unsealed
-from aolink.recording.remote import Url, location, only_paths
-from aolink.recording.scan import Loss, Summary, chunk_at, open_recording, read_summary, record_at, scan
+from aolink.recording.messages import END_OF_TIME, RawMessage, RecordedMessage, RecordedMessages, in_time
+from aolink.recording.remote import Url, only_paths
+from aolink.recording.scan import Loss, open_recording, read_summary
 from aolink.recording.slices import RecordingSlice
 from aolink.recording.sound import what_is_wrong
 from aolink.rig import Rig, parse_rig
@@ -40,40 +37,8 @@ from aolink.wire.runs_pb2 import Run
 if TYPE_CHECKING:
     from aolink.restoration import RestoredPictures
 
-_END_OF_TIME = 1 << 64
-"""After every log time, ns."""
 
-
-@dataclass(frozen=True, slots=True)
-class RecordedMessage:
-    """A message of a recording."""
-
-    topic: str
-    log_time_ns: int
-    """Log time: the host's clock when the message came, ns."""
-    sequence: int
-    """Order in the file, from 1."""
-    message: Message
-
-
-class RawMessage(NamedTuple):
-    """A message of a recording as bytes."""
-
-    topic: str
-    schema: str
-    """Full name of its type."""
-    log_time_ns: int
-    sequence: int
-    data: bytes
-
-    @classmethod
-    def of(cls, topic: str, message: Message, log_time_ns: int, sequence: int = 0) -> RawMessage:
-        """The bytes of a message as it is written: the same fields always give the same bytes."""
-        data = message.SerializeToString(deterministic=True)
-        return cls(topic, message.DESCRIPTOR.full_name, log_time_ns, sequence, data)
-
-
-class Recording(Series):
+class Recording(RecordedMessages, Series):
     """A recording on disk, read piece by piece, so files may be larger than the memory.
 
     It is a series of exposures: a loop over it gives them, and so do its length, numbers and slices. The numbers are
@@ -81,9 +46,6 @@ class Recording(Series):
 
     A complete file is read by its index. One that was cut off or damaged is scanned for its undamaged parts; `losses`
     lists the others.
-
-    A subclass that finds its messages in another way gives `survey` and `own_messages`, and tells of what it finds with
-    ``channels``, `note_metadata` and `lose`.
 
     Parameters
     ----------
@@ -114,35 +76,12 @@ class Recording(Series):
         check: bool = False,
         side: Sequence[str | Path | Url] = (),
     ) -> None:
-        self.path = location(path)
-        self.metadata: dict[str, str] = {}
-        """Facts about the session, from its start and its end."""
-        self.end_metadata: dict[str, str] = {}
-        """Facts from the session's end alone."""
-        self.attachments: dict[str, bytes] = {}
-        """Attachments by name, among them the rig file and the exposure basis."""
-        self.counts: dict[str, int] = {}
-        """Number of messages by topic."""
-        self.start_ns = self.end_ns = 0
-        """Log times of the first and of the last message."""
-        self._losses: dict[int, Loss] = {}
-        self._unusable: dict[tuple[str, str], dict[tuple[int, int], int]] = {}
-        """Messages that are not of their kind, by topic and kind of error: sequence, log time and length."""
-        self.channels: dict[int, tuple[str, str]] = {}
-        """Topic and name of the schema, by the channel's id."""
-        self.schemas: dict[str, Schema] = {}
-        """Schemas by name, as they are in the file."""
-        self.encodings: dict[str, str] = {}
-        """Encoding of the messages by topic, where the file states it."""
-        self._index: list[ChunkIndex] | None = None
-        self._index_digest: str | None = None
-        self._left_out: frozenset[str] = frozenset()
-        """Topics that are read from side files instead."""
-        self._second_rig_text: str | None = None
-        rig_text = self.survey(check=check)
+        super().__init__(path, check=check)
+        rig_text = self.rig_text
         if rig_text is None:
             raise RecordingError(f"{self.path} is an MCAP file but not a recording of aolink: it holds no rig file")
-        self._rig_text = rig_text
+        self._unusable: dict[tuple[str, str], dict[tuple[int, int], int]] = {}
+        """Messages that are not of their kind, by topic and kind of error: sequence, log time and length."""
         try:
             recorded_rig = _parsed_rig(rig_text)
         except RigError as error:
@@ -159,8 +98,9 @@ class Recording(Series):
 
     @property
     def losses(self) -> list[Loss]:
-        """The parts that could not be read, so far as the file has been read, in the order of the file."""
-        found = [self._losses[offset] for offset in sorted(self._losses)]
+        """The parts that could not be read, so far as the file has been read, in the order of the file; messages that
+        are not of their kind come after them."""
+        found = super().losses
         for (topic, wrong), messages in self._unusable.items():
             times = [time_ns for _, time_ns in messages]
             what = f"{len(messages)} message(s) on {topic} {wrong}"
@@ -168,39 +108,22 @@ class Recording(Series):
         return found + [loss for each in self._side for loss in each.losses]
 
     @property
-    def damage(self) -> str:
-        """The reason why the file cannot be read whole, in words; empty where it can."""
-        losses = self.losses
-        more = f" and {len(losses) - 1} more" if len(losses) > 1 else ""
-        return f"{losses[0].what}{more}" if losses else ""
-
-    @property
-    def complete(self) -> bool:
-        """Whether the file ends as a recording should."""
-        return not self.damage
-
-    @property
     def files(self) -> list[Path]:
         """The files of this machine that it is read from: no file made from it may replace them."""
         return only_paths([self.path, *(side.path for side in self._side)])
 
     @cached_property
-    def size(self) -> int:
-        """Bytes of the file."""
-        return self.path.size if isinstance(self.path, Url) else self.path.stat().st_size
-
-    @cached_property
     def digest(self) -> str:
         """The name of the recording in side files: SHA-256 of its index, which has the place and the length of all
         records. Where there is no index, it is that of the results of a scan: rig, session, times and counts."""
-        if self._index_digest is None:
+        if self.index_digest is None:
             with open_recording(self.path) as file:
                 summary = read_summary(file)
             if summary is not None and summary.is_index:
-                self._index_digest = summary.digest
-        if self._index_digest is not None:
-            return self._index_digest
-        facts = [self._rig_text, self.metadata.get("session"), self.start_ns, self.end_ns, sorted(self.counts.items())]
+                self.index_digest = summary.digest
+        if self.index_digest is not None:
+            return self.index_digest
+        facts = [self.rig_text, self.metadata.get("session"), self.start_ns, self.end_ns, sorted(self.counts.items())]
         return hashlib.sha256(json.dumps(facts).encode()).hexdigest()
 
     @property
@@ -234,7 +157,7 @@ class Recording(Series):
         """The exposure model that expands the recorded coefficients into paths."""
         return exposure_model(self.rig.plant, self.rig.timing.exposure_steps)
 
-    def messages(self, *wanted: str, start_ns: int = 0, end_ns: int = _END_OF_TIME) -> Iterator[RecordedMessage]:
+    def messages(self, *wanted: str, start_ns: int = 0, end_ns: int = END_OF_TIME) -> Iterator[RecordedMessage]:
         """The messages of some topics (of all, if none is named) in the order in which they were recorded.
 
         With ``start_ns`` (inclusive) and ``end_ns`` (exclusive) only those whose log time is between them; with
@@ -272,7 +195,7 @@ class Recording(Series):
         return None if what_is_wrong(run, self.rig) else run
 
     def raw_messages(
-        self, *wanted: str, start_ns: int = 0, end_ns: int = _END_OF_TIME, first_chunk: int = 0
+        self, *wanted: str, start_ns: int = 0, end_ns: int = END_OF_TIME, first_chunk: int = 0
     ) -> Iterator[RawMessage]:
         """The messages as bytes, with those of other software too, selected as by `messages`; with an index, from one
         of its chunks on."""
@@ -282,21 +205,6 @@ class Recording(Series):
         others = (each.raw_messages(*wanted, start_ns=start_ns, end_ns=end_ns) for each in self._side)
         timed = heapq.merge(*map(in_time, (own, *others)), key=lambda each: each[0])
         return (raw for _, raw in timed)
-
-    def own_messages(
-        self, wanted: Collection[str], low: int = 0, high: int = _END_OF_TIME, chunks: slice = slice(None)
-    ) -> Iterator[RawMessage]:
-        """The messages of the file itself, as bytes: those of these topics (of all, if none is named) whose log time is
-        from ``low`` to below ``high``; with an index, only those in these of its chunks."""
-        channels = {
-            k: names
-            for k, names in self.channels.items()
-            if (not wanted or names[0] in wanted) and names[0] not in self._left_out
-        }
-        for record in self._records(channels, low, high, chunks):
-            if isinstance(record, McapMessage) and record.channel_id in channels and low <= record.log_time < high:
-                topic, schema = channels[record.channel_id]
-                yield RawMessage(topic, schema, record.log_time, record.sequence, record.data)
 
     def __len__(self) -> int:
         return self.n_frames
@@ -386,10 +294,10 @@ class Recording(Series):
     @cached_property
     def _frame_index(self) -> FrameIndex | None:
         """The index of frames; None where the file has no index, or one without the messages' places."""
-        if self._index is None or self._losses or self.counts.get(topics.EXPOSURE) != self.n_frames:
+        if self.chunk_index is None or self.lost or self.counts.get(topics.EXPOSURE) != self.n_frames:
             return None
         frames = {channel for channel, (topic, _) in self.channels.items() if topic == topics.EXPOSURE}
-        index = FrameIndex.of(self._index, frames)
+        index = FrameIndex.of(self.chunk_index, frames)
         return index if index is not None and index.before[-1] == self.n_frames else None
 
     def _runs_in(self, chunk: int) -> Iterator[StepRun]:
@@ -491,118 +399,20 @@ class Recording(Series):
                 " give those of one"
             )
         replaced = {topics.estimate_topic(name) for each in self._side for name in each.estimators}
-        other_rig = self._side[0].rig.toml != self._rig_text
+        other_rig = self._side[0].rig.toml != self.rig_text
         own = {topic for topic in self.counts if topic.startswith(topics.ESTIMATE)}
         gone = own if other_rig else own & replaced
         # Pictures were restored with some of these estimates; only reading all of them would show which.
-        self._left_out = frozenset(
+        self.left_out = frozenset(
             {*gone, *(topics.estimation_topic(topic.removeprefix(topics.ESTIMATE)) for topic in gone)}
             | {topic for topic in self.counts if gone and topic.startswith(topics.RESTORED)}
         )
-        self.counts = {topic: count for topic, count in self.counts.items() if topic not in self._left_out}
+        self.counts = {topic: count for topic, count in self.counts.items() if topic not in self.left_out}
         for each in self._side:
             self.counts |= each.counts
             self.schemas = each.schemas | self.schemas
             self.encodings |= each.encodings
         self.rig, self.rig_is_recorded = self._side[0].rig, True
-
-    def survey(self, *, check: bool) -> str | None:
-        """Find out what is in the file: from its index, or else by a scan. Gives the text of the rig file."""
-        with open_recording(self.path) as file:
-            summary = None if check else read_summary(file)
-        held: dict[int, int] = {}
-        """Number of messages by the channel's id."""
-        if summary is not None and summary.is_index and (known := summary.statistics) is not None:
-            self._index_digest = summary.digest
-            self._index, held = summary.chunks, dict(sorted(known.channel_message_counts.items()))
-            self.start_ns, self.end_ns = known.message_start_time, known.message_end_time
-            records = self._summarised(summary)
-        else:
-            records = self._scanned()
-        ids: dict[int, str] = {}
-        noted: list[Metadata] = []
-        for record, sure in records:
-            if isinstance(record, McapMessage):
-                self.start_ns = min(self.start_ns, record.log_time) if held else record.log_time
-                self.end_ns = max(self.end_ns, record.log_time)
-                held[record.channel_id] = held.get(record.channel_id, 0) + 1
-            elif isinstance(record, Schema):
-                if sure or record.id not in ids:
-                    ids[record.id] = record.name
-                    self.schemas[record.name] = record
-            elif isinstance(record, Channel):
-                before = self.channels.get(record.id)
-                if sure or before is None:  # its schema may have been in a chunk that is lost
-                    kind = ids.get(record.schema_id, before[1] if before else "")
-                    self.channels[record.id] = (record.topic, kind)
-                    self.encodings[record.topic] = record.message_encoding
-            elif isinstance(record, Attachment):
-                self._attach(record)
-            elif isinstance(record, Metadata):
-                noted.append(record)
-        self.note_metadata(noted)
-        for channel_id, number in held.items():
-            if channel_id in self.channels:
-                self.counts[self.channels[channel_id][0]] = number
-        attached = self.attachments.get(topics.RIG_ATTACHMENT)
-        return self._second_rig_text if attached is None else attached.decode(errors="replace")
-
-    def _summarised(self, summary: Summary) -> Iterator[tuple[McapRecord, bool]]:
-        """Read the attachments and metadata that the index names, and check that they are undamaged."""
-        for record in (*summary.schemas.values(), *summary.channels.values()):
-            yield record, True
-        others = sorted(summary.others, key=lambda each: each.offset)
-        with open_recording(self.path, [(each.offset, each.length) for each in others]) as file:
-            for each in others:
-                if (found := record_at(file, each, self.lose)) is not None:
-                    yield found, True
-
-    def _attach(self, record: Attachment) -> None:
-        self.attachments[record.name] = record.data
-        if (held := sum(map(len, self.attachments.values()))) > limits().attachment_bytes:
-            raise exceeded(f"{self.path} holds attachments of {held} bytes", "attachment_bytes")
-
-    def note_metadata(self, records: Sequence[Metadata]) -> None:
-        """Keep the facts in the file's metadata."""
-        for name, values in unsealed(records):
-            if values is None:
-                self._losses[-1 - len(self._losses)] = Loss(0, 0, f"the metadata {name!r} is damaged")
-            elif name in (topics.SESSION_METADATA, topics.END_METADATA):
-                self.metadata.update(values)
-                if name == topics.END_METADATA:
-                    self.end_metadata.update(values)
-            elif name == topics.RIG_METADATA:
-                self._second_rig_text = values.get("toml", self._second_rig_text)
-            elif name == topics.CHANNEL_METADATA and values.get("id", "").isdigit():
-                number = int(values["id"])
-                # The chunk that names the channel, or the one that holds its schema, may be lost.
-                if not self.channels.get(number, ("", ""))[1]:
-                    self.channels[number] = (values.get("topic", ""), values.get("schema", ""))
-
-    def _records(self, channels: Collection[int], low: int, high: int, chunks: slice) -> Iterator[McapRecord]:
-        """Records in the order of the file, at least all messages of some channels between two log times."""
-        if self._index is None:
-            for record, _ in self._scanned():
-                yield record
-            return
-        wanted = [
-            index
-            for index in self._index[chunks]
-            if not (index.message_end_time < low or index.message_start_time >= high)
-            and (not (held := index.message_index_offsets) or not held.keys().isdisjoint(channels))
-        ]
-        budget = Budget(str(self.path), self.size)
-        with open_recording(self.path, [(each.chunk_start_offset, each.chunk_length) for each in wanted]) as file:
-            for index in wanted:
-                yield from chunk_at(file, index, self.lose, budget)
-
-    def _scanned(self) -> Iterator[tuple[McapRecord, bool]]:
-        with open_recording(self.path) as file:
-            yield from scan(file, self.lose)
-
-    def lose(self, loss: Loss) -> None:
-        """Add to `losses`; of several at one place, the first counts."""
-        self._losses.setdefault(loss.offset, loss)
 
 
 @lru_cache(maxsize=8)
@@ -634,14 +444,6 @@ def check_stands_alone(recording: Recording) -> None:
             f"{recording.path} is a side file with the estimates of {name} alone: give {name}, and after it this file"
             " where the command takes side files"
         )
-
-
-def in_time(messages: Iterator[RawMessage]) -> Iterator[tuple[int, RawMessage]]:
-    """Messages with a time that never goes back, so that their order stays."""
-    latest = 0
-    for raw in messages:
-        latest = max(latest, raw.log_time_ns)
-        yield latest, raw
 
 
 def _restored(info: schemas_pb2.Restoration, pictures: dict[str, RawImage]) -> RestoredPictures:

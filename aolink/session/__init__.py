@@ -24,10 +24,12 @@ from aolink.recording.mcap_file import WriteOptions
 from aolink.recording.writer import RecordingWriter
 from aolink.rig import Drive, Rig
 from aolink.rig.scene_table import read_scene_picture
+from aolink.session.commanding import Inputs
 from aolink.session.controlling import Controlling, facts
 from aolink.session.estimating import BesideTheLoop, Outcome
 from aolink.session.excitation import Excitation
-from aolink.session.loop import ESTIMATES_S, Inputs, SessionLoop, Show
+from aolink.session.live import Show
+from aolink.session.loop import ESTIMATES_S, SessionLoop
 from aolink.session.report import EstimatorReport, Report
 from aolink.session.waiting import Aside, most_waiting
 

@@ -18,8 +18,9 @@ from aolink.estimation import Driver
 from aolink.files import check_target
 from aolink.rig import Rig
 from aolink.session import at_rest, controller
+from aolink.session.commanding import Inputs
 from aolink.session.excitation import Excitation, check_inputs
-from aolink.session.loop import ANSWER_NS, Inputs
+from aolink.session.loop import ANSWER_NS
 
 _RECORD_BYTES = 3000
 """The most bytes that an exposure takes in a recording beside its picture and inputs."""

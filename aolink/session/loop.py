@@ -8,13 +8,8 @@ mirror. The same loop runs in real time and on virtual time; on virtual time it 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
-from functools import partial
 
-import numpy as np
 from foxglove_schemas_protobuf.Log_pb2 import Log
-from google.protobuf.message import Message
-from numpy.typing import NDArray
 
 from aolink.assembly import Assembler, Frame
 from aolink.devices.clock import QUERY_PERIOD_S, SUSPICION_PERIOD_S, WARM_UP_QUERIES
@@ -30,22 +25,20 @@ from aolink.devices.interfaces import (
     Vanished,
 )
 from aolink.errors import DeviceError, PortError
-from aolink.estimation import Driver, Estimate
-from aolink.exposure import Exposure, Picture
-from aolink.recording import convert, topics
-from aolink.recording import schemas_pb2 as pb
+from aolink.estimation import Driver
+from aolink.recording import topics
 from aolink.recording.writer import RecordingWriter
-from aolink.rig import MirrorDriver, Rig
+from aolink.rig import Rig
 from aolink.session.account import REFUSALS, Account
-from aolink.session.controlling import MARGIN_S, Controlling
-from aolink.session.estimating import Estimating, InTheLoop, Outcome
+from aolink.session.commanding import Commanding, Inputs, lead_steps
+from aolink.session.controlling import Controlling
+from aolink.session.estimating import Estimating, InTheLoop
+from aolink.session.journal import Journal
+from aolink.session.live import LiveExposures, Show
+from aolink.session.received import ReceivedFrames
 from aolink.session.report import EstimatorReport, LatencyBook, Report
 from aolink.wire import messages_pb2 as wire
 
-LEAD_BLOCKS = 3
-"""Command blocks that are queued on the device ahead of time; in a queue of more than eight blocks, all but five are
-filled."""
-_ROOM_BLOCKS = 5
 _START_DELAY_S = 0.25
 """In real time, the least time from the first command to its first step, s; with a long queue it is the queue's length,
 so that the queue is full then."""
@@ -61,26 +54,8 @@ _OUTAGE_WATCHDOGS = 2.0
 """A mirror that was out of reach for more than this many times its watchdog's time is not re-armed."""
 ESTIMATES_S = 5.0
 """In real time, how long the session's end waits for estimates that are under way, s."""
-_ALIGNED = 0.2
-"""Largest standard deviation of an exposure's alignment without a warning, as a part of the exposure: estimates'
-intervals hold up to there."""
 _NOT_YET = 1 << 63
 """The first fast step of a session that has not begun."""
-
-
-Inputs = Callable[[int, int], NDArray[np.float64]]
-"""First fast step since the session's start and number of steps -> inputs to command, (n_steps, n_inputs)."""
-
-Show = Callable[[Exposure, Sequence[Outcome]], None]
-"""A function that gets each exposure, with the estimates that have come since the one before; it must not take time."""
-
-
-def lead_steps(mirror: MirrorDriver) -> int:
-    """How far ahead of the device commands are sent, fast steps.
-
-    With a queue of more than eight blocks, estimators may take longer than the duration of three blocks.
-    """
-    return max(LEAD_BLOCKS * mirror.block_steps, mirror.queue_steps - _ROOM_BLOCKS * mirror.block_steps)
 
 
 class SessionLoop:
@@ -103,28 +78,15 @@ class SessionLoop:
         self.report = report or Report()
         self.report.virtual_time = time.virtual
         self._rig, self._time, self._camera, self._mirror = rig, time, camera, mirror
-        self._writer, self._estimating = writer, beside or InTheLoop(driver)
+        self._estimating = beside or InTheLoop(driver)
         if beside is not None:
             self.report.estimation |= {name: EstimatorReport() for name in beside.names}
-        self._unsettled: dict[int, list[Outcome]] = {}
-        """Outcomes so far of the exposures that some estimators are still working on, by frame."""
-        self._show = show
-        self._unseen: Exposure | None = None
-        """The exposure that has not been given to the session's watcher yet."""
-        self._unseen_estimates: list[Outcome] = []
-        """The estimates that have not been given to the session's watcher yet."""
-        self._inputs = inputs or partial(rig.drive.inputs, fast_step_s=rig.timing.fast_step_s)
         self._controlling = controlling
         if controlling is not None:
             self.report.control = controlling.report
         self._assembler = Assembler(rig)
         self._step_ns = rig.timing.fast_step_ns
         self._first_step = _NOT_YET
-        self._queued_until = 0
-        """First fast step for which no command was sent."""
-        self._newest_frame = 0
-        self._aligned = True
-        """Whether all exposures were aligned well enough so far."""
         self._devices: list[Camera | Mirror] = [camera, mirror] if mirror.commanded else [camera]
         """The devices in the order in which their clocks are queried; the next one first."""
         self._last_query_ns = self._next_statistics_ns = 0
@@ -138,12 +100,15 @@ class SessionLoop:
         """Devices whose port has vanished, until the session goes on with them."""
         self._returned: list[Device] = []
         """Vanished devices that have been identified again; their clocks are being queried."""
-        self._newest_steps: dict[int, int] = {}
-        """First fast step of the newest frame, by its sensor's number on the wire."""
-        self._restarted: set[int] = set()
-        """Numbers of the sensors from which no frame has come since the camera was started again."""
         self._account = Account(self.report)
-        self._latencies = LatencyBook(self.report, partial(self._record, topics.LATENCY))
+        self._journal = Journal(writer, self.report, time)
+        self._latencies = LatencyBook(self.report, self._journal.latency)
+        self._frames = ReceivedFrames(rig, time, camera, mirror, self._journal, self._latencies)
+        self._commanding = Commanding(
+            rig, time, mirror, inputs, controlling, self._assembler, self._account, self._journal, self._latencies
+        )
+        control, serves = (None, "") if controlling is None else (self._commanding.control, controlling.estimator)
+        self._live = LiveExposures(rig, time, self._journal, self._latencies, self._estimating, show, control, serves)
 
     def run(self, exposures: int, stop: Callable[[], bool], progress: Callable[[int], None]) -> None:
         self._estimating.get_ready(stop)
@@ -155,17 +120,15 @@ class SessionLoop:
         timing, time = self._rig.timing, self._time
         if self._mirror.latched:
             self._rearm("in a session before")
-        self._first_step = self._queued_until = self._start_camera(self._soon, lambda first_step: exposures)
+        self._first_step = self._start_camera(self._soon, lambda first_step: exposures)
         if self._controlling is not None:
             self._controlling.begin(self._first_step)
         if exposures:
             self._end_step = self._first_step + (exposures - 1) * timing.frame_period_steps + timing.exposure_steps
-        # Queued before the first step is due, as far as the queue reaches.
-        reach = self._rig.mirror.queue_steps - lead_steps(self._rig.mirror)
-        self._send_commands(min(self._first_step, self._device_step() + reach))
+        self._commanding.begin(self._first_step, self._end_step)
         self._receive(0.0)
         self._last_frame_ns = time.now_ns()
-        self._log(Log.INFO, f"session of {exposures or 'unlimited'} exposures from fast step {self._first_step}")
+        self._journal.log(f"session of {exposures or 'unlimited'} exposures from fast step {self._first_step}")
         self.report.ended = "interrupted"
         while not stop():
             self._receive(self._send_due())
@@ -180,7 +143,7 @@ class SessionLoop:
         """Park the mirror and stop the camera, once; try both even if one cannot be reached."""
         if self._is_safe:
             return
-        self._is_safe = True
+        self._is_safe = self._commanding.ended = True
         try:
             self._parked_from = self._mirror.park()
         finally:
@@ -195,10 +158,7 @@ class SessionLoop:
 
     def finish_estimates(self, patience_s: float = ESTIMATES_S) -> None:
         """Wait for the estimates under way, and record exposures without an estimate as skipped."""
-        outcomes = self._estimating.finish(patience_s)
-        self._take_outcomes(outcomes, self._time.now_ns())
-        self._note_failures()
-        self._show_unseen(ready=True)
+        self._live.finish(patience_s)
 
     def _receive(self, timeout_s: float) -> int:
         """Handle the events of the next ``timeout_s``; gives the number of clock queries that were answered."""
@@ -206,7 +166,7 @@ class SessionLoop:
         for device, events, receive_ns in self._time.events(timeout_s):
             answers += sum(isinstance(event, ClockSampled) for event in events)
             self._take(device, events, receive_ns)
-        self._take_outcomes(self._estimating.outcomes(), self._time.now_ns())
+        self._live.take_estimates()
         return answers
 
     def _warm_up_clocks(self, stop: Callable[[], bool]) -> None:
@@ -253,17 +213,6 @@ class SessionLoop:
             " too late: is the line or this machine so slow, do both devices count the same fast steps?"
         )
 
-    def _device_step(self) -> int:
-        """The fast step that the device is in by its clock; on virtual time, the step that it waits at."""
-        if self._time.virtual:
-            return self._queued_until
-        return self._mirror.since_zero_ns(self._time.now_ns()) // self._step_ns
-
-    def _reached_step(self) -> int:
-        """The first fast step that a command which is sent now reaches in time."""
-        margin = 0 if self._time.virtual else round(MARGIN_S * 1e9) // self._step_ns + 1
-        return self._device_step() + margin
-
     def _send_due(self) -> float:
         """Send what is due; gives the time until something is due again, s."""
         time = self._time
@@ -283,16 +232,15 @@ class SessionLoop:
         if not time.virtual and now >= self._keep_alive_ns():
             self._mirror.query_clock(now)
         if now >= self._next_statistics_ns:
-            self._record_statistics(now)
+            self._note_statistics(now)
             self._next_statistics_ns = now + round(_STATISTICS_PERIOD_S * 1e9)
         if is_there and not (time.virtual and self._mirror.in_flight):
-            self._send_commands(self._device_step())
+            self._commanding.send(self._live.newest_frame)
         if time.virtual:
             return 0.0
         due = [self._next_query_ns() - now, self._keep_alive_ns() - now]
-        if is_there and self._mirror.commanded and (self._end_step is None or self._queued_until < self._end_step):
-            ahead = self._queued_until - self._device_step() - lead_steps(self._rig.mirror)
-            due.append((max(ahead, 0) + 1) * self._step_ns)
+        if is_there and (due_steps := self._commanding.due_steps()) is not None:
+            due.append(due_steps * self._step_ns)
         if is_there and (due_ns := self._mirror.next_due_ns()) is not None:
             due.append(due_ns - now)
         return max(0, min(due)) / 1e9
@@ -312,8 +260,9 @@ class SessionLoop:
         step = self._mirror.rearm()
         self.report.rearmed += 1
         out = f", {outage_s:.2f} s after its last command" if outage_s else ""
-        self._log(Log.WARNING, f"the mirror was parked by its watchdog {when}: re-armed at fast step {step}{out}")
-        self._queued_until = min(self._queued_until, step)  # the queued inputs are dropped
+        parked = f"the mirror was parked by its watchdog {when}"
+        self._journal.log(f"{parked}: re-armed at fast step {step}{out}", Log.WARNING)
+        self._commanding.go_back_to(step)  # the queued inputs are dropped
 
     def _vanished(self, device: Device, why: str) -> None:
         if device not in self._absent:
@@ -321,12 +270,12 @@ class SessionLoop:
         if device in self._returned:
             self._returned.remove(device)
         self.report.ports_vanished += 1
-        self._log(Log.WARNING, f"the port of the {device.name} has vanished; the session waits for it: {why}")
+        self._journal.log(f"the port of the {device.name} has vanished; the session waits for it: {why}", Log.WARNING)
 
     def _has_returned(self, device: Device, away_s: float) -> None:
         self._returned.append(device)
         self.report.away_s += away_s
-        self._log(Log.WARNING, f"the {device.name} has returned {away_s:.2f} s after its port had vanished")
+        self._journal.log(f"the {device.name} has returned {away_s:.2f} s after its port had vanished", Log.WARNING)
 
     def _go_on_with(self, device: Device) -> None:
         """Go on with a device that has returned: the request for its identity has stopped or parked it."""
@@ -338,8 +287,8 @@ class SessionLoop:
             else:
                 if self._mirror.latched:
                     self._rearm("while its port was gone")
-                self._queued_until = max(self._first_step, self._device_step() + self._rig.mirror.block_steps)
-                self._log(Log.INFO, f"commands to the mirror go on from fast step {self._queued_until}")
+                step = self._commanding.go_on()
+                self._journal.log(f"commands to the mirror go on from fast step {step}")
         except PortError:
             self._absent.append(device)  # it has vanished again, and the session waits for it as before
 
@@ -349,7 +298,7 @@ class SessionLoop:
         period = timing.frame_period_steps
 
         def begin() -> int:
-            soon = self._device_step() + round(_START_DELAY_S * 1e9) // self._step_ns
+            soon = self._commanding.device_step() + round(_START_DELAY_S * 1e9) // self._step_ns
             return first + max(0, -(-(soon - first) // period)) * period
 
         def left(first_step: int) -> int:
@@ -357,58 +306,24 @@ class SessionLoop:
 
         if end is None or left(begin()):
             step = self._start_camera(begin, left)
-            self._log(Log.INFO, f"the camera goes on with the exposure from fast step {step}")
-        self._restarted = set(self._newest_steps)
+            self._journal.log(f"the camera goes on with the exposure from fast step {step}")
+        self._frames.camera_restarted()
         self._last_frame_ns = self._time.now_ns()
-
-    def _send_commands(self, device_step: int) -> None:
-        if not self._mirror.commanded:
-            return
-        block_steps, end_step = self._rig.mirror.block_steps, self._end_step
-        lead, control, cause = lead_steps(self._rig.mirror), self._controlling, self._newest_frame
-        if control is not None:  # queued inputs are sent anew after each exposure
-            lead, cause = LEAD_BLOCKS * block_steps, control.cause_frame
-        horizon = device_step + lead
-        if control is not None and self._time.virtual:
-            horizon = control.horizon(device_step)
-            end_step = horizon if end_step is None else min(end_step, horizon)
-        elif self._rig.mirror.slew_max_per_s and self._queued_until <= device_step and not self._time.virtual:
-            self._leave_out()
-        while self._queued_until < horizon and (end_step is None or self._queued_until < end_step):
-            first = self._queued_until
-            n_steps = block_steps if end_step is None else min(block_steps, end_step - first)
-            u = control.loop.inputs(first, n_steps) if control else self._inputs(first - self._first_step, n_steps)
-            now = self._time.now_ns()
-            block = self._mirror.send_block(first, u, cause, now)
-            if control is not None:
-                control.commanded(block)
-            self._account.commanded(block)
-            self._assembler.add_command(block)
-            self._record(topics.COMMAND, block, now)
-            self._latencies.sent(block, self._time.now_ns())
-            self._queued_until += n_steps
-
-    def _leave_out(self) -> None:
-        """Leave out inputs that would come too late, so that the slew limit applies from the input that the mirror then
-        holds."""
-        first, step = self._queued_until, self._reached_step()
-        step = step if self._end_step is None else min(step, self._end_step)
-        if step <= first:
-            return
-        held, self._queued_until = self._mirror.go_on_from(first, step), step
-        if self._controlling is not None:
-            self._controlling.loop.commanded(first, held)
 
     def _is_over(self, exposures: int) -> bool:
         if self._time.virtual:
-            return self._end_step is not None and self._queued_until >= self._end_step and not self._mirror.in_flight
+            return (
+                self._end_step is not None
+                and self._commanding.queued_until >= self._end_step
+                and not self._mirror.in_flight
+            )
         now, timing = self._time.now_ns(), self._rig.timing
         if self._absent:
             self._last_frame_ns = now
             return False
         if self._end_step is not None:
             late_step = self._end_step + _GRACE_S * 1e9 / self._step_ns
-            if self.report.exposures >= exposures or self._device_step() > late_step:
+            if self.report.exposures >= exposures or self._commanding.device_step() > late_step:
                 return True
         patience_ns = 3 * timing.frame_period_steps * self._step_ns + (_GRACE_S + _START_DELAY_S) * 1e9
         # A camera and a mirror of one device are held up together, and the mirror is waited for that long.
@@ -425,7 +340,7 @@ class SessionLoop:
         self._collect_reports()
         now = self._time.now_ns()
         self._take(self._camera, list(self._camera.flush()), now)
-        self._estimate(self._assembler.flush(), now)
+        self._live.take(self._assembler.flush(), now)
         self.finish_estimates()
         self._latencies.close(self._time.now_ns())
         self.close_account()
@@ -434,12 +349,12 @@ class SessionLoop:
             self.report.frames_lost = max(self.report.frames_lost, exposures - self.report.frames_received)
             if self._rig.scene:
                 self.report.scenes_lost = exposures - self.report.scenes_received
-        self._record_statistics(now)
-        self._log(Log.INFO, f"session {self.report.ended}: {self.report.exposures} exposures")
+        self._note_statistics(now)
+        self._journal.log(f"session {self.report.ended}: {self.report.exposures} exposures")
 
     def _collect_reports(self) -> None:
         """Request the reports that have not come, now that the mirror is parked."""
-        end, now = self._queued_until, self._time.now_ns()
+        end, now = self._commanding.queued_until, self._time.now_ns()
         end = end if self._parked_from is None else min(end, self._parked_from)
         self._take(self._mirror, self._mirror.await_reports(end, now), now)
         while (due_ns := self._mirror.next_due_ns()) is not None:
@@ -453,15 +368,13 @@ class SessionLoop:
         for event in events:
             if isinstance(event, Frame):
                 if event.first_step >= self._first_step:  # not one of an earlier session
-                    event = self._count_lost(event)
-                    take = self._take_scene if event.plane else self._take_frame
-                    take(event, receive_ns)
+                    self._take_frame(event, receive_ns)
             elif isinstance(event, wire.Applied):
                 self._take_applied(event, receive_ns)
             elif isinstance(event, wire.Truth):
-                self._record(topics.TRUTH, event, receive_ns)
+                self._journal.record(topics.TRUTH, event, receive_ns)
             elif isinstance(event, ClockSampled):
-                self._take_clock(device, event)
+                self._journal.clock(device, event)
             elif isinstance(event, CommandAnswered):
                 self._take_answer(event, receive_ns)
             elif isinstance(event, Vanished):
@@ -470,157 +383,18 @@ class SessionLoop:
                 self._has_returned(device, event.away_s)
             else:
                 level = {wire.Event.INFO: Log.INFO, wire.Event.WARNING: Log.WARNING}.get(event.level, Log.ERROR)
-                self._log(level, f"{device.name}: {event.text}")
-
-    def _count_lost(self, frame: Frame) -> Frame:
-        """Count the exposures that a camera has not taken before it was started again: it does not number them."""
-        before = self._newest_steps.get(frame.plane)
-        self._newest_steps[frame.plane] = frame.first_step
-        if before is None or frame.plane not in self._restarted:
-            return frame
-        self._restarted.remove(frame.plane)
-        lost = (frame.first_step - before) // self._rig.timing.frame_period_steps - 1
-        return replace(frame, frames_lost_before=max(frame.frames_lost_before, lost))
+                self._journal.log(f"{device.name}: {event.text}", level)
 
     def _take_frame(self, frame: Frame, receive_ns: int) -> None:
-        frame = self._record_picture(frame, topics.EXPOSURE, topics.IMAGE, receive_ns)
-        report = self.report
-        report.frames_received += 1
-        report.frames_incomplete += frame.chunks_lost > 0
-        report.frames_lost += frame.frames_lost_before
-        self._last_frame_ns = receive_ns
-        self._check_alignment(frame)
-        if not self._time.virtual:
-            host_end_ns, _ = self._camera.clock.host_ns(frame.device_end_ns)
-            self._latencies.frame(
-                pb.Latency(
-                    frame_id=frame.frame_id,
-                    exposure_end_ns=host_end_ns,
-                    first_byte_ns=frame.host_first_byte_ns,
-                    complete_ns=frame.host_receive_ns,
-                )
-            )
-        self._estimate(self._assembler.add_frame(frame), receive_ns)
-
-    def _check_alignment(self, frame: Frame) -> None:
-        """Warn once where it is not known well enough which of the mirror's steps an exposure covers."""
-        exposure_ns = self._rig.timing.exposure_steps * self._step_ns
-        if self._aligned and self._mirror.commanded and frame.alignment_sigma_ns > _ALIGNED * exposure_ns:
-            self._aligned = False
-            self.report.warnings.append(
-                "which of the mirror's fast steps an exposure covers is known only to"
-                f" {frame.alignment_sigma_ns / exposure_ns:.2g} of an exposure (sd, frame {frame.frame_id}): intervals"
-                f" of estimates are reliable up to {_ALIGNED:g}; give delay_s and delay_sd_s of the devices as well as"
-                " they are known"
-            )
-
-    def _take_scene(self, frame: Frame, receive_ns: int) -> None:
-        self._record_picture(frame, topics.SCENE_EXPOSURE, topics.SCENE, receive_ns)
-        self.report.scenes_received += 1
-        self.report.scenes_incomplete += frame.chunks_lost > 0
-        self.report.scenes_lost += frame.frames_lost_before
-        self._show_unseen(frame)
-
-    def _show_unseen(self, scene: Frame | None = None, *, ready: bool = False) -> None:
-        """Give the waiting exposure to the watcher when it is complete, or, if ``ready``, as it is.
-
-        With a picture sensor, its scene belongs to it. It does not wait for estimates that are not there when the next
-        exposure comes; they are given with that one.
-        """
-        exposure = self._unseen
-        if self._show is None or exposure is None:
-            return
-        if scene is not None and scene.frame_id == exposure.frame_id:
-            exposure = self._unseen = replace(exposure, scene=Picture(pixels=scene.pixels, mask=scene.mask))
-        whole = self._rig.scene is None or exposure.scene is not None
-        if ready or (whole and exposure.frame_id not in self._unsettled):
-            self._show(exposure, self._unseen_estimates)
-            self._unseen, self._unseen_estimates = None, []
-
-    def _record_picture(self, frame: Frame, exposure_topic: str, topic: str, receive_ns: int) -> Frame:
-        """Record a picture with its facts; gives the frame with the host's time of its start."""
-        since_zero_ns, camera = frame.first_step * self._step_ns + frame.exposure_offset_ns, self._camera
-        length_ns = (frame.last_step + 1 - frame.first_step) * self._step_ns
-        camera.host_ns(
-            frame.device_end_ns, since_zero_ns + length_ns, receive_ns
-        )  # may raise the doubt about the start
-        host_start_ns, sigma_ns = camera.host_ns(frame.device_start_ns, since_zero_ns, receive_ns)
-        frame = replace(frame, host_start_ns=host_start_ns, clock_sigma_ns=sigma_ns)
-        info, image = convert.frame_messages(frame)
-        self._record(exposure_topic, info, receive_ns)
-        self._record(topic, image, receive_ns)
-        return frame
-
-    def _estimate(self, exposures: Sequence[Exposure], log_time_ns: int) -> None:
-        for exposure in exposures:
-            self.report.exposures += 1
-            self._show_unseen(ready=True)
-            self._unseen = exposure
-            self._unsettled[exposure.frame_id] = []
-            outcomes = self._estimating.offer(exposure)
-            if self._controlling is not None and not self._controlling.estimator:
-                self._control(exposure, None, log_time_ns)
-            if not self._estimating.names:
-                self._settle(exposure.frame_id)
-            self._take_outcomes(outcomes, log_time_ns)
-
-    def _control(self, exposure: Exposure, estimate: Estimate | None, log_time_ns: int) -> None:
-        """Let the controller change the inputs that are not due yet: they are sent anew, and supersede the queued
-        ones."""
-        if self._controlling is None or self._is_safe:
-            return
-        change = self._controlling.see(exposure, estimate, self._reached_step())
-        if (first_step := change.first_step) < self._queued_until:
-            # No later than the first changed step: the limits apply from the input that the controller continues from.
-            self._queued_until = min(first_step, max(self._device_step() + 1, self._mirror.withdraw(first_step)))
-        self._record(topics.CONTROL, change.message, log_time_ns)
-        if change.warning:
-            self.report.warnings.append(change.warning)
-            self._log(Log.WARNING, change.warning)
-
-    def _take_outcomes(self, outcomes: Sequence[Outcome], log_time_ns: int) -> None:
-        for outcome in outcomes:
-            name, frame_id, message = outcome.estimator, outcome.exposure.frame_id, outcome.message
-            if message is not None:
-                self._record(topics.estimate_topic(name), message, log_time_ns)
-                if self._controlling is not None and name == self._controlling.estimator:
-                    self._control(outcome.exposure, outcome.estimate(self._rig), log_time_ns)
-                if self._show is not None:
-                    self._unseen_estimates.append(outcome)
-            if name in self.report.estimation:
-                self.report.estimation[name].add(outcome)
-                self._record(topics.estimation_topic(name), outcome.account(), log_time_ns)
-            outcomes_so_far = self._unsettled[frame_id]
-            if message is not None and all(each.message is None for each in outcomes_so_far):
-                self._know(frame_id, self._time.now_ns())
-            outcomes_so_far.append(outcome)
-            if message is None:
-                self._note_failures()
-            if len(outcomes_so_far) == len(self._estimating.names):
-                self._settle(frame_id)
-
-    def _note_failures(self) -> None:
-        for name, why in self._estimating.failures.items():
-            if not self.report.estimation[name].failed:
-                self.report.estimation[name].failed = why
-                text = f"the estimator {name} failed, the recording goes on without it: {why}"
-                self.report.warnings.append(text)
-                self._log(Log.ERROR, text)
-
-    def _settle(self, frame_id: int) -> None:
-        """Finish an exposure that all estimators have estimated or skipped."""
-        outcomes = self._unsettled.pop(frame_id)
-        if all(each.message is None for each in outcomes):
-            self._know(frame_id, 0 if outcomes else self._time.now_ns())
-        self._show_unseen()
-
-    def _know(self, frame_id: int, estimated_ns: int) -> None:
-        """Note that commands from now on depend on a frame: its first estimate is there, or there will be none."""
-        self._newest_frame = max(self._newest_frame, frame_id)
-        self._latencies.estimated(frame_id, estimated_ns)
+        frame = self._frames.take(frame, receive_ns)
+        if frame.plane:
+            self._live.take_scene(frame)
+        else:
+            self._last_frame_ns = receive_ns
+            self._live.take(self._assembler.add_frame(frame), receive_ns)
 
     def _take_applied(self, applied: wire.Applied, receive_ns: int) -> None:
-        self._record(topics.APPLIED, applied, receive_ns)
+        self._journal.record(topics.APPLIED, applied, receive_ns)
         if applied.source != wire.Applied.AWAITED:
             self._account.reported(applied)
         if self._controlling is not None:
@@ -636,7 +410,7 @@ class SessionLoop:
         n_steps = max(0, end - max(applied.first_step, self._first_step))  # it belongs to this session
         if applied.source in (wire.Applied.PARKED, wire.Applied.WATCHDOG):
             report.steps_parked += n_steps
-        self._estimate(self._assembler.add_applied(applied), receive_ns)
+        self._live.take(self._assembler.add_applied(applied), receive_ns)
 
     def _take_answer(self, answer: CommandAnswered, receive_ns: int) -> None:
         ack = answer.ack
@@ -648,58 +422,12 @@ class SessionLoop:
                 f" {ack.text or wire.Code.Name(ack.code)}"
             )
 
-    def _take_clock(self, device: Device, sampled: ClockSampled) -> None:
-        clock, exchange, report = device.clock, sampled.exchange, self.report
-        sample = pb.ClockSample(
-            device=device.name,
-            host_send_ns=exchange.host_send_ns,
-            device_receive_ns=exchange.device_receive_ns,
-            device_send_ns=exchange.device_send_ns,
-            host_receive_ns=exchange.host_receive_ns,
-            round_trip_ns=exchange.round_trip_ns,
-            accepted=sampled.accepted,
-        )
-        if clock.ready:
-            _, sigma_ns = clock.device_ns(exchange.host_receive_ns)
-            sample.offset_ns = clock.offset_ns(exchange.host_receive_ns)
-            sample.frequency_ppm, sample.sigma_ns = clock.frequency_ppm, sigma_ns
-            report.clock_offset_ns, report.clock_frequency_ppm = sample.offset_ns, sample.frequency_ppm
-            report.clock_sigma_ns = sigma_ns
-        self._record(topics.CLOCK, sample, exchange.host_receive_ns)
-        if sampled.step is not None:
-            size_s, period_s = sampled.step.size_ns / 1e9, (sampled.step.before_ns - sampled.step.after_ns) / 1e9
-            direction = "forward" if size_s > 0 else "back"
-            warning = (
-                f"the {device.name}'s clock was set {direction} by {abs(size_s):.6f} s: host times of its stamps"
-                f" in the {period_s:.3f} s from {sampled.step.after_ns} ns on may be off by as much"
-            )
-            report.warnings.append(warning)
-            self._log(Log.WARNING, warning)
-
-    def _record_statistics(self, now: int) -> None:
-        report = self.report
+    def _note_statistics(self, now: int) -> None:
         self._count_tries()
-        counts = {device.name: device.statistics() for device in self._devices}
-        report.packets_bad_crc = sum(each.get("bad_crc", 0) for each in counts.values())
-        report.packets_bad_framing = sum(each.get("bad_framing", 0) for each in counts.values())
-        report.packets_bad_payload = sum(each.get("bad_payload", 0) for each in counts.values())
-        report.packets_duplicate = sum(each.get("duplicates", 0) for each in counts.values())
-        report.packets_missing = sum(each.get("sequence_gaps", 0) for each in counts.values())
-        report.chunks_refused = self._camera.chunks_refused
-        for name, each in counts.items():
-            if each:
-                self._record(topics.LINK, pb.LinkStatistics(device=name, **each), now)
+        self._journal.statistics(self._devices, now)
+        self.report.chunks_refused = self._camera.chunks_refused
 
     def _count_tries(self) -> None:
         counts = self._mirror.statistics()
         self.report.blocks_retransmitted = counts.get("retransmits", 0)
         self.report.reports_asked = counts.get("reports_asked", 0)
-
-    def _log(self, level: Log.Level.ValueType, text: str) -> None:
-        now = self._time.now_ns()
-        entry = Log(level=level, message=text, name="aolink")
-        entry.timestamp.FromNanoseconds(now)
-        self._record(topics.LOG, entry, now)
-
-    def _record(self, topic: str, message: Message, log_time_ns: int) -> None:
-        self._writer.write(topic, message, log_time_ns)

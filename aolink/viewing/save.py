@@ -29,7 +29,8 @@ from aolink.viewing.series import POINTS, Chosen, Drawing
 from aolink.viewing.timebase import Timebase
 
 if TYPE_CHECKING:
-    from aolink.recording.reader import RecordedMessage, Recording
+    from aolink.recording.messages import RecordedMessage
+    from aolink.recording.reader import Recording
     from aolink.restoration import RestoredPictures
 
 COMPARED = "compared/"

@@ -64,24 +64,9 @@ class PacketType(IntEnum):
     VIRTUAL_TIME = 121
 
 
+# COMMAND_BLOCK is the type of a CommandBlock.
 MESSAGE_OF_TYPE: dict[int, type[Message]] = {
-    PacketType.IDENTIFY: pb.Identify,
-    PacketType.IDENTITY: pb.Identity,
-    PacketType.COMMAND_BLOCK: pb.CommandBlock,
-    PacketType.COMMAND_ACK: pb.CommandAck,
-    PacketType.APPLIED: pb.Applied,
-    PacketType.CAMERA_CONTROL: pb.CameraControl,
-    PacketType.PARK: pb.Park,
-    PacketType.ACK: pb.Ack,
-    PacketType.FRAME_CHUNK: pb.FrameChunk,
-    PacketType.CLOCK_QUERY: pb.ClockQuery,
-    PacketType.CLOCK_REPLY: pb.ClockReply,
-    PacketType.EVENT: pb.Event,
-    PacketType.PART: pb.Part,
-    PacketType.APPLIED_QUERY: pb.AppliedQuery,
-    PacketType.REARM: pb.Rearm,
-    PacketType.TRUTH_CHUNK: pb.TruthChunk,
-    PacketType.VIRTUAL_TIME: pb.VirtualTime,
+    type_: getattr(pb, type_.name.title().replace("_", "")) for type_ in PacketType
 }
 TYPE_OF_MESSAGE: dict[type[Message], int] = {message: type_ for type_, message in MESSAGE_OF_TYPE.items()}
 

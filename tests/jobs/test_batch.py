@@ -57,7 +57,7 @@ def test_a_setting_that_makes_no_sense(setting: str, message: str) -> None:
 
 def test_a_job_is_what_one_estimate_would_be(recorded: Session, tmp_path: Path) -> None:
     model = batch.models(None, ["plant.process_noise=3.0"])
-    (done,) = batch.run(batch.jobs([recorded.path], model, ["o3"], tmp_path), 1)
+    (done,) = batch.run_here(batch.jobs([recorded.path], model, ["o3"], tmp_path), 1)
     assert not done.error
     changed = Recording(done.job.output)
     assert changed.rig.plant.process_noise == pytest.approx(3.0)
@@ -73,13 +73,13 @@ def test_what_was_done_is_not_done_again_until_something_changes(recorded: Sessi
     shutil.copy(recorded.path, source := tmp_path / "s.mcap")
     todo = batch.jobs([source], batch.models(None, []), ["o1"], tmp_path / "out")
     (tmp_path / "out").mkdir()
-    first, second = next(batch.run(todo, 1)), next(batch.run(todo, 1))
+    first, second = next(batch.run_here(todo, 1)), next(batch.run_here(todo, 1))
     assert (first.skipped, second.skipped) == (False, True)
     assert first.rows == second.rows
     shutil.copyfile(recorded.path, source)  # a new time
-    assert not next(batch.run(todo, 1)).skipped
+    assert not next(batch.run_here(todo, 1)).skipped
     todo[0].output.unlink()
-    assert not next(batch.run(todo, 1)).skipped
+    assert not next(batch.run_here(todo, 1)).skipped
 
 
 def test_values_given_twice_are_one_model_and_another_rig_names_its_models() -> None:
@@ -95,7 +95,7 @@ def test_the_table_has_what_is_in_the_folder_from_before(recorded: Session, tmp_
 
     def rows(*values: str) -> list[tuple[str, float]]:
         settings = [f"plant.process_noise={','.join(values)}"]
-        done = list(batch.run(batch.jobs([recorded.path], batch.models(None, settings), ["o3"], tmp_path), 1))
+        done = list(batch.run_here(batch.jobs([recorded.path], batch.models(None, settings), ["o3"], tmp_path), 1))
         return [(row["model"], row["path_rmse"]) for row in batch.table_rows(done, tmp_path)]
 
     (first,) = rows("5")
@@ -124,9 +124,9 @@ def test_nothing_is_written_over_but_results(recorded: Session, tmp_path: Path) 
     with pytest.raises(RecordingError, match="is no result of a batch"):
         batch.jobs([source], batch.models(None, []), ["o1"], out)
     for _ in range(2):
-        (done,) = batch.run(batch.jobs([source], batch.models(None, []), ["o1"], out, overwrite=True), 1)
+        (done,) = batch.run_here(batch.jobs([source], batch.models(None, []), ["o1"], out, overwrite=True), 1)
         assert not done.skipped
-    (done,) = batch.run(batch.jobs([source], batch.models(None, []), ["o1"], out), 1)
+    (done,) = batch.run_here(batch.jobs([source], batch.models(None, []), ["o1"], out), 1)
     assert done.skipped
     assert {each.name for each in out.iterdir()} == {"s.mcap", "s.json"}
 
@@ -144,7 +144,7 @@ def test_damage_of_a_recording_is_in_its_row(aolink: Run, recorded: Session, tmp
 
 def test_an_absurd_value_fails_alone(recorded: Session, tmp_path: Path) -> None:
     models = batch.models(None, ["sensor.counts_per_density=1e-300,300"])
-    bad, good = batch.run(batch.jobs([recorded.path], models, ["moments"], tmp_path), 1)
+    bad, good = batch.run_here(batch.jobs([recorded.path], models, ["moments"], tmp_path), 1)
     assert bad.error
     assert not good.error
     assert {each.suffix for each in tmp_path.iterdir()} == {".mcap", ".json"}
@@ -158,7 +158,7 @@ def several(recorded: Session, folder: Path) -> list[batch.Job]:
 @pytest.mark.parametrize("workers", [1, 2])
 def test_stopped_no_job_is_begun_and_those_on_the_way_count(recorded: Session, tmp_path: Path, workers: int) -> None:
     todo, done = several(recorded, tmp_path), list[batch.Done]()
-    for each in batch.run(todo, workers, stop=lambda: bool(done)):
+    for each in batch.run_here(todo, workers, stop=lambda: bool(done)):
         done.append(each)
     assert 1 <= len(done) <= workers + 1
     assert not any(each.error for each in done)
@@ -185,7 +185,7 @@ def test_stopped_twice_the_processes_end_at_once_and_leave_nothing_half(recorded
         return False
 
     with pytest.raises(KeyboardInterrupt):
-        list(batch.run(several(recorded, tmp_path), 2, stop=stop))
+        list(batch.run_here(several(recorded, tmp_path), 2, stop=stop))
     assert not [each for each in multiprocessing.active_children() if each.pid and runs(each.pid)]
     assert not [*tmp_path.glob("*.partial"), *tmp_path.glob(".*")]
 
@@ -201,7 +201,7 @@ def test_a_process_that_is_killed_costs_its_own_jobs(recorded: Session, tmp_path
             break
         return False
 
-    done = list(batch.run(several(recorded, tmp_path), 2, stop=stop))
+    done = list(batch.run_here(several(recorded, tmp_path), 2, stop=stop))
     assert len(done) == 6
     failed = [each.error for each in done if each.error]
     assert killed

@@ -12,7 +12,6 @@ from aolink.exposure import Exposure
 from aolink.identification import CANDIDATES, readings, rig_model
 from aolink.identification.likelihood import Likelihood
 from aolink.identification.search import BLOCK
-from aolink.jobs import follow
 from aolink.jobs.follow import FITTED, HELD_OUT, REPORT, Following, News, Offer, offer_path, with_own_kinds
 from aolink.jobs.identify import Wanted
 from aolink.rig import load_rig, parse_rig
@@ -40,8 +39,8 @@ def joined(*series):
     return out
 
 
-def followed(rig, exposures, target="identified.toml"):
-    job = Following(rig, Wanted(), Path(target))
+def followed(rig, exposures, target="identified.toml", **options):
+    job = Following(rig, Wanted(), Path(target), **options)
     return job, [each for exposure in exposures for each in job.see(exposure)]
 
 
@@ -88,9 +87,9 @@ def test_after_a_line_has_moved_its_new_frequency_is_offered_and_then_fits():
 
 
 @pytest.mark.long
-def test_what_does_not_foretell_better_is_not_offered(monkeypatch):
-    monkeypatch.setattr(follow, "LEAST_GAIN", 1e6)
-    job, said = followed(with_line(12.0), list(aolink.simulate(with_line(14.0), FITTED + HELD_OUT, seed=6)))
+def test_what_does_not_foretell_better_is_not_offered():
+    moved = list(aolink.simulate(with_line(14.0), FITTED + HELD_OUT, seed=6))
+    job, said = followed(with_line(12.0), moved, least_gain=1e6)
     assert not job.offers
     news = must_be(News, said[-1])
     assert news.frame_id == FITTED + HELD_OUT

@@ -30,7 +30,8 @@ from aolink.recording import schemas_pb2 as pb
 from aolink.recording import topics
 from aolink.recording.editing import recover
 from aolink.recording.mcap_file import McapFile, WriteOptions, schema_of
-from aolink.recording.reader import RawMessage, Recording
+from aolink.recording.messages import RawMessage
+from aolink.recording.reader import Recording
 from aolink.recording.scan import Loss, broken_up, scan
 from aolink.recording.writer import RecordingWriter, begin_recording
 from aolink.rig import load_rig

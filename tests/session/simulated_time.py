@@ -28,8 +28,9 @@ from aolink.recording import topics
 from aolink.recording.reader import Recording
 from aolink.recording.writer import RecordingWriter
 from aolink.rig import Rig
+from aolink.session.commanding import Inputs
 from aolink.session.controlling import Controlling
-from aolink.session.loop import Inputs, SessionLoop
+from aolink.session.loop import SessionLoop
 from aolink.session.report import Report
 from aolink.simulation.devices import LineName
 from aolink.simulation.server import RigServer

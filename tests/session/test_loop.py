@@ -11,7 +11,8 @@ from aolink.jobs.demo import simulated_rig
 from aolink.recording.reader import Recording
 from aolink.recording.writer import RecordingWriter
 from aolink.rig import load_rig
-from aolink.session.loop import SessionLoop, lead_steps
+from aolink.session.commanding import lead_steps
+from aolink.session.loop import SessionLoop
 from aolink.wire import messages_pb2 as pb
 from tests.session.native import open_native
 

@@ -14,7 +14,7 @@ from aolink.control.integrator import Integrator
 from aolink.recording import topics
 from aolink.recording.reader import Recording
 from aolink.rig import Rig, parse_rig
-from aolink.session.loop import Inputs
+from aolink.session.commanding import Inputs
 from aolink.wire import messages_pb2 as pb
 from tests.control.rigs import DRIFT, small_rig
 from tests.kinds import messages_of

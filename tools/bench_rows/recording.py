@@ -289,7 +289,7 @@ def batch_workers(effort: Effort) -> Row:
             target.mkdir()
             todo = batch.jobs(sources, batch.models(None, []), ["moments"], target)
             start = time.perf_counter()
-            assert not any(each.error for each in batch.run(todo, jobs))
+            assert not any(each.error for each in batch.run_here(todo, jobs))
             return time.perf_counter() - start
 
         one, two = work(1), work(2)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -36,6 +37,13 @@ def text(name: str, value: Any) -> str:
     if not isinstance(value, str):
         raise RigError(f"devices.mirror.{name}: expected a text, found {value!r}")
     return value
+
+
+def seconds(name: str, value: Any) -> float:
+    """A time in seconds. Raises RigError."""
+    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value < math.inf:
+        raise RigError(f"devices.mirror.{name}: expected a number of seconds, found {value!r}")
+    return float(value)
 
 
 def speed(name: str, value: Any) -> int:

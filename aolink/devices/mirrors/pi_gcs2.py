@@ -15,7 +15,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from aolink.devices.mirrors.keys import per_input, scale_per_input, speed, text
+from aolink.devices.mirrors.keys import per_input, scale_per_input, seconds, speed, text
 from aolink.devices.mirrors.line import SerialLine, usb_ports
 from aolink.devices.simple import Lacks
 from aolink.errors import DeviceError, RigError
@@ -38,8 +38,6 @@ _ERRORS = {
 }
 """The meanings of the commonest error numbers."""
 _UNKNOWN_COMMAND = 2
-SETTLING_S = 5.0
-"""How long the stage may take to its safe position when it is opened."""
 _POLL_S = 0.02
 _MOST_LINES = 100
 """The most lines of an answer, or of earlier answers still waiting; more of them are not an answer."""
@@ -64,6 +62,8 @@ class PiMirror:
         or a list of one for each input.
     baud_rate:
         Baud rate of a serial port.
+    settling_s:
+        How long the stage may take to its safe position when it is opened, s.
     """
 
     lacks: ClassVar[tuple[Lacks, ...]] = (Lacks.READ_BACK, Lacks.WATCHDOG)
@@ -77,11 +77,13 @@ class PiMirror:
         scale: float | list[float] = 1.0,
         offset: float | list[float] = 0.0,
         baud_rate: int = 115_200,
+        settling_s: float = 5.0,
     ) -> None:
         self._axes = _checked_axes(axes, rig.n_inputs)
         self._scale = scale_per_input("scale", scale, rig.n_inputs)
         self._offset = per_input("offset", offset, rig.n_inputs)
         self._park = rig.mirror.park
+        self._settling_s = seconds("settling_s", settling_s)
         self._unanswered = ""
         """The command whose ERR? has not been answered."""
         with ExitStack() as opened:
@@ -192,14 +194,14 @@ class PiMirror:
 
     def _settle(self) -> None:
         """Wait until the safe position is reached. Raises DeviceError where it is not."""
-        deadline = time.monotonic() + SETTLING_S
+        deadline = time.monotonic() + self._settling_s
         while (there := self._numbers("ONT?")) is not None and not there.all():
             if time.monotonic() > deadline:
                 positions = self._numbers("POS?")
                 raise DeviceError(
                     f"the PI axes {' '.join(self._axes)} do not reach their safe position"
-                    f" {self._offset + self._scale * self._park} in {SETTLING_S:g} s, they are at {positions}: are"
-                    " they zeroed (ATZ) or referenced, and do the stage's parameters fit?"
+                    f" {self._offset + self._scale * self._park} in {self._settling_s:g} s, they are at {positions}:"
+                    " are they zeroed (ATZ) or referenced, and do the stage's parameters fit?"
                 )
             time.sleep(_POLL_S)
 

@@ -39,14 +39,18 @@ compiles_itself = False
 """Whether this is the process that compiles for all others."""
 
 
-def make_ready(folder: Path = _FOLDER, program: str = _COMPILE) -> None:
+def make_ready() -> None:
     """Compile the loops in a process of its own, once for this version and processor; all other processes load them.
 
     A process that compiles them for itself computes with other machine code than one that loads the kept code, so the
     last bits of estimates online and offline might differ. Where nothing can be kept, each process compiles for itself.
     """
-    if compiles_itself:
-        return
+    if not compiles_itself:
+        compile_once(_FOLDER, _COMPILE)
+
+
+def compile_once(folder: Path, program: str) -> None:
+    """Run a program that compiles the sources in a folder, unless it has succeeded since they last changed."""
     kept = folder / "__pycache__"
     with suppress(OSError):
         changed = max(source.stat().st_mtime for source in folder.glob("*.py"))

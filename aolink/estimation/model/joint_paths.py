@@ -41,15 +41,17 @@ class JointPaths:
     ----------
     sensor:
         Its kernel, pixels and noise set the number of nodes and of coefficients.
+    left_out:
+        Rms of the noise path that may be left out, in standard deviations of the kernel.
     """
 
-    def __init__(self, model: FactoredModel, sensor: SpotSensor) -> None:
-        self.model = model
+    def __init__(self, model: FactoredModel, sensor: SpotSensor, left_out: float = LEFT_OUT) -> None:
+        self.model, self.left_out = model, left_out
         n = model.plant.n_states + model.n_unmodelled
         variance = float(np.linalg.eigvalsh(sensor.kernel.covariance)[0])
         energy = (model.patterns[:, n:] ** 2).sum(axis=0) * (model.functions**2).mean(axis=0)[model.course_of[n:]]
         rest = np.append(np.cumsum(energy[::-1])[::-1], 0.0) + model.noise.left_out.sum()
-        enough = np.flatnonzero(rest <= LEFT_OUT**2 * variance * model.plant.n_outputs)
+        enough = np.flatnonzero(rest <= left_out**2 * variance * model.plant.n_outputs)
         kept = int(enough[0]) if len(enough) else len(energy)
         self.widening = float(rest[kept]) / model.plant.n_outputs + model.unmodelled_rest
         """Mean variance of the part of the path that is left out, by which the kernel is widened."""
@@ -79,7 +81,7 @@ class JointPaths:
             return resolution(self._unseen(), variance, sensor.profile)
         model = exposure_model(self.model.plant, self.model.n_steps)
         assert isinstance(model, FactoredModel)
-        return joint_paths(model, sensor).resolution
+        return joint_paths(model, sensor, self.left_out).resolution
 
     def _unseen(self) -> FloatArray:
         """Random paths of the outputs by the plant's prior, (paths, n_steps)."""

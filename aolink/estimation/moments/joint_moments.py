@@ -19,9 +19,9 @@ from aolink.estimation.frames.moments import LEAST_FLUX
 from aolink.estimation.kalman.gaussian import Gaussian, Update
 from aolink.estimation.model.base import ExposureModel, InputResponse
 from aolink.estimation.model.factored import FactoredModel
-from aolink.estimation.model.joint_paths import JointPaths, joint_paths
+from aolink.estimation.model.joint_paths import LEFT_OUT, JointPaths, joint_paths
 from aolink.estimation.moments.spots import WindowedSpots
-from aolink.estimation.moments.windowed import NOT_BELIEVED, PASSES, Basis, Regression, error_memory, slowest
+from aolink.estimation.moments.windowed import NOT_BELIEVED, PASSES, Basis, Regression, Windowed, error_memory, slowest
 from aolink.numerics import batched
 from aolink.numerics.arrays import FloatArray
 from aolink.numerics.single_thread import by_one_thread, covariance_of_information, matmul_one_thread, solve_information
@@ -37,6 +37,9 @@ class JointObservation(ABC):
     needs = Needs(what="windows", least_usable=HALF, least_spots=HALF)
     models_noise = True
 
+    left_out = LEFT_OUT
+    """As in `JointPaths`."""
+
     def __init__(self, sensor: SpotSensor, n_measurements: int) -> None:
         self.sensor, self.n_measurements = sensor, n_measurements
 
@@ -44,7 +47,7 @@ class JointObservation(ABC):
     def update(self, model: ExposureModel, response: InputResponse, prior: Gaussian, measured: SpotWindows) -> Update:
         """The prior updated with the pixels; coefficients that move no spot visibly keep theirs."""
         assert isinstance(model, FactoredModel)
-        paths, n = joint_paths(model, self.sensor), model.plant.n_states
+        paths, n = joint_paths(model, self.sensor, self.left_out), model.plant.n_states
         mean, covariance, rest = prior.mean.copy(), prior.covariance.copy(), []
         for axis in range(len(mean)):
             some = slice(0, paths.size)
@@ -77,6 +80,9 @@ class JointMoments(JointObservation):
         As in `WindowedSpots`.
     """
 
+    most_memory = Windowed.most_memory
+    """As in `Windowed`."""
+
     def __init__(
         self, sensor: SpotSensor, n_outputs: int, orders: Sequence[int] = (0, 1, 2, 3), *, basis: Basis = "monomial",
         flux: Flux = "known",
@@ -96,7 +102,7 @@ class JointMoments(JointObservation):
         wide = paths.prior_covariance(prior.covariance)
         # Frames have hardly any information about some of hundreds of states, whose errors last for the plant's own
         # memory.
-        memory = error_memory(slowest(paths.model.transition_of_one[None]))[0]
+        memory = error_memory(slowest(paths.model.transition_of_one[None]), self.most_memory)[0]
         t, P, lit = prior.mean, wide, windows.mask.any(axis=(1, 2, 3))
         spread = first = paths.spread(wide)
         for to_come in reversed(range(PASSES)):

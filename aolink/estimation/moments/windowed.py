@@ -48,7 +48,6 @@ PATH_REACH = 3.0
 KERNEL_REACH = 2.0
 # The path is averaged over blocks of steps so that there are no more than this; a mean over it stays exact.
 _MOST_NODES = 100
-MOST_MEMORY = 1e3
 # Axes together: more of them do not fit into the processor's cache.
 _AT_ONCE = 8
 # NIS of moments that are divided by a light that its noise hides: they are gated.
@@ -89,6 +88,8 @@ class Windowed(ABC, Generic[Data]):
 
     models_noise = True
     most_nodes = _MOST_NODES
+    most_memory = 1e3
+    """Bound of `error_memory`; with 1, errors of an exposure count as independent of those before."""
 
     def __init__(self, basis: Basis, flux: Flux, lights: Sequence[int], light_of: Sequence[int]) -> None:
         self.basis, self.flux = basis, flux
@@ -109,7 +110,7 @@ class Windowed(ABC, Generic[Data]):
 
     def _update(self, model: ExposureModel, nodes: QuadraturePaths, prior: Gaussian, measured: Data) -> Update:
         about, rho = prior, np.full(len(prior.mean), slowest(model.transition[None])[0])
-        memory = error_memory(rho)
+        memory = error_memory(rho, self.most_memory)
         for to_come in reversed(range(PASSES)):
             y, noise, fit = self.look(nodes, about, measured)
             if self.flux == "measured":
@@ -120,7 +121,8 @@ class Windowed(ABC, Generic[Data]):
             done = joseph_update(prior, innovation, fit.slope, R)
             about = done.posterior
             if to_come:
-                memory = error_memory(np.sqrt(rho * slowest(_closed_loop(model, prior, fit.slope, R))))
+                rho_here = np.sqrt(rho * slowest(_closed_loop(model, prior, fit.slope, R)))
+                memory = error_memory(rho_here, self.most_memory)
         # The covariance of this one innovation is without the memory.
         HP = batched.matmul(fit.slope, prior.covariance)
         S = batched.symmetric(batched.matmul(HP, batched.transpose(fit.slope)) + noise + fit.remainder)
@@ -326,9 +328,10 @@ def slowest(transition: FloatArray) -> FloatArray:
     return np.asarray(np.abs(np.linalg.eigvals(np.where(finite, transition, 0.0))).max(axis=1))
 
 
-def error_memory(rho: FloatArray) -> FloatArray:
-    """(1 + rho) / (1 - rho), bounded: variance of a mean of errors correlated by rho, over that of independent ones."""
-    return np.asarray(np.minimum(MOST_MEMORY, (1 + rho) / np.maximum(1 - rho, 1e-9)))
+def error_memory(rho: FloatArray, most: float) -> FloatArray:
+    """Variance of a mean of errors correlated by rho, over that of independent ones: (1 + rho) / (1 - rho), at most
+    ``most``."""
+    return np.asarray(np.minimum(most, (1 + rho) / np.maximum(1 - rho, 1e-9)))
 
 
 def _closed_loop(model: ExposureModel, prior: Gaussian, H: FloatArray, R: FloatArray) -> FloatArray:

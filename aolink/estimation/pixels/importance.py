@@ -33,9 +33,8 @@ from aolink.estimation.pixels.likelihood import PixelView
 from aolink.estimation.pixels.tempering import fitted, tempered_points
 from aolink.numerics.arrays import BoolArray, FloatArray
 
-# Most rounds, and the effective sample size that is enough.
+# Most rounds.
 ROUNDS = 4
-ENOUGH = 100.0
 # If less than this share of it is reached, points are tempered: number of components fitted to their end states.
 _TOO_FEW = 0.5
 _COMPONENTS = 6
@@ -79,15 +78,15 @@ def proposed(modes: GaussianMixture, wide: GaussianMixture) -> GaussianMixture:
 
 
 def posterior(
-    view: PixelView, prior: GaussianMixture, proposal: GaussianMixture, share: float
+    view: PixelView, prior: GaussianMixture, proposal: GaussianMixture, share: float, enough: float
 ) -> tuple[GaussianMixture, BoolArray]:
     """A mixture that fits the posterior of t by importance sampling, and where it can be relied on, (axes,).
 
     Each round has this ``share`` of the usual number of points, and the effective sample size to reach is the same
-    share of the usual one. A fit to less than half of that cannot be relied on: its weights are flattened, so that it
+    share of ``enough``. A fit to less than half of that cannot be relied on: its weights are flattened, so that it
     is wide.
     """
-    wanted = np.full(len(prior.mean), share * ENOUGH)
+    wanted = np.full(len(prior.mean), share * enough)
     fit, effective = importance_corrected(view, prior, proposal, share, wanted)
     return fit, np.asarray(effective >= _TOO_FEW * wanted)
 

@@ -68,6 +68,8 @@ class ImportanceUpdater:
 
     points: int
     """Tempered points of an axis where the usual points are not enough; 0 for none."""
+    enough: float = 100.0
+    """The usual effective sample size: with less than half of it, points are tempered."""
 
     def within(self, points: int | None) -> ImportanceUpdater:
         """The same with another number of tempered points, if not None."""
@@ -114,7 +116,7 @@ class ImportanceUpdater:
         several = has_several(modes, _LEAST_DOUBTED_SHARE)[usual]
         for which, share in ((usual[~several], self.share), (usual[several], 1.0)):
             if len(which):
-                fit, good = posterior(view.part(which), before.part(which), proposal.part(which), share)
+                fit, good = posterior(view.part(which), before.part(which), proposal.part(which), share, self.enough)
                 after = after.replaced(which, fit)
                 poor[which] |= ~good & new.within_gate[which]
         few = np.flatnonzero(poor)

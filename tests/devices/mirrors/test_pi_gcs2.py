@@ -155,11 +155,10 @@ def test_commands_that_are_refused(refused: dict[str, int], what: str) -> None:
         opened(simulator)
 
 
-def test_a_stage_that_does_not_arrive(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("aolink.devices.mirrors.pi_gcs2.SETTLING_S", 0.2)
+def test_a_stage_that_does_not_arrive() -> None:
     what = r"do not reach their safe position \[17.5 17.5\] in 0.2 s, they are at \[3. 3.\]: are they zeroed"
     with PiSimulator(travel_s=float("inf")) as simulator, pytest.raises(DeviceError, match=what):
-        opened(simulator)
+        opened(simulator, settling_s=0.2)
 
 
 def test_a_stage_on_its_way_is_waited_for_when_it_is_opened_and_not_in_a_session() -> None:

@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from aolink.estimation.compiled import forget_stale, make_ready
+from aolink.estimation.compiled import compile_once, forget_stale
 
 
 def test_one_process_compiles_for_all_others_once_for_each_version_of_the_sources(tmp_path):
@@ -14,13 +14,13 @@ def test_one_process_compiles_for_all_others_once_for_each_version_of_the_source
     said, source = tmp_path / "said", tmp_path / "loops.py"
     source.touch()
     program = f"open({str(said)!r}, 'a').write('compiled ')"
-    make_ready(tmp_path, program)
-    make_ready(tmp_path, program)
+    compile_once(tmp_path, program)
+    compile_once(tmp_path, program)
     assert said.read_text() == "compiled "
     later = source.stat().st_mtime + 60
     os.utime(source, (later, later))
-    make_ready(tmp_path, program + "; raise SystemExit(1)")  # it has failed, so that the next one tries again
-    make_ready(tmp_path, program)
+    compile_once(tmp_path, program + "; raise SystemExit(1)")  # it has failed, so that the next one tries again
+    compile_once(tmp_path, program)
     assert said.read_text() == 3 * "compiled "
 
 

@@ -11,9 +11,9 @@ from scipy import linalg
 from aolink.estimation import Measurement, Status, exposure_model, make_estimator, run, score
 from aolink.estimation.frames.frame_data import SpotWindows
 from aolink.estimation.frames.measure import measure
+from aolink.estimation.kalman.filter import BlurFilter
 from aolink.estimation.kalman.gaussian import Gaussian
 from aolink.estimation.model.quadrature import blocks, quadrature_paths
-from aolink.estimation.moments import windowed
 from aolink.estimation.moments.spots import WindowedSpots
 from aolink.optics.camera import pixel_noise_sd, shot_gain
 from aolink.optics.plane import exposure_density_2d, pixel_mass_2d
@@ -226,10 +226,11 @@ def test_copies_that_do_not_hang_together_are_as_one_plant_that_holds_them_all(m
         initial_covariance=double(plant.initial_covariance), axes=1,
     )  # fmt: skip
     # How long errors last is one number for a whole copy, two copies have one each.
-    monkeypatch.setattr(windowed, "MOST_MEMORY", 1.0)
-    apart = run(two, exposures, ["moments"])["moments"]
-    together = run(dataclasses.replace(two, plant=joint), exposures, ["moments"])["moments"]
-    for a, b in zip(apart, together, strict=True):
+    apart, together = (make_estimator(each, "moments") for each in (two, dataclasses.replace(two, plant=joint)))
+    for each in (apart, together):
+        must_be(WindowedSpots, must_be(BlurFilter, each.filter).observation).most_memory = 1.0
+    for exposure in exposures:
+        a, b = apart.step(exposure), together.step(exposure)
         np.testing.assert_allclose(a.path, b.path, atol=1e-9)
         np.testing.assert_allclose(a.path_sd, b.path_sd, atol=1e-9)
 

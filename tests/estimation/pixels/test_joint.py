@@ -18,12 +18,10 @@ from aolink.estimation.kalman.gaussian import Gaussian
 from aolink.estimation.kalman.path_moments import predicted_moments
 from aolink.estimation.kalman.steady_gain import steady_gain
 from aolink.estimation.kalman.update import joseph_update
-from aolink.estimation.model import joint_paths
 from aolink.estimation.model.dense import DenseModel
 from aolink.estimation.model.factored import FactoredModel
 from aolink.estimation.model.joint_paths import JointPaths
 from aolink.estimation.model.quadrature import quadrature_paths
-from aolink.estimation.moments import windowed
 from aolink.estimation.moments.joint_moments import JointMoments, by_spot
 from aolink.estimation.moments.spots import WindowedSpots
 from aolink.estimation.moments.windowed import Regression
@@ -198,18 +196,17 @@ def test_o3_is_the_dense_filter_in_every_step(small_membrane):
 
 
 @pytest.mark.parametrize("flux", ["known", "measured"])
-def test_moments_are_the_dense_ones_but_for_errors_that_spots_share(rig, frame, flux, monkeypatch):
+def test_moments_are_the_dense_ones_but_for_errors_that_spots_share(rig, frame, flux):
     """All coefficients, the same nodes, and no errors shared: then both are the same least squares."""
-    monkeypatch.setattr(windowed, "MOST_MEMORY", 1.0)
-    monkeypatch.setattr(joint_paths, "LEFT_OUT", 1e-4)
-    joint_paths.joint_paths.cache_clear()
-    paths = joint_paths.joint_paths(frame.model, rig.sensor)
+    paths = JointPaths(frame.model, rig.sensor, left_out=1e-4)
     assert paths.size == frame.model.n_coefficients
     spots = rig.plant.n_outputs // 2
     nodes = quadrature_paths(frame.model, frame.response, paths.resolution.levels[0])
 
     class Apart(WindowedSpots):
         """At these nodes, and without errors that spots share."""
+
+        most_memory = 1.0
 
         def look(self, _, about, measured):
             return super().look(nodes, about, measured)
@@ -220,13 +217,13 @@ def test_moments_are_the_dense_ones_but_for_errors_that_spots_share(rig, frame, 
             own = np.kron(np.eye(spots), np.ones((size, size)))
             return Regression(fit.expected, fit.slope, fit.remainder * own)
 
+    class Joint(JointMoments):
+        most_memory, left_out = 1.0, 1e-4
+
     before = whole_prior(frame, paths.size)
     dense = Apart(rig.sensor, spots, flux=flux)
     expected = dense.update(frame.model, frame.response, before, frame.windows)
-    found = JointMoments(rig.sensor, rig.plant.n_outputs, flux=flux).update(
-        frame.model, frame.response, before, frame.windows
-    )
-    joint_paths.joint_paths.cache_clear()
+    found = Joint(rig.sensor, rig.plant.n_outputs, flux=flux).update(frame.model, frame.response, before, frame.windows)
     sd = np.sqrt(np.diag(expected.posterior.covariance[0]))
     np.testing.assert_allclose(found.posterior.mean[0] / sd, expected.posterior.mean[0] / sd, atol=1e-6)
     ours, dense = (each.posterior.covariance[0] / sd / sd[:, None] for each in (found, expected))

@@ -393,11 +393,11 @@ def test_a_lost_mode_is_found_again(name):
 
 
 @pytest.mark.parametrize("updates", [PROFILE, MIXTURE])
-def test_where_few_points_count_others_are_tempered(updates, monkeypatch):
+def test_where_few_points_count_others_are_tempered(updates):
     view, state = seen(quiet(RIG, 0.003), width=0.5, seed=11)
     mean, covariance, effective = by_importance(view, state)
     assert effective > 200
-    monkeypatch.setattr("aolink.estimation.pixels.importance.ENOUGH", np.inf)
+    updates = dataclasses.replace(updates, enough=np.inf)
     done, again = (updates.update(view, single(state), state, 7) for _ in range(2))
     assert done.coefficients.mean.tobytes() == again.coefficients.mean.tobytes()
     assert_near(done.coefficients, mean, covariance, 0.25, 0.2)
@@ -407,7 +407,7 @@ def test_where_few_points_count_others_are_tempered(updates, monkeypatch):
 
 @pytest.mark.parametrize("updates", [PROFILE, MIXTURE])
 @pytest.mark.parametrize("temper", [False, True])
-def test_the_posterior_of_a_single_coefficient_is_an_integral_over_a_line(updates, temper, monkeypatch):
+def test_the_posterior_of_a_single_coefficient_is_an_integral_over_a_line(updates, temper):
     """For one state without process noise, the posterior is an integral over a line."""
     noise = 0.0 * RIG.plant.process_noise
     one = np.ones((1, 1))
@@ -418,7 +418,7 @@ def test_the_posterior_of_a_single_coefficient_is_an_integral_over_a_line(update
     view, state = seen(dataclasses.replace(RIG, plant=plant), width=0.5)
     assert view.reduced.size == 1
     if temper:
-        monkeypatch.setattr("aolink.estimation.pixels.importance.ENOUGH", np.inf)
+        updates = dataclasses.replace(updates, enough=np.inf)
     t = np.linspace(-3, 3, 60_001)
     log = view.log_likelihoods(t[None, :, None])[0] - 0.5 * t**2 / state.covariance[0, 0, 0]
     w = np.exp(log - log.max())
@@ -454,11 +454,11 @@ def test_an_unstable_plant_does_not_end_in_infinity(name):
 
 
 @pytest.mark.parametrize("updates", [PROFILE, MIXTURE])
-def test_a_frame_that_cannot_be_believed_is_not_tempered(updates, monkeypatch):
+def test_a_frame_that_cannot_be_believed_is_not_tempered(updates):
     view, state = seen(quiet(RIG, 0.001), width=0.3)
     lie = view.part(slice(None))
     lie.y = np.roll(np.abs(lie.y), 15, axis=1) + 3.0
-    monkeypatch.setattr("aolink.estimation.pixels.importance.ENOUGH", np.inf)
+    updates = dataclasses.replace(updates, enough=np.inf)
     of_a_lie = updates.update(lie, single(state), state, 0)
     assert not of_a_lie.innovation.within_gate[0]
     assert not of_a_lie.poor[0]

@@ -1,0 +1,78 @@
+"""The journal of a session: the messages that it records, and among them its log and facts about the devices' clocks
+and lines."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from foxglove_schemas_protobuf.Log_pb2 import Log
+
+from aolink.devices.interfaces import Camera, ClockSampled, Device, Mirror, Time
+from aolink.recording import schemas_pb2 as pb
+from aolink.recording import topics
+from aolink.recording.writer import RecordingWriter
+from aolink.session.report import Report
+
+
+class Journal:
+    """Writes a session's messages into its recording, and notes warnings and counts in its `Report`."""
+
+    def __init__(self, writer: RecordingWriter, report: Report, time: Time) -> None:
+        self.report = report
+        self.record = writer.write
+        self._time = time
+
+    def log(self, text: str, level: Log.Level.ValueType = Log.INFO) -> None:
+        """Record a sentence about the session."""
+        now = self._time.now_ns()
+        entry = Log(level=level, message=text, name="aolink")
+        entry.timestamp.FromNanoseconds(now)
+        self.record(topics.LOG, entry, now)
+
+    def warn(self, text: str, level: Log.Level.ValueType = Log.WARNING) -> None:
+        """Record a warning, which the report has as well."""
+        self.report.warnings.append(text)
+        self.log(text, level)
+
+    def latency(self, latency: pb.Latency, log_time_ns: int) -> None:
+        self.record(topics.LATENCY, latency, log_time_ns)
+
+    def clock(self, device: Device, sampled: ClockSampled) -> None:
+        """Record the comparison of a device's clock with the host's."""
+        clock, exchange, report = device.clock, sampled.exchange, self.report
+        sample = pb.ClockSample(
+            device=device.name,
+            host_send_ns=exchange.host_send_ns,
+            device_receive_ns=exchange.device_receive_ns,
+            device_send_ns=exchange.device_send_ns,
+            host_receive_ns=exchange.host_receive_ns,
+            round_trip_ns=exchange.round_trip_ns,
+            accepted=sampled.accepted,
+        )
+        if clock.ready:
+            _, sigma_ns = clock.device_ns(exchange.host_receive_ns)
+            sample.offset_ns = clock.offset_ns(exchange.host_receive_ns)
+            sample.frequency_ppm, sample.sigma_ns = clock.frequency_ppm, sigma_ns
+            report.clock_offset_ns, report.clock_frequency_ppm = sample.offset_ns, sample.frequency_ppm
+            report.clock_sigma_ns = sigma_ns
+        self.record(topics.CLOCK, sample, exchange.host_receive_ns)
+        if sampled.step is not None:
+            size_s, period_s = sampled.step.size_ns / 1e9, (sampled.step.before_ns - sampled.step.after_ns) / 1e9
+            direction = "forward" if size_s > 0 else "back"
+            self.warn(
+                f"the {device.name}'s clock was set {direction} by {abs(size_s):.6f} s: host times of its stamps"
+                f" in the {period_s:.3f} s from {sampled.step.after_ns} ns on may be off by as much"
+            )
+
+    def statistics(self, devices: Sequence[Camera | Mirror], now: int) -> None:
+        """Record the counts of each device's line."""
+        counts = {device.name: device.statistics() for device in devices}
+        report = self.report
+        report.packets_bad_crc = sum(each.get("bad_crc", 0) for each in counts.values())
+        report.packets_bad_framing = sum(each.get("bad_framing", 0) for each in counts.values())
+        report.packets_bad_payload = sum(each.get("bad_payload", 0) for each in counts.values())
+        report.packets_duplicate = sum(each.get("duplicates", 0) for each in counts.values())
+        report.packets_missing = sum(each.get("sequence_gaps", 0) for each in counts.values())
+        for name, each in counts.items():
+            if each:
+                self.record(topics.LINK, pb.LinkStatistics(device=name, **each), now)

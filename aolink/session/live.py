@@ -1,0 +1,141 @@
+"""Exposures on their way through a session: to the estimators, to the controller, and with the estimates to the
+function that watches the session."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+from foxglove_schemas_protobuf.Log_pb2 import Log
+
+from aolink.assembly import Frame
+from aolink.devices.interfaces import Time
+from aolink.estimation import Estimate
+from aolink.exposure import Exposure, Picture
+from aolink.recording import topics
+from aolink.rig import Rig
+from aolink.session.estimating import Estimating, Outcome
+from aolink.session.journal import Journal
+from aolink.session.report import LatencyBook
+
+Show = Callable[[Exposure, Sequence[Outcome]], None]
+"""A function that gets each exposure, with the estimates that have come since the one before; it must not take time."""
+
+Control = Callable[[Exposure, Estimate | None, int], None]
+"""Lets the controller see an exposure, with the estimate that serves it; the last argument is the log time, ns."""
+
+
+class LiveExposures:
+    """Hands exposures over as they come, and records the estimates of them.
+
+    ``serves`` is the estimator whose estimates ``control`` gets; where it is empty, ``control`` gets each exposure at
+    once.
+    """
+
+    def __init__(
+        self,
+        rig: Rig,
+        time: Time,
+        journal: Journal,
+        latencies: LatencyBook,
+        estimating: Estimating,
+        show: Show | None,
+        control: Control | None,
+        serves: str,
+    ) -> None:
+        self._rig, self._time, self._journal, self._latencies = rig, time, journal, latencies
+        self._report = journal.report
+        self._estimating, self._show, self._control, self._serves = estimating, show, control, serves
+        self.newest_frame = 0
+        """The newest frame that commands can depend on."""
+        self._unsettled: dict[int, list[Outcome]] = {}
+        """Outcomes so far of the exposures that some estimators are still working on, by frame."""
+        self._unseen: Exposure | None = None
+        """The exposure that has not been given to the session's watcher yet."""
+        self._unseen_estimates: list[Outcome] = []
+        """The estimates that have not been given to the session's watcher yet."""
+
+    def take(self, exposures: Sequence[Exposure], log_time_ns: int) -> None:
+        """Take the next exposures."""
+        for exposure in exposures:
+            self._report.exposures += 1
+            self._show_unseen(ready=True)
+            self._unseen = exposure
+            self._unsettled[exposure.frame_id] = []
+            outcomes = self._estimating.offer(exposure)
+            if self._control is not None and not self._serves:
+                self._control(exposure, None, log_time_ns)
+            if not self._estimating.names:
+                self._settle(exposure.frame_id)
+            self._take_outcomes(outcomes, log_time_ns)
+
+    def take_scene(self, frame: Frame) -> None:
+        """Take a frame of the picture sensor, for the watcher."""
+        exposure = self._unseen
+        if self._show is not None and exposure is not None and frame.frame_id == exposure.frame_id:
+            self._unseen = replace(exposure, scene=Picture(pixels=frame.pixels, mask=frame.mask))
+        self._show_unseen()
+
+    def take_estimates(self) -> None:
+        """Take the estimates that have become known."""
+        self._take_outcomes(self._estimating.outcomes(), self._time.now_ns())
+
+    def finish(self, patience_s: float) -> None:
+        """Wait for the estimates under way, and record exposures without an estimate as skipped."""
+        self._take_outcomes(self._estimating.finish(patience_s), self._time.now_ns())
+        self._note_failures()
+        self._show_unseen(ready=True)
+
+    def _take_outcomes(self, outcomes: Sequence[Outcome], log_time_ns: int) -> None:
+        for outcome in outcomes:
+            name, frame_id, message = outcome.estimator, outcome.exposure.frame_id, outcome.message
+            if message is not None:
+                self._journal.record(topics.estimate_topic(name), message, log_time_ns)
+                if self._control is not None and name == self._serves:
+                    self._control(outcome.exposure, outcome.estimate(self._rig), log_time_ns)
+                if self._show is not None:
+                    self._unseen_estimates.append(outcome)
+            if name in self._report.estimation:
+                self._report.estimation[name].add(outcome)
+                self._journal.record(topics.estimation_topic(name), outcome.account(), log_time_ns)
+            outcomes_so_far = self._unsettled[frame_id]
+            if message is not None and all(each.message is None for each in outcomes_so_far):
+                self._know(frame_id, self._time.now_ns())
+            outcomes_so_far.append(outcome)
+            if message is None:
+                self._note_failures()
+            if len(outcomes_so_far) == len(self._estimating.names):
+                self._settle(frame_id)
+
+    def _note_failures(self) -> None:
+        for name, why in self._estimating.failures.items():
+            if not self._report.estimation[name].failed:
+                self._report.estimation[name].failed = why
+                text = f"the estimator {name} failed, the recording goes on without it: {why}"
+                self._journal.warn(text, Log.ERROR)
+
+    def _settle(self, frame_id: int) -> None:
+        """Finish an exposure that all estimators have estimated or skipped."""
+        outcomes = self._unsettled.pop(frame_id)
+        if all(each.message is None for each in outcomes):
+            self._know(frame_id, 0 if outcomes else self._time.now_ns())
+        self._show_unseen()
+
+    def _know(self, frame_id: int, estimated_ns: int) -> None:
+        """Note that commands from now on depend on a frame: its first estimate is there, or there will be none."""
+        self.newest_frame = max(self.newest_frame, frame_id)
+        self._latencies.estimated(frame_id, estimated_ns)
+
+    def _show_unseen(self, *, ready: bool = False) -> None:
+        """Give the waiting exposure to the watcher when it is complete, or, if ``ready``, as it is.
+
+        With a picture sensor, its scene belongs to it. It does not wait for estimates that are not there when the next
+        exposure comes; they are given with that one.
+        """
+        exposure = self._unseen
+        if self._show is None or exposure is None:
+            return
+        whole = self._rig.scene is None or exposure.scene is not None
+        if ready or (whole and exposure.frame_id not in self._unsettled):
+            self._show(exposure, self._unseen_estimates)
+            self._unseen, self._unseen_estimates = None, []
