@@ -275,14 +275,12 @@ def spheres(effort: Effort) -> list[Row]:
                 f"spheres, sums of {count} less single frames", f"{off:+.1f} sd", f"pylake {tracks:+.1f} sd",
                 1 / max(abs(off), 1e-3), 1.0,
             ))  # fmt: skip
-    return [*rows, *_compression()]
+    return [*rows, *compression()]
 
 
 def diffusion(frames: int) -> Diffusion:
     """The spheres' diffusion from sums of so many frames, and by pylake's covariance estimator on the means of the
     positions in these frames."""
-    from lumicks.pylake.kymotracker.detail.msd_estimation import _cve
-
     rig, exposures, _ = film_of_spheres(frames)
     seen = [readings(rig, exposures, kernel_known=False)]
     space = space_of(["random-walk"], seen, rig.sensor.kernel.variance, with_noise=True, with_kernel=True)
@@ -296,17 +294,24 @@ def diffusion(frames: int) -> Diffusion:
         np.full(rig.n_outputs, np.nan) if each.truth is None else each.truth.path.mean(axis=1) - move
         for each, move in zip(exposures, moves, strict=True)
     ]).T / rig.sensor.pixel_width  # fmt: skip
-    each = []
-    for track in places:
+    return Diffusion(intensity.best * unit, width / (2 * 1.96) * unit, *by_pylake(places, frames))
+
+
+def by_pylake(tracks: NDArray[np.float64], frames: int) -> tuple[float, float]:
+    """Variance that tracks (tracks, exposures) of means of so many frames gain in a frame, and its standard error over
+    the tracks, by pylake's covariance estimator; NaN where there is no position."""
+    from lumicks.pylake.detail.pixel_calibration import PositionUnit
+    from lumicks.pylake.kymotracker.detail.msd_estimation import estimate_diffusion_cve
+
+    found = []
+    for track in tracks:
         at = np.flatnonzero(np.isfinite(track))
-        each.append(2 * _cve(at, track[at], dt=frames, blur_constant=1 / 6)[0])
-    return Diffusion(
-        intensity.best * unit, width / (2 * 1.96) * unit, float(np.mean(each)),
-        float(np.std(each, ddof=1) / math.sqrt(len(each))),
-    )  # fmt: skip
+        one = estimate_diffusion_cve(at, track[at], dt=frames, blur_constant=1 / 6, unit=PositionUnit.pixel)
+        found.append(2 * float(one.value))
+    return float(np.mean(found)), float(np.std(found, ddof=1) / math.sqrt(len(found)))
 
 
-def _compression() -> list[Row]:
+def compression() -> list[Row]:
     """What the film's compression does to single frames: motion comes late, and with a group's key frame at once."""
     xy = np.load(SPHERES)["tracked_xy"]
     steps = np.diff(xy, axis=1).transpose(0, 2, 1).reshape(-1, xy.shape[1] - 1)
