@@ -191,22 +191,22 @@ def readings(
     )  # fmt: skip
     seen = _lit(rig.sensor.profile, density, mask)
     variances = np.full(rig.n_outputs, rig.sensor.kernel.variance)
-    found = _measured(seen, variances, blank)
+    made = _measured(seen, variances, blank)
     if not kernel_known:
         for _ in range(2):
-            variances = _variances(rig, variances, found)
-            found = _measured(seen, variances, blank)
-    return _divided(found)
+            variances = _variances(rig, variances, made)
+            made = _measured(seen, variances, blank)
+    return _divided(made)
 
 
 def _lit(sensor: Sensor, density: FloatArray, mask: BoolArray) -> _Seen:
     """Densities divided by their light, if they show that it is not always one: all readings are proportional to it."""
-    light, whole = density.sum(axis=2) * sensor.pixel_width, mask.all(axis=2)
+    light, whole = density.sum(axis=2) * sensor.pixel_width, np.asarray(mask.all(axis=2))
     off, both = light - 1, whole[:, 1:] & whole[:, :-1]
     # Noise differs from exposure to exposure, light lasts. A spot that leaves the sensor now and then loses light too:
     # signs and medians do not count how much.
     pairs = (off[:, 1:] * off[:, :-1])[both]
-    lasting = (pairs > 0).sum() - len(pairs) / 2 > _SEEN * math.sqrt(len(pairs)) / 2
+    lasting = int((pairs > 0).sum()) - len(pairs) / 2 > _SEEN * math.sqrt(len(pairs)) / 2
     if not lasting or float(np.median(np.abs(off[whole]))) < _EXACT:
         return _Seen(sensor, density, mask, None)
     usual = float(np.median(light[whole]))
@@ -222,7 +222,7 @@ def _variances(rig: Rig, variances: FloatArray, found: Readings) -> FloatArray:
     copies = width.reshape(-1, rig.plant.n_outputs)
     wider = (copies - np.average(copies, axis=0, weights=count.reshape(copies.shape))).ravel()
     known = rig.sensor.kernel.variance
-    return np.clip(variances + wider, _NARROWEST * known, _WIDEST * known)
+    return np.asarray(np.clip(variances + wider, _NARROWEST * known, _WIDEST * known))
 
 
 def _divided(found: Readings) -> Readings:
@@ -351,7 +351,7 @@ def _at(seen: _Seen, variances: FloatArray, blank: Readings, centre: FloatArray,
                 continue
             first, second = W @ seen.density[o, k] * D
             mean[o, k], square[o, k] = first - off, second - 2 * off * first + off**2
-            mean_noise[o, k], square_noise[o, k] = seen.noise(W, o, k)
+            mean_noise[o, k], square_noise[o, k] = seen.noise(W, o, int(k))
             usable[o, k] = True
     found = replace(
         blank, mean=mean, square=square, mean_noise=mean_noise, square_noise=square_noise, centre=centre, usable=usable
