@@ -41,8 +41,38 @@ _FOLLOWED = 0.6
 """Weights follow the spot if that makes its motion about them smaller by this factor."""
 _LEAST_MOTION = 0.15
 """Least standard deviation of a path that weights are made for, in those of the kernel."""
+_FEWEST_STEPS = 8
+"""Fast steps in an exposure from which on their number does not matter: with N instants instead of an integral, a
+random walk's means gain 1/(2 N^2) of variance."""
+_NARROWEST, _WIDEST = 0.25, 4.0
+"""Limits of the variance of an output's kernel, in those of the rig file's."""
+_SEEN, _EXACT, _LEAST_LIGHT = 4.0, 0.02, 0.2
+"""The light is measured where its deviations from one have their neighbours' sign more often than chance allows by this
+many standard deviations, and are larger than the second value; with less than the last there is no spot to speak of."""
 _LOST = 0.05
 """Share of the weights' noise that may be in pixels that did not arrive."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Seen:
+    """What the readings are made from, (outputs, slots, pixels)."""
+
+    sensor: Sensor
+    density: FloatArray
+    """Divided by ``light``."""
+    mask: BoolArray
+    light: FloatArray | None
+    """Light of each exposure, (outputs, slots), where it is measured; None where it is one, as the rig file says."""
+
+    def noise(self, W: FloatArray, o: int, k: int) -> FloatArray:
+        """Variances of weighted sums in one exposure by the pixels' noise."""
+        sensor, y = self.sensor, self.density[o, k]
+        D, light = sensor.pixel_width, 1.0
+        if self.light is not None:
+            light = float(self.light[o, k])
+            W = W - (W @ y * D)[:, None]  # noise of the light is noise of the quotient
+        pixel = effective_noise_density(sensor) / D + shot_gain(sensor) * np.maximum(light * y, 0.0)
+        return np.asarray((W**2) @ pixel * D**2 / light**2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,13 +131,17 @@ class Readings:
         return replace(self, **{name: getattr(self, name)[list(which)] for name in names})
 
 
-def readings(rig: Rig, exposures: Sequence[Exposure], *, plant_known: bool = True) -> Readings:
+def readings(
+    rig: Rig, exposures: Sequence[Exposure], *, plant_known: bool = True, kernel_known: bool = True
+) -> Readings:
     """The readings of a recording's exposures.
 
     Parameters
     ----------
     plant_known:
         Whether the inputs' response is that of the rig's plant; if not, no response is part of the expected position.
+    kernel_known:
+        Whether all kernels are as wide as the rig file says; if not, those of several copies of the plant may differ.
 
     Raises
     ------
@@ -155,7 +189,52 @@ def readings(rig: Rig, exposures: Sequence[Exposure], *, plant_known: bool = Tru
         motion=0.0, follows=False,
         reach=(rig.sensor.field[1] - rig.sensor.field[0]) / 2,
     )  # fmt: skip
-    return _measured(rig.sensor.profile, density, mask, blank)
+    seen = _lit(rig.sensor.profile, density, mask)
+    variances = np.full(rig.n_outputs, rig.sensor.kernel.variance)
+    made = _measured(seen, variances, blank)
+    if not kernel_known:
+        for _ in range(2):
+            variances = _variances(rig, variances, made)
+            made = _measured(seen, variances, blank)
+    return _divided(made)
+
+
+def _lit(sensor: Sensor, density: FloatArray, mask: BoolArray) -> _Seen:
+    """Densities divided by their light, if they show that it is not always one: all readings are proportional to it."""
+    light, whole = density.sum(axis=2) * sensor.pixel_width, np.asarray(mask.all(axis=2))
+    off, both = light - 1, whole[:, 1:] & whole[:, :-1]
+    # Noise differs from exposure to exposure, light lasts. A spot that leaves the sensor now and then loses light too:
+    # signs and medians do not count how much.
+    pairs = (off[:, 1:] * off[:, :-1])[both]
+    lasting = int((pairs > 0).sum()) - len(pairs) / 2 > _SEEN * math.sqrt(len(pairs)) / 2
+    if not lasting or float(np.median(np.abs(off[whole]))) < _EXACT:
+        return _Seen(sensor, density, mask, None)
+    usual = float(np.median(light[whole]))
+    light = np.where(whole & (light > _LEAST_LIGHT), light, usual)
+    return _Seen(sensor, density / light[:, :, None], mask, light)
+
+
+def _variances(rig: Rig, variances: FloatArray, found: Readings) -> FloatArray:
+    """Variances of the outputs' kernels: copies of the plant move alike, and where one's images are wider than the
+    others' by more than its kernel explains, its kernel is wider."""
+    count = np.maximum(found.usable.sum(axis=1), 1)
+    width = ((found.square - found.mean**2 + found.mean_noise) * found.usable).sum(axis=1) / count
+    copies = width.reshape(-1, rig.plant.n_outputs)
+    wider = (copies - np.average(copies, axis=0, weights=count.reshape(copies.shape))).ravel()
+    known = rig.sensor.kernel.variance
+    return np.asarray(np.clip(variances + wider, _NARROWEST * known, _WIDEST * known))
+
+
+def _divided(found: Readings) -> Readings:
+    """Readings with fast steps divided where exposures have few: a camera integrates over a fast step as well."""
+    parts = -(-_FEWEST_STEPS // found.n_steps)
+    if parts == 1 or found.offset:
+        return found
+    held, last = np.repeat(found.response[:, :, :-1], parts, axis=2), found.response[:, :, -1:]
+    return replace(
+        found, step_s=found.step_s / parts, n_steps=found.n_steps * parts, period_steps=found.period_steps * parts,
+        response=np.concatenate([held, last], axis=2), inputs=np.repeat(found.inputs, parts, axis=2),
+    )  # fmt: skip
 
 
 def _inputs(rig: Rig, exposures: Sequence[Exposure], steps: int) -> FloatArray:
@@ -199,13 +278,13 @@ def by_slot(path: FloatArray, slots: int, n_steps: int, period: int, offset: flo
     return np.asarray(path[:, np.arange(slots)[:, None] * period + np.arange(n_steps + 1)])
 
 
-def _measured(sensor: Sensor, density: FloatArray, mask: BoolArray, blank: Readings) -> Readings:
+def _measured(seen: _Seen, variances: FloatArray, blank: Readings) -> Readings:
     """Readings from densities (outputs, slots, pixels): the expected position follows the spot, if that makes the
     motion about it smaller."""
-    expected = blank.response[:, :, :-1].mean(axis=2)
+    sensor, expected = seen.sensor, blank.response[:, :, :-1].mean(axis=2)
     middle = (sensor.field[0] + sensor.field[1]) / 2
     # First the spot may be anywhere; then weights are made for the motion that was found.
-    found = _at(sensor, density, mask, blank, np.full_like(expected, middle), blank.reach / _REACH)
+    found = _at(seen, variances, blank, np.full_like(expected, middle), blank.reach / _REACH)
     if not found.usable.any():
         raise IdentificationError("no exposure shows a spot on the rig's sensor")
     best = found
@@ -214,7 +293,7 @@ def _measured(sensor: Sensor, density: FloatArray, mask: BoolArray, blank: Readi
         still = expected + _mean(place, best.usable)[:, None]
         follows = expected + before(place, best.usable)
         tried = [
-            _at(sensor, density, mask, blank, centre, _motion_about(sensor, best, centre))
+            _at(seen, variances, blank, centre, _motion_about(sensor, best, centre))
             for centre in (np.clip(each, *sensor.field) for each in (still, follows))
         ]
         last = best.motion
@@ -251,32 +330,28 @@ def _motion_about(sensor: Sensor, found: Readings, centre: FloatArray) -> float:
     return math.sqrt(max(float((np.maximum(each, 0.0) + sd).max()), least))
 
 
-def _at(
-    sensor: Sensor, density: FloatArray, mask: BoolArray, blank: Readings, centre: FloatArray, motion: float
-) -> Readings:
-    """The readings about these positions, for paths of this standard deviation."""
-    D, gain = sensor.pixel_width, shot_gain(sensor)
-    read = effective_noise_density(sensor) / D
-    shape = centre.shape
+def _at(seen: _Seen, variances: FloatArray, blank: Readings, centre: FloatArray, motion: float) -> Readings:
+    """The readings about these positions, for paths of this standard deviation and kernels of these variances."""
+    sensor, shape = seen.sensor, centre.shape
+    D = sensor.pixel_width
     mean, square, mean_noise, square_noise = (np.zeros(shape) for _ in range(4))
     usable = np.zeros(shape, dtype=bool)
-    made: dict[int, FloatArray] = {}
+    made: dict[tuple[int, float], FloatArray] = {}
     for o in range(shape[0]):
         for k in np.flatnonzero(blank.usable[o]):
             # Places are a hundredth of a pixel apart, so that weights are made once for many exposures.
             place = round((centre[o, k] - sensor.field[0]) / (0.01 * D))
-            if place not in made:
-                made[place] = _weights(sensor, sensor.field[0] + 0.01 * D * place, motion)
-            W = made[place]
+            if (place, variances[o]) not in made:
+                made[place, variances[o]] = _weights(sensor, variances[o], sensor.field[0] + 0.01 * D * place, motion)
+            W = made[place, variances[o]]
             off = centre[o, k] - (sensor.field[0] + 0.01 * D * place)
-            here, y = mask[o, k], density[o, k]
+            here = seen.mask[o, k]
             noise = (W**2).sum(axis=1)
             if ((W[:, ~here] ** 2).sum(axis=1) > _LOST * noise).any():
                 continue
-            first, second = W @ y * D
-            variance = (W**2) @ (read + gain * np.maximum(y, 0.0)) * D**2
+            first, second = W @ seen.density[o, k] * D
             mean[o, k], square[o, k] = first - off, second - 2 * off * first + off**2
-            mean_noise[o, k], square_noise[o, k] = variance
+            mean_noise[o, k], square_noise[o, k] = seen.noise(W, o, int(k))
             usable[o, k] = True
     found = replace(
         blank, mean=mean, square=square, mean_noise=mean_noise, square_noise=square_noise, centre=centre, usable=usable
@@ -284,20 +359,21 @@ def _at(
     return replace(found, motion=_motion_about(sensor, found, centre)) if usable.any() else found
 
 
-def _weights(sensor: Sensor, centre: float, motion: float) -> FloatArray:
-    """Weights of the pixels for theta - c and (theta - c)^2, (2, pixels), with the least noise.
+def _weights(sensor: Sensor, variance: float, centre: float, motion: float) -> FloatArray:
+    """Weights of the pixels for theta - c and (theta - c)^2, (2, pixels), with the least noise, for a kernel of this
+    variance.
 
     They are a ridge regression for spots at points of the range, with the largest ridge for which g is still accurate
     enough.
     """
     edges, D = sensor.edges, sensor.pixel_width
     read = math.sqrt(effective_noise_density(sensor) * D)
-    margin = math.sqrt(sensor.kernel.variance)
+    margin = math.sqrt(variance)
     low, high = sensor.field[0] + margin - centre, sensor.field[1] - margin - centre
     at = np.linspace(max(-_REACH * motion, min(low, -margin)), min(_REACH * motion, max(high, margin)), _POINTS)
     share = np.exp(-0.5 * (at / (1.5 * motion)) ** 2) + 0.02
     share /= share.sum()
-    G = pixel_masses(sensor.kernel.variance, edges, centre + at, 0)[0]
+    G = pixel_masses(variance, edges, centre + at, 0)[0]
     root = np.sqrt(share)[:, None]
     U, values, V = linalg.svd(root * G, full_matrices=False)
     out = np.empty((2, len(V[0])))

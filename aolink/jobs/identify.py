@@ -103,7 +103,7 @@ def identify(recordings: Sequence[Recording], rig: Rig | None, wanted: Wanted, t
             raise IdentificationError(
                 f"{recording.path} is of another rig than {recordings[0].path}: timing and outputs must be the same"
             )
-        seen.append(readings(own, list(recording.exposures()), plant_known=plant_known))
+        seen.append(readings(own, list(recording.exposures()), plant_known=plant_known, kernel_known=not wanted.kernel))
         if tell:
             tell("recordings", number + 1, len(recordings))
     return from_readings(first, seen, wanted, tell)

@@ -1,14 +1,25 @@
 """The readings of simulated frames against the paths that made them."""
 
+import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 import aolink
 from aolink.errors import IdentificationError
-from aolink.identification import readings
+from aolink.identification import Process, ProcessSum, readings
+from aolink.identification.likelihood import Likelihood
+from aolink.importing.film import array_film
+from aolink.importing.first_rig import first_rig
+from aolink.importing.frames import Settings
+from aolink.importing.recording import import_film
+from aolink.recording.reader import Recording
 from tests.kinds import truth_of
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
+from paper_report.spot_films import random_walk, spot_film
 
 
 @pytest.mark.parametrize("name", ["jitter", "section-vi-lively", "tip-tilt"])
@@ -57,3 +68,64 @@ def test_dark_frames_are_refused():
     ]
     with pytest.raises(IdentificationError, match="0 exposures show a spot"):
         readings(rig, dark)
+
+
+@pytest.mark.parametrize("light", [0.8, 1.25])
+def test_light_that_is_not_one_changes_no_reading(light):
+    exposures = aolink.simulate("jitter", 40, seed=3)
+    rig, black = exposures.rig, float(exposures.rig.sensor.black_level)
+    pixels = [np.rint(black + light * (each.pixels - black)).astype(np.uint16) for each in exposures]
+    brighter = [replace(each, pixels=some) for each, some in zip(exposures, pixels, strict=True)]
+
+    def response(seen):
+        path = np.array([truth_of(each).path for each in exposures]).swapaxes(0, 1) - seen.centre[:, :, None]
+        true = (path**2).mean(axis=2)
+        return float((seen.square * true).sum() / (true**2).sum())
+
+    assert response(readings(rig, brighter)) == pytest.approx(response(readings(rig, list(exposures))), abs=0.03)
+
+
+def test_an_exposure_of_one_step_is_an_integral():
+    """A random walk's mean over its own frame period changes by two thirds of its intensity, so that a likelihood that
+    took an exposure of one fast step for an instant would be highest at 0.67."""
+    text = aolink.rig.load_rig("jitter").toml.replace("exposure_steps = 200", "exposure_steps = 1")
+    rig = aolink.rig.parse_rig(text.replace("block_steps = 50", "block_steps = 1"))
+    seen = readings(rig, list(aolink.simulate(rig, 40, seed=3)))
+    assert seen.n_steps * seen.step_s == pytest.approx(rig.timing.fast_step_s)
+    random, shape = np.random.default_rng(0), (60, 40)
+    walk = np.cumsum(random.normal(size=(60, 40 * 64)) / 8, axis=1).reshape(*shape, 64).mean(axis=2)
+    walks = replace(
+        seen, mean=walk, square=walk**2, mean_noise=np.full(shape, 1e-4), square_noise=np.full(shape, 1e6),
+        centre=np.zeros(shape), usable=np.ones(shape, dtype=bool), reach=10.0,
+        response=np.zeros((*shape, seen.n_steps + 1)),
+    )  # fmt: skip
+    likelihood = Likelihood(walks, 16)
+    tried = np.array([0.55, 0.67, 0.8, 1.0, 1.2])
+    models = [ProcessSum((Process("random-walk", (each / rig.timing.fast_step_s,)),)) for each in tried]
+    assert tried[np.argmax([likelihood(model) for model in models])] == 1.0
+
+
+@pytest.mark.long
+def test_copies_of_a_plant_may_have_kernels_of_their_own(tmp_path):
+    """Of two spots one is narrower and one wider than the rig file's kernel: both are read alike only where the kernel
+    is not taken as known."""
+    random, middle = np.random.default_rng(1), np.array([[24.0, 24.0]])
+    motion = random_walk(random, 40, 1, 0.4)
+    motion -= motion.mean(axis=(0, 1))
+    films = [spot_film(random, motion, middle, (48, 48), sd=sd).frames for sd in (1.6, 2.0)]
+    film = array_film(np.concatenate(films, axis=2), "film")
+    places = tuple((float(x), float(y)) for x, y in (motion[0].mean(axis=0) + middle + [[0, 0], [48, 0]]))
+    settings = Settings(rate_hz=100.0, subtract_median=True, track=2, places=places)
+    rig = aolink.rig.parse_rig(first_rig(film, settings, "film").text)
+
+    import_film(film, rig, settings, tmp_path / "film.mcap")
+    exposures = list(Recording(tmp_path / "film.mcap").exposures())
+
+    def wider(kernel_known):
+        seen = readings(rig, exposures, kernel_known=kernel_known)
+        width = (seen.square - seen.mean**2).mean(axis=1) / rig.sensor.pixel_width**2
+        return width[2:].mean() - width[:2].mean()
+
+    apart = 2.0**2 - 1.6**2
+    assert wider(True) > 0.5 * apart
+    assert abs(wider(False)) < 0.2 * apart

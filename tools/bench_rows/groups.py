@@ -28,7 +28,7 @@ ROWS = {
     "loop_worth": (
         "worth_headline", "worth_lines", "worth_resonance", "worth_air", "worth_factors",
     ),
-    "identification": ("coverage", "following"),
+    "identification": ("coverage", "following", "spheres"),
 }  # fmt: skip
 """Functions that measure, by the module of bench_rows that they are in, in the order of the table."""
 
@@ -36,7 +36,7 @@ LONG = frozenset(
     {
         "soak", "closed_loop_soak", "bit_errors", "large_frames", "time_to_park", "restoration_quality", "shaken",
         "moving_scene", "residual_slopes", "fall_back", "worth_headline", "worth_lines", "worth_resonance",
-        "worth_air", "worth_factors", "coverage", "following",
+        "worth_air", "worth_factors", "coverage", "following", "spheres",
     }
 )  # fmt: skip
 """Functions that take two minutes or more each, `soak` forty, `closed_loop_soak` sixty.

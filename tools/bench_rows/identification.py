@@ -1,5 +1,5 @@
-"""Rows about `aolink identify` on recordings (logs) drawn at random: whether its sets hold the truth, and its offers
-when it follows."""
+"""Rows about `aolink identify`: on recordings (logs) drawn at random, whether its sets hold the truth, and its offers
+when it follows; and the diffusion of the film of spheres."""
 
 from __future__ import annotations
 
@@ -13,6 +13,8 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 from numpy.typing import NDArray
+from paper_report.spheres import FILE as SPHERES
+from paper_report.spheres import spheres as film_of_spheres
 from scipy import stats
 
 import aolink
@@ -234,3 +236,97 @@ def _slopes(parts: list[tuple[Rig, int]], random: np.random.Generator) -> NDArra
             out.append(model.C @ state)
             state = model.A @ state + root @ push
     return np.array(out)
+
+
+_PICTURES = 12
+"""Frames from one key frame of the film's compression to the next."""
+_KEY = (8, 10)
+"""The steps between frames, counted in such a group, that are taken as those at its key frame."""
+
+
+@dataclass(frozen=True)
+class Diffusion:
+    """Variance that the spheres gain in a frame period along one direction, with its standard error, pixels squared."""
+
+    ours: float
+    ours_sd: float
+    pylake: float
+    pylake_sd: float
+
+
+def spheres(effort: Effort) -> list[Row]:
+    """Diffusion of the film of spheres from sums of frames, beside pylake's estimate, corrected for blur, on the tracks
+    of the same frames. The ratio is the joint standard error over the difference."""
+    frames = (1, 2, 4, 8) if effort == FULL else (8,)
+    found = {count: diffusion(count) for count in frames}
+    first = found[frames[0]]
+    rows = []
+    for count, each in found.items():
+        ours, theirs = f"{each.ours:.3f} +- {each.ours_sd:.3f}", f"{each.pylake:.3f} +- {each.pylake_sd:.3f}"
+        off = (each.ours - each.pylake) / math.hypot(each.ours_sd, each.pylake_sd)
+        rows.append(Row(
+            f"spheres, sums of {count}: pixels squared a frame", ours, f"pylake {theirs}, {off:+.1f} sd",
+            1 / max(abs(off), 1e-3), 1.0,
+        ))  # fmt: skip
+        if count != frames[0]:
+            off = (each.ours - first.ours) / math.hypot(each.ours_sd, first.ours_sd)
+            tracks = (each.pylake - first.pylake) / math.hypot(each.pylake_sd, first.pylake_sd)
+            rows.append(Row(
+                f"spheres, sums of {count} less single frames", f"{off:+.1f} sd", f"pylake {tracks:+.1f} sd",
+                1 / max(abs(off), 1e-3), 1.0,
+            ))  # fmt: skip
+    return [*rows, *compression()]
+
+
+def diffusion(frames: int) -> Diffusion:
+    """The spheres' diffusion from sums of so many frames, and by pylake's covariance estimator on the means of the
+    positions in these frames."""
+    rig, exposures, _ = film_of_spheres(frames)
+    seen = [readings(rig, exposures, kernel_known=False)]
+    space = space_of(["random-walk"], seen, rig.sensor.kernel.variance, with_noise=True, with_kernel=True)
+    top = maxima(space, seen)
+    (intensity, *_) = identified(space, top, seen)
+    unit = rig.timing.fast_step_s / rig.sensor.pixel_width**2
+    width = intensity.pieces[-1].high - intensity.pieces[0].low
+    moves = np.cumsum([each.inputs.sum(axis=0) for each in exposures], axis=0)
+    moves = np.vstack([np.zeros(moves.shape[1]), moves[:-1]])
+    places = np.array([
+        np.full(rig.n_outputs, np.nan) if each.truth is None else each.truth.path.mean(axis=1) - move
+        for each, move in zip(exposures, moves, strict=True)
+    ]).T / rig.sensor.pixel_width  # fmt: skip
+    return Diffusion(intensity.best * unit, width / (2 * 1.96) * unit, *by_pylake(places, frames))
+
+
+def by_pylake(tracks: NDArray[np.float64], frames: int) -> tuple[float, float]:
+    """Variance that tracks (tracks, exposures) of means of so many frames gain in a frame, and its standard error over
+    the tracks, by pylake's covariance estimator; NaN where there is no position."""
+    from lumicks.pylake.detail.pixel_calibration import PositionUnit
+    from lumicks.pylake.kymotracker.detail.msd_estimation import estimate_diffusion_cve
+
+    found = []
+    for track in tracks:
+        at = np.flatnonzero(np.isfinite(track))
+        one = estimate_diffusion_cve(at, track[at], dt=frames, blur_constant=1 / 6, unit=PositionUnit.pixel)
+        found.append(2 * float(one.value))
+    return float(np.mean(found)), float(np.std(found, ddof=1) / math.sqrt(len(found)))
+
+
+def compression() -> list[Row]:
+    """What the film's compression does to single frames: motion comes late, and with a group's key frame at once."""
+    xy = np.load(SPHERES)["tracked_xy"]
+    steps = np.diff(xy, axis=1).transpose(0, 2, 1).reshape(-1, xy.shape[1] - 1)
+    lagged = (steps[:, 2:] * steps[:, :-2]).mean(axis=1)
+    sd = lagged.std(ddof=1) / math.sqrt(len(lagged))
+    at = np.arange(steps.shape[1]) % _PICTURES
+    key = (at >= _KEY[0]) & (at < _KEY[1])
+    return [
+        Row(
+            "tracks: covariance of steps two frames apart", f"{lagged.mean():.4f} +- {sd:.4f} px2",
+            "0, whatever the shutter", abs(lagged.mean()) / sd, 0.0,
+        ),
+        Row(
+            f"tracks: square of the steps at one of {_PICTURES} frames", f"{(steps[:, key] ** 2).mean():.3f} px2",
+            f"{(steps[:, ~key] ** 2).mean():.3f} px2 elsewhere",
+            float((steps[:, key] ** 2).mean() / (steps[:, ~key] ** 2).mean()), 0.0,
+        ),
+    ]  # fmt: skip

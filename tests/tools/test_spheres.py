@@ -1,0 +1,51 @@
+"""What the film of spheres itself allows, as the page of identification has it."""
+
+from __future__ import annotations
+
+import importlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.needs import needed
+
+TOOLS = Path(__file__).parents[2] / "tools"
+
+
+@pytest.fixture(scope="module")
+def identification() -> Any:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(TOOLS))
+        yield importlib.import_module("bench_rows.identification")
+
+
+def test_single_frames_of_the_film_are_late_by_its_compression(identification: Any) -> None:
+    """A random walk has no covariance of steps two frames apart, and steps of one size in each frame."""
+    lagged, key = identification.compression()
+    assert lagged.ratio > 4  # standard deviations
+    assert key.ratio > 1.3
+
+
+@pytest.fixture
+def walk() -> Any:
+    """Means over single frames of random walks that gain a variance of one in a frame, (6, 300, 2)."""
+    random = np.random.default_rng(0)
+    return np.cumsum(random.normal(size=(6, 300 * 8, 2)) / 8**0.5, axis=1).reshape(6, 300, 8, 2).mean(axis=2)
+
+
+def test_a_random_walk_shows_no_compression(identification: Any, monkeypatch: pytest.MonkeyPatch, walk: Any) -> None:
+    monkeypatch.setattr(identification.np, "load", lambda path: {"tracked_xy": walk})
+    lagged, key = identification.compression()
+    assert lagged.ratio < 3
+    assert key.ratio == pytest.approx(1, abs=0.2)
+
+
+@pytest.mark.parametrize("frames", [1, 4])
+def test_pylake_finds_the_walks_intensity(identification: Any, walk: Any, frames: int) -> None:
+    needed("lumicks.pylake")
+    tracks = walk.transpose(0, 2, 1).reshape(12, -1, frames).mean(axis=2)
+    value, sd = identification.by_pylake(tracks, frames)
+    assert abs(value - 1) < 3 * sd
+    assert sd < 0.2
