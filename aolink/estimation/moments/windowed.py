@@ -261,7 +261,8 @@ def slowest(transition: FloatArray) -> FloatArray:
         return np.asarray(np.abs(np.linalg.eigvals(A)).max(axis=1))
     half, away = (A[:, 0, 0] + A[:, 1, 1]) / 2, (A[:, 0, 0] - A[:, 1, 1]) / 2
     square = away * away + A[:, 0, 1] * A[:, 1, 0]
-    return np.where(square < 0, np.sqrt(np.abs(half * half - square)), np.abs(half) + np.sqrt(np.abs(square)))
+    turning = np.sqrt(np.abs(half * half - square))
+    return np.asarray(np.where(square < 0, turning, np.abs(half) + np.sqrt(np.abs(square))))
 
 
 def error_memory(rho: FloatArray) -> FloatArray:

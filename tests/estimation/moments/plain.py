@@ -2,12 +2,13 @@
 
 import numpy as np
 
+from aolink.estimation.frames.frame_data import Profile
 from aolink.estimation.moments.lines import WindowedMoments
 from aolink.estimation.moments.windowed import Regression, Windowed, expected_response, weighted_sums
 from aolink.numerics import batched
 
 
-class PlainMoments(Windowed):
+class PlainMoments(Windowed[Profile]):
     """`WindowedMoments` with the arithmetic of `Windowed`."""
 
     def __init__(self, sensor, orders=(0, 1, 2, 3), *, basis="monomial", flux="known"):
