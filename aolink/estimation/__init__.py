@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from aolink.estimation.kalman.update import joseph_update
     from aolink.estimation.model.base import ExposureModel
     from aolink.estimation.model.exposure_model import exposure_model, path_from_coefficients
+    from aolink.estimation.moments.lines import WindowedMoments
     from aolink.estimation.moments.spots import WindowedSpots
-    from aolink.estimation.moments.windowed import WindowedMoments
     from aolink.estimation.options import Engine, Options
     from aolink.estimation.registry import EstimatorRow, estimator_row, estimator_rows, make_estimator
     from aolink.estimation.smoother import smooth
@@ -43,8 +43,8 @@ else:  # the type checker would accept any name
             "kalman.update": "joseph_update",
             "model.base": "ExposureModel",
             "model.exposure_model": "exposure_model path_from_coefficients",
+            "moments.lines": "WindowedMoments",
             "moments.spots": "WindowedSpots",
-            "moments.windowed": "WindowedMoments",
             "options": "Engine Options",
             "registry": "EstimatorRow estimator_row estimator_rows make_estimator",
             "smoother": "smooth",

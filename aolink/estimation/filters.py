@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import lru_cache
 from typing import Any
 
@@ -10,7 +11,7 @@ import numpy as np
 from aolink.errors import EstimatorError
 from aolink.estimation.compiled import make_ready
 from aolink.estimation.frames.centroid_noise import centroid_covariance
-from aolink.estimation.frames.frame_data import SpotWindows
+from aolink.estimation.frames.frame_data import Profile, SpotWindows
 from aolink.estimation.kalman.filter import BlurFilter, Filter, TwoStateFilter
 from aolink.estimation.kalman.filterpy_engine import FilterpyMoments
 from aolink.estimation.kalman.path_moments import Observation, PathMoments, SecondOrderMoments
@@ -19,7 +20,6 @@ from aolink.estimation.kalman.steady_gain import steady_gain
 from aolink.estimation.model.exposure_model import exposure_model
 from aolink.estimation.moments.joint_moments import JointMoments
 from aolink.estimation.moments.spots import WindowedSpots
-from aolink.estimation.moments.windowed import WindowedMoments
 from aolink.estimation.options import Options
 from aolink.estimation.pixels.joint_pixels import JointProfile
 from aolink.numerics.arrays import FloatArray
@@ -73,6 +73,8 @@ def _steady_gain(rig: Rig, options: Options) -> FloatArray | None:
 
 
 def moments(rig: Rig, options: Options) -> Filter:
+    if rig.plant.n_outputs == 1:
+        _warm_up_line(rig, options)
     if alike_systems(rig.plant) is not None:
         _warm_up(rig)
     return _blur_filter(rig, options, _windowed(rig, options))
@@ -82,6 +84,8 @@ def _windowed(rig: Rig, options: Options) -> Observation[Any]:
     """Windowed moments of a line sensor, of spots, or of all spots of a plant with hundreds of states."""
     orders, basis, flux, n_outputs = options.orders, options.basis, options.flux, rig.plant.n_outputs
     if n_outputs == 1:
+        from aolink.estimation.moments.lines import WindowedMoments
+
         return WindowedMoments(rig.sensor.profile, orders, basis=basis, flux=flux)
     sensor = _spots(rig)
     if alike_systems(rig.plant) is not None:
@@ -105,6 +109,16 @@ def _warm_up(rig: Rig) -> None:
     for each in (JointMoments, JointProfile):
         blur_filter = BlurFilter(rig.plant, each(sensor, rig.plant.n_outputs))
         blur_filter.step(model, model.response(np.zeros((steps, rig.n_inputs))), dark)
+
+
+def _warm_up_line(rig: Rig, options: Options) -> None:
+    """Estimate a dark exposure of one line, so that what this loads is loaded before the session."""
+    make_ready()
+    plant, pixels = replace(rig.plant, axes=1), rig.sensor.profile.pixels
+    model = exposure_model(plant, 2)
+    dark = Profile(density=np.zeros((1, pixels)), mask=np.ones((1, pixels), dtype=bool))
+    one = BlurFilter(plant, _windowed(rig, options))
+    one.step(model, model.response(np.zeros((2, plant.n_inputs))), dark)
 
 
 def profile(rig: Rig, options: Options) -> Filter:

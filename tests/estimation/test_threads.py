@@ -14,7 +14,7 @@ from aolink.estimation import ESTIMATOR_NAMES, exposure_model, run
 from aolink.estimation.kalman.filter import BlurFilter
 from aolink.estimation.pixels import joint_pixels
 from aolink.estimation.frames.spots import measure_spots
-from aolink.estimation.moments.windowed import WindowedMoments
+from aolink.estimation.moments.lines import WindowedMoments
 from aolink.estimation.frames.frame_data import Needs, Profile
 from aolink.rig import load_rig
 from aolink.simulation.model import simulate

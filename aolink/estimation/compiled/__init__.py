@@ -2,9 +2,10 @@
 plant.
 
 Whole-array calls for thousands of axes run through memory again and again; these loops keep one axis in the
-processor's cache (rows `profile_of_many_axes`, `mixture_of_many_axes` and `membrane_in_real_time` of tools/bench).
-Each loop for line sensors and for spots has a twin in NumPy that tests compare it with: in `pixels.modes`, where spots
-on a plane use it, or in `tests/estimation/pixels/plain.py`. The loops for many spots of one plant are tested against
+processor's cache (rows `moments_of_many_axes`, `profile_of_many_axes`, `mixture_of_many_axes` and
+`membrane_in_real_time` of tools/bench). Each loop for line sensors and for spots has a twin in NumPy that tests compare
+it with: in `pixels.modes`, where spots on a plane use it, or in `plain.py` of `tests/estimation/pixels` and
+`tests/estimation/moments`. The loops for many spots of one plant are tested against
 the dense view of the same pixels. They hold no lock, so axes are shared among threads; the result for one axis does
 not depend on how many others there are, bit for bit. Machine code is kept beside the source or in the user's cache.
 ``python -m aolink.estimation.compiled`` makes it, as a part of the installation; otherwise it is made when the first
@@ -31,6 +32,7 @@ from aolink.rig import load_rig
 
 compiled.compiles_itself = True
 make_estimator(load_rig("section-vi-lively"), "o3")
+make_estimator(load_rig("section-vi-lively"), "moments")
 make_estimator(load_rig("section-vi-lively"), "mixture")
 make_estimator(load_rig("tip-tilt"), "mixture")
 make_estimator(load_rig("membrane-12x12"), "profile")

@@ -1,5 +1,7 @@
 """Moments in a window about the spot, used by iterated statistical linearisation.
 
+Line sensors have compiled code for it (`aolink.estimation.moments.lines`); the class here is for spots on a plane.
+
 A moment, in any basis and with any window or mask, is a weighted sum of pixels, y = sum_i W_i Y_i D. A
 spot resting at theta makes g(theta) = sum_i W_i (kernel integrated over pixel i) of it, so that
 E[y | path] = mean_k g(theta_k) holds with kernel, pixels, window and mask all in it: there is no bias to remove.
@@ -28,7 +30,7 @@ from typing import Generic, Literal, TypeVar
 
 import numpy as np
 
-from aolink.estimation.frames.frame_data import HALF, Densities, Flux, Needs, Profile
+from aolink.estimation.frames.frame_data import Densities, Flux
 from aolink.estimation.frames.moments import LEAST_FLUX
 from aolink.estimation.kalman.gaussian import Gaussian, Update
 from aolink.estimation.kalman.update import joseph_update
@@ -47,7 +49,8 @@ PASSES = 3
 PATH_REACH = 3.0
 KERNEL_REACH = 2.0
 # The path is averaged over blocks of steps so that there are no more than this; a mean over it stays exact.
-_MOST_NODES = 100
+MOST_NODES = 100
+MOST_MEMORY = 1e3
 # Axes together: more of them do not fit into the processor's cache.
 _AT_ONCE = 8
 # NIS of moments that are divided by a light that its noise hides: they are gated.
@@ -87,8 +90,8 @@ class Windowed(ABC, Generic[Data]):
     """
 
     models_noise = True
-    most_nodes = _MOST_NODES
-    most_memory = 1e3
+    most_nodes = MOST_NODES
+    most_memory = MOST_MEMORY
     """Bound of `error_memory`; with 1, errors of an exposure count as independent of those before."""
 
     def __init__(self, basis: Basis, flux: Flux, lights: Sequence[int], light_of: Sequence[int]) -> None:
@@ -192,75 +195,6 @@ class Windowed(ABC, Generic[Data]):
         return ratio, batched.congruence(at_measured, noise), Regression(expected, slope, remainder)
 
 
-class WindowedMoments(Windowed[Profile]):
-    """Windowed moments of line-sensor profiles, one output for each axis.
-
-    Parameters
-    ----------
-    orders:
-        Orders of the basis functions; 0 is the light in the window.
-    basis, flux:
-        As in `Windowed`.
-    """
-
-    def __init__(
-        self, sensor: Sensor, orders: Sequence[int] = (0, 1, 2, 3), *, basis: Basis = "monomial",
-        flux: Flux = "known",
-    ) -> None:  # fmt: skip
-        self.sensor = sensor
-        # A ratio to the light in the window needs the light first.
-        self.orders = tuple(orders) if flux == "known" else (0, *(p for p in orders if p))
-        self.needs = Needs(what="profile", least_usable=HALF)
-        super().__init__(basis, flux, lights=[0], light_of=[0] * len(self.orders))
-
-    def look(
-        self, nodes: QuadraturePaths, about: Gaussian, measured: Profile
-    ) -> tuple[FloatArray, FloatArray, Regression]:
-        """The weighted sums, their noise, and their regression on the coefficients."""
-        basis = nodes.basis[0]
-        mean = batched.matvec(basis, about.mean) + nodes.inputs[:, 0]
-        spread = batched.congruence(basis, about.covariance)
-        W = self.window_weights(mean, np.einsum("akk->ak", spread), measured.mask)
-        y, noise = weighted_sums(self.sensor, W, measured.density, measured.light)
-        return y, noise, self.regression(W, mean, spread, basis, nodes.weights, nodes.widening)
-
-    def window_weights(self, mean: FloatArray, variance: FloatArray, mask: BoolArray) -> FloatArray:
-        """Weights of the pixels about a path, (axes, sums, pixels), from its mean and variance, both (axes, nodes)."""
-        u, inside = self.window(self.sensor, self.sensor.kernel.variance, mean, variance, mask)
-        return np.stack([self.function(p, u) * inside for p in self.orders], axis=1)
-
-    def regression(
-        self, W: FloatArray, mean: FloatArray, spread: FloatArray, basis: FloatArray, weights: FloatArray,
-        widening: float = 0.0,
-    ) -> Regression:  # fmt: skip
-        """Regression of the weighted sums on the coefficients.
-
-        Parameters
-        ----------
-        W:
-            (axes, m, pixels)
-        mean, spread:
-            Mean and covariance of the path at its nodes, (axes, nodes) and (axes, nodes, nodes).
-        basis, weights:
-            Rows of the exposure basis at the nodes, (nodes, n_coefficients), and the nodes' weights, (nodes,).
-        widening:
-            Variance of the path about its nodes that no coefficient covers, slope units squared.
-        """
-        variance = np.maximum(np.einsum("akk->ak", spread), 0.0)
-        if widening:
-            variance = variance + widening
-        g = expected_response(self.sensor.kernel.variance, self.sensor.edges, W, mean, variance)
-        light = weights[:, None]
-        # Mehler: Cov(g(a), g(b)) is the sum over j of C^j / j! times the means of the j-th derivatives.
-        square = spread * spread
-        remainder = sum(
-            batched.matmul(batched.transpose(light * g[j]), batched.matmul(power, light * g[j]))
-            for j, power in ((2, square / 2), (3, square * spread / 6))
-        )
-        slope = batched.matmul(batched.transpose(light * g[1]), np.broadcast_to(basis, (len(W), *basis.shape)))
-        return Regression((light * g[0]).sum(axis=1), slope, batched.symmetric(np.asarray(remainder)))
-
-
 def weighted_sums(
     sensor: BaseSensor, W: FloatArray, density: FloatArray, light: FloatArray | None = None
 ) -> tuple[FloatArray, FloatArray]:
@@ -325,7 +259,13 @@ def slowest(transition: FloatArray) -> FloatArray:
     """Spectral radius: the modulus of the largest eigenvalue, (axes, n, n) -> (axes,)."""
     finite = np.isfinite(transition).all(axis=(1, 2), keepdims=True)
     # What is not finite is refused by the filter; here it must only not stop the others.
-    return np.asarray(np.abs(np.linalg.eigvals(np.where(finite, transition, 0.0))).max(axis=1))
+    A = np.where(finite, transition, 0.0)
+    if A.shape[1] != 2:
+        return np.asarray(np.abs(np.linalg.eigvals(A)).max(axis=1))
+    half, away = (A[:, 0, 0] + A[:, 1, 1]) / 2, (A[:, 0, 0] - A[:, 1, 1]) / 2
+    square = away * away + A[:, 0, 1] * A[:, 1, 0]
+    turning = np.sqrt(np.abs(half * half - square))
+    return np.asarray(np.where(square < 0, turning, np.abs(half) + np.sqrt(np.abs(square))))
 
 
 def error_memory(rho: FloatArray, most: float) -> FloatArray:

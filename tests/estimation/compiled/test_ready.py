@@ -27,12 +27,13 @@ def test_one_process_compiles_for_all_others_once_for_each_version_of_the_source
 FIRST_SESSION = """
 import dataclasses, sys
 from aolink.estimation import make_estimator
-from aolink.estimation.compiled import joint, line, mixtures, modes, moments, small
+from aolink.estimation.compiled import joint, line, mixtures, modes, moments, small, windowed
 from aolink.rig import load_rig
 from aolink.simulation.model import simulate
 
 def overloads():
-    each = [value for module in (small, line, modes, moments, mixtures, joint) for value in vars(module).values()]
+    loaded = small, line, modes, moments, mixtures, joint, windowed
+    each = [value for module in loaded for value in vars(module).values()]
     return sum(len(value.signatures) for value in each if hasattr(value, "signatures"))
 
 rig, name = load_rig(sys.argv[1]), sys.argv[2]
@@ -61,6 +62,12 @@ def test_nothing_is_compiled_in_a_session(name):
     before, after, several = first_session("section-vi-lively", name, 0.003, 30)
     assert before == after > 4
     assert several
+
+
+@pytest.mark.parametrize("name", ["moments", "moments:flux=measured,basis=fourier"])
+def test_nothing_is_compiled_in_a_session_of_moments(name):
+    before, after, _ = first_session("section-vi-lively", name, 0.003, 4)
+    assert before == after > 1
 
 
 @pytest.mark.long

@@ -11,11 +11,11 @@ from aolink.errors import RigError
 from aolink.estimation import exposure_model, run, score
 from aolink.estimation.kalman.path_moments import predicted_moments
 from aolink.estimation.model.quadrature import blocks, quadrature_paths
-from aolink.estimation.moments.windowed import WindowedMoments
 from aolink.optics.frame import frame_density
 from aolink.optics.kernel import exposure_density
 from aolink.rig import Plant, Rig, load_rig, parse_rig
 from aolink.simulation.model import RigPhysics, simulate
+from tests.estimation.moments.plain import PlainMoments
 from tests.kinds import line_of, truth_of
 
 LIVELY = load_rig("section-vi-lively")
@@ -105,7 +105,7 @@ def test_windowed_moments_expect_what_finer_steps_show():
     z = np.zeros(model.n_coefficients)
     z[:2] = 0.1, 20.0
     path = nodes.basis[0] @ z
-    observation = WindowedMoments(line_of(rig))
+    observation = PlainMoments(line_of(rig))
     W = observation.window_weights(path[None], np.zeros((1, len(path))), np.ones((1, 40), bool))
     zero = np.zeros((1, len(path), len(path)))
     expected = observation.regression(W, path[None], zero, nodes.basis[0], nodes.weights).expected[0]

@@ -12,11 +12,14 @@ from aolink.estimation.frames.frame_data import Flux, Profile
 from aolink.estimation.kalman.filter import BlurFilter
 from aolink.estimation.kalman.gaussian import Gaussian
 from aolink.estimation.model.quadrature import blocks, quadrature_paths
-from aolink.estimation.moments.windowed import WindowedMoments, weighted_sums
+from aolink.estimation.moments.lines import WindowedMoments
+from aolink.estimation.moments.windowed import weighted_sums
 from aolink.optics.camera import pixel_noise_sd, shot_gain, to_counts
 from aolink.optics.kernel import exposure_density, pixel_mass
 from aolink.rig import Rig, load_rig
+from aolink.rig.parts import UnmodelledSlopes
 from aolink.simulation.model import simulate
+from tests.estimation.moments.plain import PlainMoments
 from tests.kinds import line_of, truth_of
 
 RIG = load_rig("section-vi-lively")
@@ -69,7 +72,7 @@ def spread_prior(axes=2):
 @pytest.mark.parametrize("basis", BASES)
 def test_regression_is_that_of_samples(basis):
     model, prior = spread_prior()
-    observation = WindowedMoments(SENSOR, (0, 1, 2, 3), basis=basis)
+    observation = PlainMoments(SENSOR, (0, 1, 2, 3), basis=basis)
     nodes = quadrature_paths(
         model, model.response(np.zeros((model.n_steps, model.plant.axes))), blocks(model.n_steps, 100)
     )
@@ -96,7 +99,7 @@ def test_regression_is_that_of_samples(basis):
 
 def test_slope_is_the_derivative_of_what_is_expected():
     model, prior = spread_prior(1)
-    observation = WindowedMoments(SENSOR)
+    observation = PlainMoments(SENSOR)
     nodes = quadrature_paths(
         model, model.response(np.zeros((model.n_steps, model.plant.axes))), blocks(model.n_steps, 100)
     )
@@ -123,7 +126,7 @@ def test_expected_sums_are_those_of_a_noiseless_frame(basis, flux):
     density = exposure_density(SENSOR.kernel, SENSOR.edges, path)[None]
     mask = np.ones((1, 40), bool)
     mask[0, 24] = False
-    observation = WindowedMoments(SENSOR, basis=basis, flux=flux)
+    observation = PlainMoments(SENSOR, basis=basis, flux=flux)
     W = observation.window_weights(path[None], np.zeros((1, 200)), mask)
     fit = observation.regression(W, path[None], np.zeros((1, 200, 200)), np.zeros((200, 3)), np.full(200, 1 / 200))
     y, _ = weighted_sums(observation.sensor, W, density)
@@ -138,7 +141,7 @@ def test_noise_of_the_sums_is_that_of_many_frames(photoelectrons):
     rng = np.random.default_rng(3)
     sensor = dataclasses.replace(SENSOR, photoelectrons=photoelectrons)
     sd = np.sqrt(pixel_noise_sd(sensor) ** 2 + shot_gain(sensor) * clean)
-    observation = WindowedMoments(sensor)
+    observation = PlainMoments(sensor)
     W = observation.window_weights(path[None], np.full((1, 200), 0.001), np.ones((1, 40), bool))
     _, noise = weighted_sums(observation.sensor, W, clean[None])
     spread = np.cov((clean + sd * rng.standard_normal((20_000, 40))) @ W[0].T * SENSOR.pixel_width, rowvar=False)
@@ -153,6 +156,42 @@ def test_blocks_of_steps_keep_the_mean_of_the_path():
     rows, weights = nodes.basis[0], nodes.weights
     assert len(weights) <= 100
     np.testing.assert_allclose(weights @ rows, model.basis[0].mean(axis=0), atol=1e-14)
+
+
+# In compiled code
+
+
+@pytest.mark.parametrize(
+    "how",
+    [
+        {}, {"flux": "measured"}, {"orders": (2, 1)}, {"basis": "legendre", "orders": (0, 1, 2, 3, 4)},
+        {"basis": "fourier", "flux": "measured"},
+    ],
+)  # fmt: skip
+@pytest.mark.parametrize("photoelectrons", [0.0, 400.0])
+@pytest.mark.parametrize("offset", [0.0, 0.3])
+def test_the_update_is_that_of_the_twin(how, photoelectrons, offset):
+    rng, axes = np.random.default_rng(4), 5
+    sensor = dataclasses.replace(SENSOR, photoelectrons=photoelectrons)
+    unmodelled = UnmodelledSlopes(sd=0.04, correlation_steps=30.0) if offset else None
+    plant = dataclasses.replace(RIG.plant, axes=axes, unmodelled=unmodelled)
+    model = exposure_model(plant, 150, offset)
+    prior = Gaussian(rng.normal(0, 0.1, (axes, 2)), np.tile(plant.initial_covariance / 3, (axes, 1, 1)))
+    paths = rng.uniform(-0.3, 0.3, (axes, 1)) + 0.1 * np.sin(np.linspace(0, 6, 150))
+    mask = rng.random((axes, 40)) > 0.02
+    density = exposure_density(SENSOR.kernel, SENSOR.edges, paths) + 0.1 * rng.standard_normal((axes, 40))
+    light = rng.uniform(0.5, 1.5, axes) if photoelectrons else None
+    given = (
+        model, model.response(rng.normal(0, 0.01, (150, axes))), prior.with_noise(model.n_coefficients),
+        Profile(density=np.where(mask, density, 0.0), mask=mask, light=light),
+    )  # fmt: skip
+    ours, twin = WindowedMoments(sensor, **how).update(*given), PlainMoments(sensor, **how).update(*given)
+    for found, expected in (
+        (ours.posterior.mean, twin.posterior.mean), (ours.posterior.covariance, twin.posterior.covariance),
+        (ours.innovation, twin.innovation), (ours.innovation_covariance, twin.innovation_covariance),
+        (ours.nis, twin.nis),
+    ):  # fmt: skip
+        np.testing.assert_allclose(found, expected, rtol=1e-8, atol=1e-9 * np.abs(expected).max())
 
 
 # What it is good for

@@ -6,7 +6,6 @@ from dataclasses import replace
 import numpy as np
 
 from aolink.estimation import Profile
-from aolink.estimation.moments.windowed import WindowedMoments
 from aolink.estimation.pixels import importance
 from aolink.estimation.pixels.gaussian_mixture import GaussianMixture, log_sum, with_noise
 from aolink.estimation.pixels.likelihood import PixelView
@@ -14,6 +13,7 @@ from aolink.numerics import batched
 from aolink.numerics.covariance import cholesky
 from aolink.optics.kernel import pixel_masses
 from aolink.optics.plane import mehler_series
+from tests.estimation.moments.plain import PlainMoments
 from tests.kinds import must_be
 
 
@@ -32,7 +32,7 @@ class PlainView(PixelView):
     def moments(self, about):
         if not self.sees_line:
             return super().moments(about)
-        return WindowedMoments(self.sensor.profile).look(self.nodes, about, must_be(Profile, self.measured))
+        return PlainMoments(self.sensor.profile).look(self.nodes, about, must_be(Profile, self.measured))
 
     def predicted(self, t):
         """Densities of the pixels without noise, (axes, k, pixels)."""

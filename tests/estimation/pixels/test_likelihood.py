@@ -9,8 +9,8 @@ from scipy import linalg
 from aolink.estimation import Profile, SpotWindows, exposure_model
 from aolink.estimation.frames.measure import measure
 from aolink.estimation.kalman.gaussian import Gaussian
+from aolink.estimation.moments.lines import WindowedMoments
 from aolink.estimation.moments.spots import WindowedSpots
-from aolink.estimation.moments.windowed import WindowedMoments
 from aolink.estimation.pixels import likelihood
 from aolink.optics.kernel import exposure_density
 from aolink.optics.plane import exposure_density_2d

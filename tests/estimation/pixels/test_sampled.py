@@ -11,7 +11,7 @@ from aolink.estimation import Profile, exposure_model, make_estimator
 from aolink.estimation.frames.measure import measure
 from aolink.estimation.kalman.gaussian import Gaussian
 from aolink.estimation.kalman.update import joseph_update
-from aolink.estimation.moments.windowed import WindowedMoments
+from aolink.estimation.moments.lines import WindowedMoments
 from aolink.estimation.pixels import likelihood
 from aolink.estimation.pixels.gaussian_mixture import single
 from aolink.estimation.pixels.sampled import TemperedUpdater

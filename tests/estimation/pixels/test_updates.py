@@ -11,7 +11,7 @@ from aolink.estimation.estimate import Components
 from aolink.estimation.frames.frame_data import Profile
 from aolink.estimation.frames.measure import measure
 from aolink.estimation.kalman.gaussian import Gaussian
-from aolink.estimation.moments.windowed import WindowedMoments
+from aolink.estimation.moments.lines import WindowedMoments
 from aolink.estimation.pixels import likelihood
 from aolink.estimation.pixels.filter import MixtureFilter
 from aolink.estimation.pixels.gaussian_mixture import GaussianMixture, single
