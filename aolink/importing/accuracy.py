@@ -70,7 +70,9 @@ def tracker_errors(
             x, y = (pixel_masses(sd**2, edges, path[:, j, d], 0)[0] for d, edges in enumerate((edges_x, edges_y)))
             picture += np.nan_to_num(light[j]) / _TIMES * (y.T @ x)
         variance = np.maximum(noise[0] + noise[1] * picture, 0.0)
-        found = Tracker(Objects(middles, sd), locate).follow(picture + np.sqrt(variance) * rng.normal(size=picture.shape))
+        found = Tracker(Objects(middles, sd), locate).follow(
+            picture + np.sqrt(variance) * rng.normal(size=picture.shape)
+        )
         squares[row] = np.where(np.isfinite(now).all(axis=1), ((found - true) ** 2).mean(axis=1), np.nan)
     known = np.isfinite(squares)
     return np.sqrt(np.where(known, squares, 0.0).sum(axis=0) / np.where(known.any(axis=0), known.sum(axis=0), np.nan))

