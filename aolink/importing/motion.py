@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy import optimize
@@ -102,10 +103,13 @@ def fit_motion(places: FloatArray) -> Motion:
 
     def fitted(free: tuple[int, ...], start: Sequence[float]) -> _Fit:
         at = np.array(start, dtype=np.float64)
-        simplex = np.vstack([at, at + np.diag([_width(which, at, free, len(places)) for which in free])])
+        options: Any = {"maxiter": 300 * len(free), "fatol": 1e-3, "xatol": 1e-3}
+        options["initial_simplex"] = np.vstack(
+            [at, at + np.diag([_width(which, at, free, len(places)) for which in free])]
+        )
         found = optimize.minimize(
             lambda values: _cost(places, free, values), at, method="Nelder-Mead",
-            options={"initial_simplex": simplex, "maxiter": 300 * len(free), "fatol": 1e-3, "xatol": 1e-3},
+            options=options,
         )  # fmt: skip
         return _Fit(free, found.x, float(found.fun) + len(free) * math.log(count) / 2)
 
@@ -209,7 +213,7 @@ def _inverse_curvature(places: FloatArray, fit: _Fit) -> FloatArray:
     ) / (4 * np.outer(np.diagonal(h), np.diagonal(h)))
     if not np.isfinite(H).all():  # an angle at the end of its range
         return np.full(n, np.nan)
-    return np.clip(np.diagonal(np.linalg.pinv(H)), 0.0, None)
+    return np.asarray(np.clip(np.diagonal(np.linalg.pinv(H)), 0.0, None))
 
 
 def _correlation(left: FloatArray) -> float:
