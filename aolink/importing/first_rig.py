@@ -5,15 +5,14 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from scipy import optimize, signal
 
 from aolink.errors import ImportingError
 from aolink.importing.film import Film
-from aolink.importing.frames import Settings
+from aolink.importing.frames import Settings, film_periods
+from aolink.importing.motion import Motion, fit_motion
 from aolink.importing.survey import Survey, reach, survey
 from aolink.importing.tracker import find_objects
 from aolink.importing.tracking import STRAY
@@ -23,139 +22,9 @@ _COUNTS = 62_000
 """Counts of the brightest pixel of a resting spot with its noise; there are 65,535."""
 _NOISE_SDS = 6
 """Standard deviations of a pixel's noise that fit below black and above the brightest pixel."""
-_SETTLED = 1e-9
-"""A smaller change of a gain counts as none."""
-_LAGS = range(2, 11)
-"""Frames over which innovations must not be correlated. Over one they are where a frame is exposed throughout."""
-_CORRELATED = 0.15
-"""Correlation of innovations from which on a motion is another one than the fitted, if it is no chance."""
 _LEAST_WINDOW = 12
 _ANYWHERE = 0.1
 """Variance of the place of an object in its window before it is seen, slope units squared."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Motion:
-    """A random walk or an Ornstein-Uhlenbeck process that fits the objects' motion from frame to frame.
-
-    x(k+1) = a x(k) + w(k), Var w = q; a frame shows x with an error of variance r. All by maximum likelihood.
-    """
-
-    a: float
-    """One for a random walk."""
-    a_sd: float
-    q: float
-    """Variance of a step, pixels squared."""
-    q_sd: float
-    r: float
-    """Variance of the error of a place, pixels squared."""
-    spread: float
-    """Standard deviation of the places about their mean, pixels."""
-    unexplained: float
-    """Largest correlation of innovations some frames apart; zero where it is small or may be by chance."""
-
-
-def fit_motion(places: FloatArray) -> Motion:
-    """Fit series of places along one direction each, (frames, series), pixels; NaN where nothing was seen.
-
-    A random walk is fitted and an Ornstein-Uhlenbeck process (a < 1). The latter is taken where the Bayesian
-    information criterion favours it.
-
-    Raises
-    ------
-    ImportingError
-        There are too few places.
-    """
-    seen = np.isfinite(places)
-    if seen.sum() < 20 or len(places) < 10:
-        raise ImportingError(f"{int(seen.sum())} places are too few to fit a motion to: 20 or more are needed")
-    steps = np.diff(places, axis=0)
-    start = math.log(max(float(np.nanvar(steps)), 1e-12))
-
-    # The part between two gaps is a series of its own; an Ornstein-Uhlenbeck process moves about its mean.
-    runs = [(one, one - one.mean(axis=0)) for one in _runs(places)]
-
-    def cost(values: FloatArray, bound: bool) -> float:
-        q, r = math.exp(values[0]), math.exp(values[1])
-        a = 1 / (1 + math.exp(-values[2])) if bound else 1.0
-        total = 0.0
-        for series in (about if a < 1 else one for one, about in runs):
-            innovations, variances = _innovations(series, a, q, r)
-            logs = series.shape[1] * float(np.log(2 * np.pi * variances).sum())
-            total += float((innovations**2 / variances[:, None]).sum()) + logs
-        return total / 2
-
-    walk = optimize.minimize(cost, [start, start - 2], args=(False,), method="Nelder-Mead")
-    bound = optimize.minimize(cost, [*walk.x, 3.0], args=(True,), method="Nelder-Mead", options={"maxiter": 600})
-    # The mean of each series is a parameter of the second, too.
-    penalty = (1 + places.shape[1]) * math.log(int(seen.sum())) / 2
-    is_bound = bound.fun + penalty < walk.fun
-    best = bound.x if is_bound else walk.x
-    variances = _inverse_curvature(lambda values: cost(values, is_bound), best)
-    a = 1 / (1 + math.exp(-best[2])) if is_bound else 1.0
-    q, r = math.exp(best[0]), math.exp(best[1])
-    a_sd = a * (1 - a) * math.sqrt(variances[2]) if is_bound else 0.0
-    spread = float(np.sqrt(np.nanmean((places - np.nanmean(places, axis=0)) ** 2)))
-    unexplained = _correlation([_innovations(about if is_bound else one, a, q, r)[0] for one, about in runs])
-    return Motion(a=a, a_sd=a_sd, q=q, q_sd=q * math.sqrt(variances[0]), r=r, spread=spread, unexplained=unexplained)
-
-
-def _runs(places: FloatArray) -> list[FloatArray]:
-    """Series without their gaps: those of the same length in one array, (frames, series)."""
-    whole = np.isfinite(places).all(axis=0)
-    runs = [places[:, whole]] if whole.any() else []
-    for one in places[:, ~whole].T:
-        edges = np.flatnonzero(np.diff(np.concatenate([[False], np.isfinite(one), [False]]).astype(np.int8)))
-        runs += [one[first:end, None] for first, end in edges.reshape(-1, 2) if end - first > 1]
-    return runs
-
-
-def _innovations(y: FloatArray, a: float, q: float, r: float) -> tuple[FloatArray, FloatArray]:
-    """Innovations of a Kalman filter, which settles after some frames, for series (frames, series), and their
-    variances: (frames - 1, series) and (frames - 1,).
-
-    The first place of each series starts the filter, of a random walk and of an Ornstein-Uhlenbeck process alike, so
-    that their likelihoods can be compared.
-    """
-    innovations, variances = np.empty((len(y) - 1, y.shape[1])), np.empty(len(y) - 1)
-    x, P, gain = a * y[0], a * a * r + q, math.nan
-    for k in range(len(y) - 1):
-        S = P + r
-        before, gain = gain, P / S
-        innovations[k], variances[k] = y[k + 1] - x, S
-        x, P = a * (x + gain * innovations[k]), a * a * P * (1 - gain) + q
-        if abs(gain - before) < _SETTLED:
-            seen, _ = signal.lfilter([0.0, a * gain], [1.0, -a * (1 - gain)], y[k + 2 :], axis=0, zi=x[None])
-            innovations[k + 1 :], variances[k + 1 :] = y[k + 2 :] - seen, S
-            break
-    return innovations, variances
-
-
-def _correlation(series: list[FloatArray]) -> float:
-    """The largest correlation of innovations that are some frames apart; zero if it is small or may be by chance."""
-    power = sum(float((one**2).sum()) for one in series)
-    pairs = [sum(one[lag:].size for one in series) for lag in _LAGS]
-    sums = [sum(float((one[lag:] * one[:-lag]).sum()) for one in series) for lag in _LAGS]
-    count = sum(one.size for one in series)
-    found = max((total / n / (power / count) for total, n in zip(sums, pairs, strict=True) if n), key=abs, default=0.0)
-    return found if abs(found) > max(_CORRELATED, 4 / math.sqrt(count)) else 0.0
-
-
-def _inverse_curvature(cost: Callable[[FloatArray], float], at: FloatArray) -> FloatArray:
-    """Diagonal of the inverse Hessian, by differences: variances of maximum-likelihood estimates."""
-    n, h = len(at), 0.05
-    H = np.empty((n, n))
-    for i in range(n):
-        for j in range(n):
-            total = 0.0
-            for a in (1, -1):
-                for b in (1, -1):
-                    x = np.array(at, dtype=np.float64)
-                    x[i] += a * h
-                    x[j] += b * h
-                    total += a * b * cost(x)
-            H[i, j] = total / (4 * h * h)
-    return np.clip(np.diagonal(np.linalg.pinv(H)), 0.0, None)
 
 
 class FirstRig(NamedTuple):
@@ -183,12 +52,12 @@ def first_rig(film: Film, settings: Settings, name: str, progress: Callable[[int
         raise ImportingError("a first rig file is about objects in the film: say how many with --track N")
     objects = find_objects(film, settings)
     known = survey(film, settings, objects, progress)
-    rate = settings.rate_hz or film.rate_hz
-    if rate is None and film.times_ns is not None and film.count > 1:
-        rate = 1e9 / float(np.median(np.diff(film.times_ns)))
+    periods, timed = film_periods(film)
+    rate = settings.rate_hz or film.rate_hz or timed
     if rate is None:
         raise ImportingError(f"it is not known how many frames a second {film.name} has: give --rate")
-    places = known.places.reshape(len(known.places), -1)
+    places = np.full((int(periods[-1]) + 1, 2 * settings.track), np.nan)  # lost frames show nothing
+    places[periods] = known.places.reshape(len(periods), -1)
     motion = fit_motion(places)
     K = settings.frames_per_exposure
     # The window moves before its object has strayed too far from the middle.
@@ -206,12 +75,65 @@ def _notes(known: Survey, motion: Motion) -> Iterator[str]:
             " are fitted without them"
         )
     if motion.unexplained:
-        kind = "a random walk" if motion.a == 1 else "an Ornstein-Uhlenbeck process"
         yield (
-            f"the motion is not {kind}: what it leaves unexplained is correlated by {motion.unexplained:.2f} from one"
-            " frame to one some frames later, as of a vibration, and intervals will be too narrow. Import with this"
-            " rig file, then try `aolink identify` with --model resonance"
+            f"the motion is not a {motion.kind} alone: what it leaves unexplained is correlated by"
+            f" {motion.unexplained:.2f} from one frame to one some frames later, as of a second vibration, and"
+            " intervals will be too narrow. Import with this rig file, then try `aolink identify`"
         )
+
+
+def _plant(motion: Motion, unit: float, copies: int) -> str:
+    """The table of the plant: the process, and an offset that the window shifts and that may walk and drift."""
+    turning = np.exp(complex(0, motion.turn)) * motion.a
+    process = np.array([[turning.real, -turning.imag], [turning.imag, turning.real]])
+    n = 0 if motion.a == 1 else 2 if motion.turn else 1
+    drifts = int(motion.drift > 0)
+    size = n + 1 + drifts
+    A, B, C = np.eye(size), np.zeros((size, 1)), np.zeros((1, size))
+    A[:n, :n], B[n], C[0, n] = process[:n, :n], 1.0, 1.0
+    C[0, : min(n, 1)] = 1.0
+    A[n, n + 1 :] = 1.0
+    noises = [motion.q] * n + [motion.walk] * (n == 0 or motion.walk > 0)
+    initial = [motion.variance / unit**2] * n + [_ANYWHERE] + [motion.drift / unit**2] * drifts
+    a_frame = f"{motion.a:.5g} +- {motion.a_sd:.2g} a frame"
+    if motion.turn:
+        period, lasts = 2 * math.pi / motion.turn, -motion.turn / (2 * math.pi * math.log(motion.a))
+        said = (
+            f"# A vibration of {period:.4g} +- {motion.turn_sd / motion.turn * period:.2g} frames, which lasts"
+            f" {lasts:.3g} +- {motion.a_sd / (1 - motion.a) * lasts:.2g} periods, {math.sqrt(motion.variance):.3g}"
+            " pixels rms"
+        )
+    elif n:
+        said = f"# An Ornstein-Uhlenbeck process: a = {a_frame}"
+    else:
+        said = "# A random walk"
+    if n:
+        said += f"; process_noise +- {motion.q_sd / unit**2:.2g}"
+    if motion.walk:
+        begin = "\n# and a random walk: process_noise" if n else ": process_noise"
+        said += f"{begin} +- {motion.walk_sd / unit**2:.2g}, {math.sqrt(motion.walk):.4g} pixels rms a frame"
+    if drifts:
+        share = motion.drift_sd / motion.drift / 2
+        said += (
+            f"\n# and a constant velocity, another one for each object and direction: {math.sqrt(motion.drift):.3g} +-"
+            f" {share * math.sqrt(motion.drift):.2g} pixels rms a frame"
+        )
+    return f"""[plant]               # a copy for each object along x and along y
+{said}.
+# The last state{" but one" if drifts else ""} is shifted by the input, as the window is.
+axes = {copies}
+A = {_matrix(A)}
+B = {_matrix(B)}
+B_w = {_matrix(np.eye(size)[:, : len(noises)])}
+C = {_matrix(C)}
+process_noise = {_matrix(np.diag(noises) / unit**2)}
+initial_covariance = {_matrix(np.diag(initial))}
+"""
+
+
+def _matrix(values: FloatArray) -> str:
+    """An array as TOML, as exact as it was fitted."""
+    return json.dumps([[float(f"{x:.8g}") for x in row] for row in values])
 
 
 def _text(
@@ -228,15 +150,6 @@ def _text(
     noise = math.sqrt(read / area) if read else 0.0
     counts = _COUNTS / (peak + 2 * _NOISE_SDS * noise)
     step_ns = round(1e9 / rate)
-    walk = motion.a == 1
-    if walk:
-        A, B, B_w, C = "[[1.0]]", "[[1.0]]", "[[1.0]]", "[[1.0]]"
-        kind, initial = "random walk", f"[[{_ANYWHERE}]]"
-    else:  # the window's shifts add up in a state of their own
-        A, B, B_w, C = f"[[{motion.a:.8g}, 0.0], [0.0, 1.0]]", "[[0.0], [1.0]]", "[[1.0], [0.0]]", "[[1.0, 1.0]]"
-        variance = motion.q / (1 - motion.a**2) / unit**2
-        kind, initial = "Ornstein-Uhlenbeck process", f"[[{variance:.4g}, 0.0], [0.0, {_ANYWHERE}]]"
-    memory = "" if walk else f": a = {motion.a:.5g} +- {motion.a_sd:.2g} a frame"
     summary = (
         f"{n} objects of {film.name}, each in a window of {side} pixels that follows it; slope unit: {unit:g} pixels"
     )
@@ -245,15 +158,7 @@ def _text(
 {said}name = {json.dumps(name)}
 summary = {json.dumps(summary)}
 
-[plant]               # a copy for each object along x and along y
-axes = {2 * n}
-A = {A}  # {kind}{memory}
-B = {B}           # the input shifts the window
-B_w = {B_w}
-C = {C}
-process_noise = {motion.q / unit**2:.6g}  # +- {motion.q_sd / unit**2:.2g}: {math.sqrt(motion.q):.4g} pixels rms a frame
-initial_covariance = {initial}
-
+{_plant(motion, unit, 2 * n)}
 [timing]
 fast_step_s = {step_ns / 1e9!r}  # {rate:.6g} frames/s
 exposure_steps = {K}

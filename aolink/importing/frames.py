@@ -117,28 +117,13 @@ def frame_times(film: Film, rig: Rig, settings: Settings) -> tuple[NDArray[np.in
         if rate is not None and abs(rate / settings.rate_hz - 1) > _CLOSE:
             notes.append(f"the film says {rate:g} frames/s; {settings.rate_hz:g} frames/s as given are taken")
         rate = settings.rate_hz
-    periods = np.arange(film.count, dtype=np.int64)
-    if film.times_ns is not None and film.count > 1:
-        gaps = np.diff(film.times_ns) / 1e9
-        period = float(np.median(gaps))
-        if period <= 0 or (gaps <= 0).any():
-            late = int(np.argmax(gaps <= 0)) + 1
-            raise ImportingError(f"{film.name}: frame {late} is not later than the one before: its times are damaged")
-        if rate is not None and abs(rate * period - 1) > _CLOSE:
-            raise ImportingError(
-                f"{film.name}: {rate:g} frames/s contradict its times, which say {1 / period:.6g}: give --rate"
-                f" {1 / period:.6g}, or a file with the right times"
-            )
-        counts = np.rint(gaps / period).astype(np.int64)
-        off = np.abs(gaps / period - counts)
-        if (counts < 1).any() or (off > _IRREGULAR).any():
-            worst = int(np.argmax(np.where(counts < 1, np.inf, off)))
-            raise ImportingError(
-                f"{film.name}: frame {worst + 1} comes {gaps[worst]:.4g} s after the one before, at a frame period of"
-                f" {period:.4g} s: exposures must follow at a steady rate, only whole frames may be missing"
-            )
-        periods[1:] = np.cumsum(counts)
-        rate = 1 / period
+    periods, timed = film_periods(film)
+    if timed is not None and rate is not None and abs(rate / timed - 1) > _CLOSE:
+        raise ImportingError(
+            f"{film.name}: {rate:g} frames/s contradict its times, which say {timed:.6g}: give --rate {timed:.6g}, or a"
+            " file with the right times"
+        )
+    rate = timed or rate
     own = K / (timing.frame_period_steps * timing.fast_step_s)
     if rate is None:
         notes.append(f"the film does not state its frame rate: that of the rig file is assumed, {own:.6g} frames/s")
@@ -169,6 +154,35 @@ def frame_times(film: Film, rig: Rig, settings: Settings) -> tuple[NDArray[np.in
                 " change timing.exposure_steps, or give the right --exposure"
             )
     return periods, notes
+
+
+def film_periods(film: Film) -> tuple[NDArray[np.int64], float | None]:
+    """Number of each frame in frame periods from the first on, (count,), and frames a second, by the film's times;
+    without times no frame is missing, and the rate is None.
+
+    Raises
+    ------
+    ImportingError
+        The times do not follow each other at a steady rate.
+    """
+    periods = np.arange(film.count, dtype=np.int64)
+    if film.times_ns is None or film.count < 2:
+        return periods, None
+    gaps = np.diff(film.times_ns) / 1e9
+    period = float(np.median(gaps))
+    if period <= 0 or (gaps <= 0).any():
+        late = int(np.argmax(gaps <= 0)) + 1
+        raise ImportingError(f"{film.name}: frame {late} is not later than the one before: its times are damaged")
+    counts = np.rint(gaps / period).astype(np.int64)
+    off = np.abs(gaps / period - counts)
+    if (counts < 1).any() or (off > _IRREGULAR).any():
+        worst = int(np.argmax(np.where(counts < 1, np.inf, off)))
+        raise ImportingError(
+            f"{film.name}: frame {worst + 1} comes {gaps[worst]:.4g} s after the one before, at a frame period of"
+            f" {period:.4g} s: exposures must follow at a steady rate, only whole frames may be missing"
+        )
+    periods[1:] = np.cumsum(counts)
+    return periods, 1 / period
 
 
 def counts_of(

@@ -10,6 +10,7 @@ import numpy as np
 from scipy import ndimage, optimize
 
 from aolink.errors import ImportingError
+from aolink.importing.accuracy import pixel_noise, tracker_errors
 from aolink.importing.film import Film
 from aolink.importing.frames import FilmLight, Settings
 from aolink.importing.tracker import FIRST_FRAMES, WEIGHT, Objects, Tracker, trackpy_locator
@@ -55,10 +56,8 @@ class Survey:
     """
     model: FloatArray
     """The fits at the same places, as a share of the object's light, (samples,)."""
-    place_sd: float
-    """Standard deviation of the error of a place in one frame, pixels."""
-    walk: float
-    """Variance of the step from frame to frame along one direction, pixels squared."""
+    place_sd: FloatArray
+    """Standard deviation of the error of each object's place in one frame, pixels, (n,); NaN where it is not seen."""
     beside: FloatArray
     """The brightest light beside each object as a share of its own, both through a Gaussian of the object's size, in
     each stretch of the film, (stretches, n); NaN where the object is not seen."""
@@ -85,9 +84,8 @@ class Survey:
         drift, count = np.nanmean(steps, axis=(0, 1)), max(int(np.isfinite(steps).all(axis=2).sum()), 1)
         if np.linalg.norm(drift) > _DRIFTS * math.sqrt(np.nanvar(steps) / count):
             yield (
-                f"the objects drift together by {drift[0]:.3g},{drift[1]:.3g} pixels a frame: a first rig file knows of"
-                " no drift, and takes it for random motion; where an exposure's drift is more than its random motion,"
-                " light is cut off and estimates are wrong"
+                f"the objects drift together by {drift[0]:.3g},{drift[1]:.3g} pixels a frame: a rig file of `aolink rig"
+                " --from` has a velocity for each of them, where they can be told from random motion"
             )
         unseen = np.asarray(~np.isfinite(self.places).all(axis=2) & ~self.together.any(axis=2))
         for number, gone in enumerate(unseen.T, 1):
@@ -149,10 +147,11 @@ def survey(film: Film, settings: Settings, objects: Objects, progress: Callable[
         raise ImportingError(f"{film.name}: no object can be followed from frame to frame: do they move too far?")
     cuts = np.array(windows)
     sd, sd_sd, amounts, ground, residual, model, beside = _fitted(cuts, np.array(centres), objects.sd)
-    walk, place_sd = _steps(path)
+    noise = pixel_noise(cuts.reshape(-1, *cuts.shape[2:]), np.concatenate(centres), sd)
+    place_sd = tracker_errors(path, np.arange(0, film.count, every), amounts, sd, noise)
     return Survey(
         places=path, last=np.array(last), together=near, sd=sd, sd_sd=sd_sd, light=amounts, ground=ground,
-        residual=residual, model=model, place_sd=place_sd, walk=walk, beside=beside, stretch=every * _STRETCH,
+        residual=residual, model=model, place_sd=place_sd, beside=beside, stretch=every * _STRETCH,
         left_out=float(np.isnan(cuts).mean()),
     )  # fmt: skip
 
@@ -210,20 +209,19 @@ def _brightest_beside(window: FloatArray, sd: float) -> float:
     return float(smooth[np.hypot(x, y) >= WEIGHT * sd].max())
 
 
-def _steps(places: FloatArray) -> tuple[float, float]:
-    """Variance of the steps of a random walk and the tracker's error, pixels squared and pixels.
-
-    A frame that is exposed throughout sees the walk's mean: steps then have the variance 2 q / 3 + 2 r and from step to
-    step the covariance q / 6 - r. Berglund, Phys. Rev. E 82, 011917 (2010).
-    """
-    steps = np.diff(places, axis=0)
-    steps = steps - np.nanmean(steps, axis=0)
-    variance = float(np.nanmean(steps**2))
-    covariance = float(np.nanmean(steps[1:] * steps[:-1]))
-    walk = max(variance + 2 * covariance, 0.0)
-    return walk, math.sqrt(max(walk / 6 - covariance, 0.0))
-
-
 def reach(known: Survey, frames: int) -> float:
     """Largest distance of an object's light from the middle of its blur in an exposure of ``frames`` frames, pixels."""
-    return _REST * math.sqrt(known.sd**2 + known.walk * frames)
+    moved = max((_mean_square(known.places[lag:] - known.places[:-lag]) for lag in range(1, frames + 1)), default=0.0)
+    return _REST * math.sqrt(known.sd**2 + moved)
+
+
+def spread_in(known: Survey, frames: int) -> float:
+    """Variance of an object's places about their mean in an exposure of ``frames`` frames, pixels squared."""
+    moved = (2 * (frames - lag) * _mean_square(known.places[lag:] - known.places[:-lag]) for lag in range(1, frames))
+    return sum(moved) / (2 * frames**2)
+
+
+def _mean_square(steps: FloatArray) -> float:
+    """Over frames and objects, along one direction; zero where nothing is known."""
+    known = np.isfinite(steps)
+    return float((steps[known] ** 2).mean()) if known.any() else 0.0

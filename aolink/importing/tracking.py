@@ -18,7 +18,7 @@ from aolink.errors import ImportingError
 from aolink.exposure import Truth
 from aolink.importing.film import Film
 from aolink.importing.frames import Account, FilmLight, ImportedExposure, Settings, counts_of, grouped, rig_frame
-from aolink.importing.survey import Survey, reach, survey
+from aolink.importing.survey import Survey, reach, spread_in, survey
 from aolink.importing.tracker import WEIGHT, find_objects
 from aolink.numerics.arrays import BoolArray, FloatArray
 from aolink.optics.centroid import weighted_centroid
@@ -50,12 +50,13 @@ def tracked(
     known = survey(film, settings, find_objects(film, settings))
     account.notes += tuple(known.notes())
     windows = _Windows(rig, sensor, known)
+    far, spread = windows.reach, spread_in(known, settings.frames_per_exposure)
     light, step, area = FilmLight(film, settings), 0, sensor.pixel_size
     for group in grouped(film, settings.frames_per_exposure, periods):
         shown = [light.of(frame) for frame in group.frames]
         mean = np.mean([one for one, _ in shown], axis=0)
         bad = np.any([wrong for _, wrong in shown], axis=0)
-        blurs = _blurs(mean, known.last[max(group.first_frame - 1, 0)], known, len(shown))
+        blurs = _blurs(mean, known.last[max(group.first_frame - 1, 0)], known.sd, far, spread)
         values, usable, own = windows.cut(mean, ~bad, blurs)
         end = group.first_frame + len(shown)
         seen = np.isfinite(known.places[group.first_frame : end]).all(axis=2)
@@ -78,20 +79,18 @@ def tracked(
             after = windows.positions(known.places[end : end + 1] if follows else known.places[:0])
             truth = Truth(
                 start_state=_state(rig, path[:, 0]), end_state=_state(rig, after[:, 0] if after.size else None),
-                path=path, path_sd=known.place_sd * sensor.pixel_width,
+                path=path, path_sd=float(np.sqrt(np.mean(known.place_sd**2))) * sensor.pixel_width,
             )  # fmt: skip
         yield ImportedExposure(frame=frame, inputs=inputs, truth=truth)
 
 
-def _blurs(picture: FloatArray, last: FloatArray, known: Survey, frames: int) -> FloatArray:
+def _blurs(picture: FloatArray, last: FloatArray, sd: float, far: float, spread: float) -> FloatArray:
     """Positions of the objects' blurs in an exposure, after they were at ``last`` (n, 2).
 
     They are measured in the exposure alone: knowledge from the single frames must not show in its pixels.
     """
-    far = reach(known, frames)
-    windows, corners = cut_windows(picture, last, math.ceil(far + 2 * WEIGHT * known.sd))
-    spread = math.sqrt(known.sd**2 + known.walk * frames / 6)  # a walk's mean square about its own mean
-    found = corners + weighted_centroid(windows, WEIGHT * spread, start=last - corners)
+    windows, corners = cut_windows(picture, last, math.ceil(far + 2 * WEIGHT * sd))
+    found = corners + weighted_centroid(windows, WEIGHT * math.sqrt(sd**2 + spread), start=last - corners)
     near = np.linalg.norm(found - last, axis=1) <= far  # False where it is NaN
     return np.where(near[:, None], found, last)
 
@@ -117,7 +116,8 @@ class _Windows:
             np.allclose(plant.C @ plant.A @ plant.B, gain) and np.linalg.matrix_rank(gain) == len(gain)
         )
         self._per_shift = np.linalg.inv(gain) if self._moves else gain
-        self._reach = reach(known, rig.timing.exposure_steps)
+        self.reach = reach(known, rig.timing.exposure_steps)
+        """Distance from the middle of a blur beyond which there is none of its object's light, pixels."""
         self._corners = self._about(known.last[0])
 
     def _about(self, places: FloatArray) -> NDArray[np.int64]:
@@ -144,10 +144,10 @@ class _Windows:
         at = np.clip(y, 0, rows - 1)[:, :, None], np.clip(x, 0, columns - 1)[:, None, :]
         distance = np.linalg.norm(places[:, None] - places, axis=2)
         shared = np.zeros(inside.shape, dtype=np.bool_)
-        for k, other in np.argwhere((distance < 2 * self._reach) & ~np.eye(len(places), dtype=np.bool_)):
-            shared[k] |= np.hypot(x[k] - places[other, 0], (y[k] - places[other, 1])[:, None]) <= self._reach
+        for k, other in np.argwhere((distance < 2 * self.reach) & ~np.eye(len(places), dtype=np.bool_)):
+            shared[k] |= np.hypot(x[k] - places[other, 0], (y[k] - places[other, 1])[:, None]) <= self.reach
         away = np.hypot((x - places[:, :1])[:, None, :], (y - places[:, 1:])[:, :, None])
-        near = away <= self._reach
+        near = away <= self.reach
         # Beyond the picture nothing is known of light that may be an object's own.
         return picture[at], ~near | (inside & usable[at] & ~shared), inside & near
 
