@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -44,7 +45,7 @@ def pixel_noise(windows: FloatArray, centres: FloatArray, sd: float) -> tuple[fl
 
 
 def tracker_errors(
-    places: FloatArray, samples: FloatArray, light: FloatArray, sd: float, noise: tuple[float, float]
+    places: FloatArray, samples: Sequence[int], light: FloatArray, sd: float, noise: tuple[float, float]
 ) -> FloatArray:
     """Standard deviation of the tracker's error along one direction, for each object, pixels, (n,).
 
@@ -54,7 +55,7 @@ def tracker_errors(
     side = 2 * math.ceil(4 * sd) + 1
     n = places.shape[1]
     middles = np.column_stack([np.arange(n) * side + side // 2, np.full(n, side // 2)]).astype(np.float64)
-    edges_x, edges_y = np.arange(n * side + 1) - 0.5, np.arange(side + 1) - 0.5
+    edges_x, edges_y = (np.arange(count + 1, dtype=np.float64) - 0.5 for count in (n * side, side))
     rng = np.random.default_rng(1)
     locate = trackpy_locator(sd)
     moments = (np.arange(_TIMES) + 0.5) / _TIMES - 0.5
@@ -75,4 +76,5 @@ def tracker_errors(
         )
         squares[row] = np.where(np.isfinite(now).all(axis=1), ((found - true) ** 2).mean(axis=1), np.nan)
     known = np.isfinite(squares)
-    return np.sqrt(np.where(known, squares, 0.0).sum(axis=0) / np.where(known.any(axis=0), known.sum(axis=0), np.nan))
+    counted = np.where(known.any(axis=0), known.sum(axis=0), np.nan)
+    return np.asarray(np.sqrt(np.where(known, squares, 0.0).sum(axis=0) / counted))

@@ -107,10 +107,11 @@ def fit_motion(places: FloatArray) -> Motion:
         options["initial_simplex"] = np.vstack(
             [at, at + np.diag([_width(which, at, free, len(places)) for which in free])]
         )
-        found = optimize.minimize(
-            lambda values: _cost(places, free, values), at, method="Nelder-Mead",
-            options=options,
-        )  # fmt: skip
+
+        def cost(values: FloatArray) -> float:
+            return _cost(places, free, values)
+
+        found = optimize.minimize(cost, at, method="Nelder-Mead", options=options)
         return _Fit(free, found.x, float(found.fun) + len(free) * math.log(count) / 2)
 
     def with_drift(fit: _Fit, start: Sequence[float] | None = None) -> _Fit:
