@@ -86,7 +86,8 @@ def dense_view(rig: Rig, frame: Frame, paths: JointPaths) -> PixelView:
         end_remainder=model.end_remainder, widening=paths.widening, resolution=paths.resolution,
     )  # fmt: skip
     (level,) = paths.resolution.of(frame.response.path).tolist()
-    return PlainView.of(PixelView(rig.sensor, model, frame.response, frame.windows, reduced, level))
+    view: PixelView = PlainView.of(PixelView(rig.sensor, model, frame.response, frame.windows, reduced, level))
+    return view
 
 
 def foreseen(frame: Frame, paths: JointPaths) -> JointPaths:
