@@ -190,3 +190,11 @@ def test_goals_are_held_or_not() -> None:
     too_sure = [*rows_of("mixture", far, nees=3.0), *rows_of("o1", one), *rows_of("sampled", limit)]
     judged = goals(by_estimator(too_sure))
     assert [goal.held for goal in judged] == [False, True, False, False]  # limit, coverage, NEES, o1
+
+
+def test_the_picture_is_drawn_of_the_rows_that_are_kept(tmp_path: Path) -> None:
+    from paper_report.figures import figure_family
+    from paper_report.judge import RECORDED, read_rows
+
+    figure_family(tmp_path / "family.png", read_rows(RECORDED), 40)
+    assert (tmp_path / "family.png").stat().st_size > 5000
