@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from paper_report.judge import Row
 
 TOOLS = Path(__file__).parents[2] / "tools"
+CHEAP_SCENES = (100000, 100001)
+"""Reporting scenes of which the repository keeps rows."""
 
 
 @pytest.fixture(autouse=True)
@@ -112,6 +114,24 @@ def test_it_is_stopped_and_continued(tmp_path: Path) -> None:
     assert [line.partition('"seconds"')[0] for line in again] == [line.partition('"seconds"')[0] for line in both]
 
 
+@pytest.mark.long
+def test_rows_that_the_repository_keeps_are_those_of_todays_code() -> None:
+    """Of two scenes, a line and a spot on a plane: to one part in a thousand, which other machines and another order of
+    sums do not reach."""
+    from paper_report.family import SEEDS, draw
+    from paper_report.judge import RECORDED, Size, judge, read_rows
+
+    kept = {(row.seed, row.estimator): row for row in read_rows(RECORDED)}
+    assert {seed for seed, _ in kept} <= set(SEEDS["reporting"])
+    assert all(row.commit and not row.commit.endswith("+") for row in kept.values())
+    for seed in CHEAP_SCENES:
+        for row in judge(draw(seed), ["open-loop", "o1", "moments"], Size()):
+            there = kept[seed, row.estimator]
+            assert (there.states, there.scored, there.statuses) == (row.states, row.scored, row.statuses)
+            np.testing.assert_allclose([row.path, row.nees], [there.path, there.nees], rtol=1e-3)
+            np.testing.assert_allclose(row.inside, there.inside, atol=3e-3)  # a step more or less at an interval's end
+
+
 def test_its_scenes_are_what_the_check_of_a_rig_file_says_nothing_of() -> None:
     from paper_report.family import SEEDS, draw, rig_of
 
@@ -170,3 +190,11 @@ def test_goals_are_held_or_not() -> None:
     too_sure = [*rows_of("mixture", far, nees=3.0), *rows_of("o1", one), *rows_of("sampled", limit)]
     judged = goals(by_estimator(too_sure))
     assert [goal.held for goal in judged] == [False, True, False, False]  # limit, coverage, NEES, o1
+
+
+def test_the_picture_is_drawn_of_the_rows_that_are_kept(tmp_path: Path) -> None:
+    from paper_report.figures import figure_family
+    from paper_report.judge import RECORDED, read_rows
+
+    figure_family(tmp_path / "family.png", read_rows(RECORDED), 40)
+    assert (tmp_path / "family.png").stat().st_size > 5000

@@ -329,17 +329,19 @@ def figure_limit(path: Path, table: Sequence[LimitScene], dpi: int) -> None:
 
 
 def figure_family(path: Path, given: Sequence[Row], dpi: int) -> None:
-    """Each scene a point: path RMSE over the sampler's, and coverage, against swings in an exposure."""
+    """Each scene a point: path RMSE over the sampler's, or over o1's without rows of it, and coverage, against swings
+    in an exposure."""
     rows = by_estimator(given)
+    reference, span = (LIMIT, (0.5, 4.0)) if rows[LIMIT] else ("o1", (0.0, 1.6))
     with _figure(path, dpi, (9.5, 4.2), 1, 2) as (figure, ((left, right),)):
         for name in ("o1", *JUDGED):
             style = {"marker": _MARKERS[name], "color": _colour(name), "linestyle": "none", "markersize": 4.5}
-            over = ratios(rows, name, LIMIT)
+            over = ratios(rows, name, reference)
             left.plot([_swings(seed) for seed in over], list(over.values()), label=name, **style)
             found = rows[name]
             right.plot([_swings(seed) for seed in found], [np.mean(row.inside) for row in found.values()], **style)
-        left.axhline(1, color=_colour(LIMIT), linewidth=1.2)
-        left.set(ylabel="path RMSE / sampled's", ylim=(0.5, 4))
+        left.axhline(1, color=_colour(reference), linewidth=1.2)
+        left.set(ylabel=f"path RMSE / {reference}'s", ylim=span)
         for end in SCENE_INSIDE:
             right.axhline(end, color="0.5", linewidth=0.9, linestyle=":")
         right.set(ylim=(0, 1.02), ylabel="coverage of 95 % intervals")

@@ -5,10 +5,12 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import json
+import subprocess
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -24,6 +26,10 @@ QUICK_NAMES = ("open-loop", "o1", "o3", "moments")
 PIXEL_NAMES = ("profile", "mixture")
 LIMIT = "sampled"
 NAMES = (*QUICK_NAMES, *PIXEL_NAMES, LIMIT)
+RECORDED = Path(__file__).with_name("family.jsonl")
+"""Rows that the repository keeps, since they take hours: of reporting seeds, made by the commits that they name."""
+_DIGITS = 6
+"""Significant digits of numbers in a file of rows."""
 BEYOND_95 = 1.959964
 """Standard deviations on either side of a 95 % interval."""
 
@@ -73,6 +79,8 @@ class Row:
     """Exposures by their status."""
     seconds: float
     """Time of the processor, s, for an exposure of one run."""
+    commit: str = ""
+    """The commit that was checked out when the row was made, with a + if files differed from it."""
 
 
 def stratified(seeds: Sequence[int], count: int) -> list[int]:
@@ -172,15 +180,15 @@ def read_rows(path: Path) -> list[Row]:
 
 @dataclass(frozen=True, kw_only=True)
 class Plan:
-    """The plan of which scenes are judged by which estimators."""
+    """The plan of which scenes are judged by which estimators, where recorded rows are not taken."""
 
-    scenes: int = 200
+    scenes: int
     """Number of scenes that are judged by all but the slow estimators; the first of the reporting seeds."""
-    pixel_scenes: int = 40
+    pixel_scenes: int
     """How many of these scenes are judged by `profile` and `mixture`, stratified."""
-    limit_scenes: int = 18
+    limit_scenes: int
     """How many of those scenes are judged by `sampled`."""
-    size: Size = field(default_factory=lambda: Size(pixel_runs=6))
+    size: Size
 
 
 def judge_plan(path: Path, plan: Plan) -> list[Row]:
@@ -201,7 +209,8 @@ def judge_all(
     file for those.
     """
     rows = read_rows(path)
-    path.write_text("".join(f"{json.dumps(dataclasses.asdict(row))}\n" for row in rows), encoding="utf-8")
+    path.write_text("".join(map(_line, rows)), encoding="utf-8")
+    commit = _commit()
     there = {(row.seed, row.estimator) for row in rows}
     with path.open("a", encoding="utf-8") as file:
         for seed in seeds:
@@ -210,12 +219,41 @@ def judge_all(
                 continue
             scene = draw(seed)
             say(f"{seed}: {scene}")
-            for row in judge(scene, missing, size):
+            for made in judge(scene, missing, size):
+                row = dataclasses.replace(made, commit=commit)
                 rows.append(row)
-                file.write(f"{json.dumps(dataclasses.asdict(row))}\n")
+                file.write(_line(row))
                 file.flush()
                 say(
                     f"  {row.estimator:9} path rms {np.sqrt(np.mean(row.path)):.4f}  inside {np.mean(row.inside):.3f}"
                     f"  NEES {np.mean(row.nees):.2f} of {row.states}  {1e3 * row.seconds:.2f} ms"
                 )
     return rows
+
+
+def _line(row: Row) -> str:
+    """A row as a line of a file."""
+    return f"{json.dumps({key: _short(value) for key, value in dataclasses.asdict(row).items()})}\n"
+
+
+def _short(value: Any) -> Any:
+    if isinstance(value, list):
+        return [_short(each) for each in value]
+    return float(f"{value:.{_DIGITS}g}") if isinstance(value, float) else value
+
+
+def _commit() -> str:
+    """`Row.commit` of rows made now; empty where this is no checkout."""
+    try:
+        head, changed = (
+            subprocess.run(
+                ["git", *arguments], cwd=RECORDED.parents[2], capture_output=True, text=True, check=True
+            ).stdout.strip()
+            for arguments in (
+                ["rev-parse", "--short=7", "HEAD"],
+                ["status", "--porcelain", "--untracked-files=no", "--", "aolink", "tools", ":!*.jsonl"],
+            )
+        )  # fmt: skip
+    except (OSError, subprocess.CalledProcessError):
+        return ""
+    return f"{head}{'+' if changed else ''}"

@@ -16,7 +16,7 @@ from paper_report import figures, shahin
 from paper_report import numbers as n
 from paper_report.blocks import as_html, as_markdown
 from paper_report.ensemble import Cell, map_cells
-from paper_report.judge import judge_plan
+from paper_report.judge import RECORDED, judge_plan, read_rows
 from paper_report.limit import against_o1, limit_table
 from paper_report.loop import loop_cells
 from paper_report.made_films import made_films
@@ -74,7 +74,8 @@ def compute(effort: n.Effort, out: Path) -> Results:
     with _timed("closed loops"):
         loops = loop_cells(effort is n.QUICK)
     with _timed("family"):
-        family = judge_plan(out / "family.jsonl", effort.family)
+        plan = effort.family
+        family = read_rows(RECORDED) if plan is None else judge_plan(out / "family.jsonl", plan)
     with _timed("map"):
         mechanism = n.mechanism(lively, effort)
         cells = map_cells(

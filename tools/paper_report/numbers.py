@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from scipy import integrate
@@ -51,7 +51,8 @@ class Effort:
     """Range of the kinds of made films, from the first number to before the second."""
     made_seeds: int = 5
     made_exposures: int = 14
-    family: Plan = field(default_factory=Plan)
+    family: Plan | None = None
+    """What is judged over the family; the rows that the repository keeps if None."""
     particles: int = 1500
     """Particles of the sampler."""
     offsets: tuple[float, ...] = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5)

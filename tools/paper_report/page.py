@@ -79,7 +79,8 @@ FIGURES = {
     " the interval leaves 1 out.",
     "limit.png": "Path RMSE of all estimators, and their distance from the sampler; dotted: where it costs 5 and 10 %.",
     "family.png": "Each scene a point, by the swings of its fastest mode in an exposure. Left: path RMSE over sampled's"
-    " on the same exposures. Right: coverage of 95 % intervals; dotted: the goal for each scene.",
+    " on the same exposures (over o1's where there is none of sampled)."
+    " Right: coverage of 95 % intervals; dotted: the goal for each scene.",
 }
 
 

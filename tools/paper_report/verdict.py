@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -225,7 +226,7 @@ def family_section(given: Sequence[Row], picture: PageFigure | None = None) -> l
             " the scenes' mean squared ratio with the 95 % interval of a bootstrap over scenes and runs. In brackets"
             " are scenes that are significantly worse (t-tests over runs, Holm's correction, 5 %). Coverage is the"
             " share of the path inside its 95 % intervals; open-loop, whose covariance is exact, shows what chance"
-            " does to a criterion."
+            f" does to a criterion.{_made_by(given)}"
         ),
         Table(
             [
@@ -238,6 +239,13 @@ def family_section(given: Sequence[Row], picture: PageFigure | None = None) -> l
         *([picture] if picture else []),
         Points(measured),
     ]  # fmt: skip
+
+
+def _made_by(rows: Sequence[Row]) -> str:
+    """The commits that made the rows, in words."""
+    counts = Counter(row.commit for row in rows if row.commit)
+    by = [f"{number} by commit {commit}" for commit, number in counts.items()]
+    return f" Rows as recorded: {', '.join(by)}." if by else ""
 
 
 def _quantiles(rows: Rows, name: str) -> list[str]:

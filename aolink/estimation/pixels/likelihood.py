@@ -21,7 +21,7 @@ import numpy as np
 
 from aolink.estimation.compiled.likelihoods import log_likelihoods
 from aolink.estimation.compiled.line import Line
-from aolink.estimation.compiled.plane import Plane
+from aolink.estimation.compiled.plane import Plane, linearised_light_of_spots
 from aolink.estimation.frames.frame_data import Profile, SpotWindows
 from aolink.estimation.kalman.gaussian import Gaussian
 from aolink.estimation.model import quadrature
@@ -255,26 +255,11 @@ class PixelView:
 
     def linearised(self, t: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Densities of the pixels without noise, (axes, k, pixels), and their Jacobian (axes, k, pixels, n)."""
-        w, edges, D = self.nodes.weights[:, None], self.optics.profile.edges, self.optics.pixel_size
-        lead, size, spots, terms = t.shape[:2], t.shape[2], self.outputs // 2, mehler_series(self.kernel)
-        path = self.paths(t).reshape(*lead, spots, 2, -1)
-        X, Y = (pixel_masses(self.kernel[d, d], edges, path[:, :, :, d], len(terms)) for d in (0, 1))
-        along, across = (self.nodes.basis.reshape(spots, 2, -1, size)[:, d] for d in (0, 1))
-        light: FloatArray = np.zeros(())
-        slopes: FloatArray = np.zeros(())
-        for j, c in enumerate(terms):
-            left = batched.transpose(Y[j])
-            light = light + c * batched.long_matmul(left, X[j] * w)
-            # d/dt sum_k w Y_r X_c: the columns' derivative times the rows, and the other way round.
-            columns = (X[j + 1] * w)[..., None] * along[:, :, None, :]
-            by_x = batched.long_matmul(left, columns.reshape(*columns.shape[:-2], -1))
-            rows = (Y[j + 1] * w)[..., None] * across[:, :, None, :]
-            by_y = batched.long_matmul(batched.transpose(X[j]), rows.reshape(*rows.shape[:-2], -1))
-            n_rows, n_columns = left.shape[-2], X[j].shape[-1]
-            by_x = by_x.reshape(*lead, spots, n_rows, n_columns, size)
-            by_y = by_y.reshape(*lead, spots, n_columns, n_rows, size).swapaxes(-3, -2)
-            slopes = slopes + c * (by_x + by_y)
-        return light.reshape(*lead, -1) / D, slopes.reshape(*lead, -1, size) / D
+        seen, (axes, points, n) = self._plane, t.shape
+        light = np.empty((axes, points, *seen.y.shape[1:]))
+        slopes = np.empty((*light.shape, n))
+        linearised_light_of_spots(seen, np.ascontiguousarray(t), light, slopes)
+        return light.reshape(axes, points, -1), slopes.reshape(axes, points, -1, n)
 
     def log_likelihood(self, f: FloatArray) -> FloatArray:
         """Log-likelihood of the usable pixels, up to a constant, (axes, k), if f (axes, k, pixels) is expected."""

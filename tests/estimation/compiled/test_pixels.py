@@ -308,6 +308,19 @@ def test_the_likelihood_of_a_spot_on_a_plane_is_that_of_the_twin(kind, masked):
     assert masked == 0 or not np.allclose(theirs, looked_at_plane(kind, 0)[1].log_likelihoods(t))
 
 
+@pytest.mark.parametrize("kind", PLANES)
+def test_the_light_of_a_spot_on_a_plane_and_its_slopes_are_the_twins(kind):
+    """A spot in the window, one half outside and one quite outside."""
+    view, in_numpy, state = looked_at_plane(kind, 0)
+    t = np.tile(view.reduced.prior(state).mean, (1, 3, 1))
+    t[0, 1, 0] += 1.0
+    t[0, 2, :4] += 7.0
+    light, slopes = view.linearised(t)
+    expected, expected_slopes = in_numpy.linearised(t)
+    np.testing.assert_allclose(light, expected, atol=1e-6 * expected.max())
+    np.testing.assert_allclose(slopes, expected_slopes, atol=3e-5 * np.abs(expected_slopes).max())
+
+
 @pytest.mark.parametrize("kind", ["round", "aslant"])
 def test_importance_sampling_of_a_spot_on_a_plane_with_the_same_points(kind):
     view, in_numpy, state = looked_at_plane(kind, 0)

@@ -46,11 +46,33 @@ class PlainView(PixelView):
 
     def linearised(self, t):
         if not self.sees_line:
-            return super().linearised(t)
+            return self._linearised_spots(t)
         path, w, pixel = self.paths(t)[:, :, 0], self.nodes.weights, self.optics.pixel_size
         mass, slope = pixel_masses(self.kernel[0, 0], self.optics.profile.edges, path, 1)
         f = batched.matmul(w[None], mass)[..., 0, :] / pixel
         return f, batched.long_matmul(np.swapaxes(slope * w[:, None], -1, -2), self.nodes.basis[0]) / pixel
+
+    def _linearised_spots(self, t):
+        w, edges, D = self.nodes.weights[:, None], self.optics.profile.edges, self.optics.pixel_size
+        lead, size, spots, terms = t.shape[:2], t.shape[2], self.outputs // 2, mehler_series(self.kernel)
+        path = self.paths(t).reshape(*lead, spots, 2, -1)
+        X, Y = (pixel_masses(self.kernel[d, d], edges, path[:, :, :, d], len(terms)) for d in (0, 1))
+        along, across = (self.nodes.basis.reshape(spots, 2, -1, size)[:, d] for d in (0, 1))
+        light = np.zeros(())
+        slopes = np.zeros(())
+        for j, c in enumerate(terms):
+            left = batched.transpose(Y[j])
+            light = light + c * batched.long_matmul(left, X[j] * w)
+            # d/dt sum_k w Y_r X_c: the columns' derivative times the rows, and the other way round.
+            columns = (X[j + 1] * w)[..., None] * along[:, :, None, :]
+            by_x = batched.long_matmul(left, columns.reshape(*columns.shape[:-2], -1))
+            rows = (Y[j + 1] * w)[..., None] * across[:, :, None, :]
+            by_y = batched.long_matmul(batched.transpose(X[j]), rows.reshape(*rows.shape[:-2], -1))
+            n_rows, n_columns = left.shape[-2], X[j].shape[-1]
+            by_x = by_x.reshape(*lead, spots, n_rows, n_columns, size)
+            by_y = by_y.reshape(*lead, spots, n_columns, n_rows, size).swapaxes(-3, -2)
+            slopes = slopes + c * (by_x + by_y)
+        return light.reshape(*lead, -1) / D, slopes.reshape(*lead, -1, size) / D
 
     def log_likelihoods(self, t):
         return self.log_likelihood(self.predicted(t))

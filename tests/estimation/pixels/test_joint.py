@@ -33,6 +33,7 @@ from aolink.exposure import Exposure
 from aolink.optics.sensor import Kernel
 from aolink.rig import Rig, load_rig, parse_rig
 from aolink.simulation.model import simulate
+from tests.estimation.pixels.plain import PlainView
 from tests.kinds import must_be, spots_of, truth_of
 
 NAMES = ("o1", "o3", "moments", "profile")
@@ -83,7 +84,8 @@ def dense_view(rig: Rig, frame: Frame, paths: JointPaths) -> PixelView:
         end_remainder=model.end_remainder, widening=paths.widening, resolution=paths.resolution,
     )  # fmt: skip
     (level,) = paths.resolution.of(frame.response.path).tolist()
-    return PixelView(rig.sensor, model, frame.response, frame.windows, reduced, level)
+    view: PixelView = PlainView.of(PixelView(rig.sensor, model, frame.response, frame.windows, reduced, level))
+    return view
 
 
 def foreseen(frame: Frame, paths: JointPaths) -> JointPaths:
