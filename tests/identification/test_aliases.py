@@ -26,7 +26,7 @@ def maximum(cycles, log_likelihood):
 def test_the_pixels_decide_whatever_the_likelihood_of_centroid_and_width_says(cycles):
     """Of the two aliases one is a cycle below, and one as far from a whole or half number of cycles, on the other
     side."""
-    exposures = list(aolink.simulate(shaken(cycles), 32, seed=3))
+    exposures = list(aolink.simulate(shaken(cycles), 48, seed=3))
     whole = round(2 * cycles)
     found = [maximum(whole - cycles, 0.0), maximum(cycles - 1, -1.0), maximum(cycles, -9.0)]
     left = by_pixels(found, lambda each: shaken(each.x[0]), exposures)
