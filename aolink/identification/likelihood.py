@@ -28,6 +28,7 @@ from aolink.estimation.model.quadrature import blocks, gauss
 from aolink.identification.models import DisturbanceProcesses
 from aolink.identification.readings import Readings
 from aolink.numerics.arrays import BoolArray, FloatArray, Indices
+from aolink.numerics.single_thread import by_one_thread
 
 _FEWEST_NODES = 12
 _NODES_PER_CYCLE = 3.2
@@ -105,6 +106,7 @@ class Likelihood:
         """
         return float(self.of_outputs(model, noise, wider, nodes).sum())
 
+    @by_one_thread
     def of_outputs(
         self, model: DisturbanceProcesses, noise: float = 1.0, wider: float = 0.0, nodes: int | None = None
     ) -> FloatArray:

@@ -29,8 +29,9 @@ _ROUNDS = 3
 """How often, at most, the aliases of the highest maximum so far are tried again."""
 _MOST = 3000
 """Most points of a grid of several processes."""
-KEPT = 12.0
-"""Local maxima that are lower than the highest by more than this, in nats, are forgotten."""
+KEPT = 30.0
+"""Local maxima that are lower than the highest by more than this, in nats, are forgotten: the pixels may prefer one
+that is lower by less (`aliases`)."""
 _SAME = 0.02
 """Maxima whose parameters differ by less than this share are one."""
 _RIDGE = 0.5

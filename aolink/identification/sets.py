@@ -27,6 +27,8 @@ QUANTILE = 3.841
 _DRAWS = 96
 _MOST = 8
 """The most local maxima that are considered."""
+_BELOW = 12.0
+"""The most by which they are lower than the given first one, nats."""
 _STEP = 0.02
 _WIDEST = 3.0
 """Longest single step along a profile, in the logarithm of the parameter."""
@@ -70,12 +72,13 @@ class Identified:
 def identified(
     space: Space, found: Sequence[Maximum], seen: Sequence[Readings], tell: Callable[[int], None] | None = None
 ) -> tuple[Identified, ...]:
-    """The sets of all parameters, from the local maxima, the highest first."""
+    """The sets of all parameters, from the local maxima, the best first: the highest, or the one that the pixels prefer
+    (`aliases`)."""
     of = [Likelihood(each, BLOCK) for each in seen]
     top = found[0]
     curvature = _curvature(space, top, of)
     factors = _factors(space, top, seen, curvature)
-    found = found[:_MOST]
+    found = [each for each in found[:_MOST] if each.log_likelihood > top.log_likelihood - _BELOW]
     allowed = [0.0, *(_allowed(space, top, each, seen) for each in found[1:])]
     curvatures, own = [curvature], [factors]
     for number, each in enumerate(found[1:], 1):

@@ -193,8 +193,8 @@ class Following:
         """Fit a new model once there are enough exposures, and judge it once there are more."""
         if self._result is None and len(self._unfitted) >= FITTED:
             del self._unfitted[:-FITTED]
-            seen = readings(self._rig, self._unfitted, kernel_known=not self._wanted.kernel)
-            self._result = from_readings(self._rig, [seen], self._wanted, self._tell)
+            seen = [readings(self._rig, self._unfitted, kernel_known=not self._wanted.kernel)]
+            self._result = from_readings(self._rig, seen, self._unfitted, self._wanted, self._tell)
         elif self._result is not None and len(self._unfitted) == FITTED + HELD_OUT:
             yield self._judge(frame_id, self._result)
             self._begin()

@@ -3,20 +3,24 @@ frames."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from aolink.errors import IdentificationError
+from aolink.exposure import Exposure
 from aolink.identification import (
     CANDIDATES,
     Identified,
     IdentifiedPlant,
+    Maximum,
     ProcessSum,
     Readings,
     Space,
     Tried,
+    by_pixels,
     chosen,
     identified,
     identified_text,
@@ -26,14 +30,18 @@ from aolink.identification import (
     space_of,
     tried,
 )
+from aolink.numerics.arrays import FloatArray
 from aolink.recording.reader import Recording
 from aolink.recording.reestimate import check_has_exposures
-from aolink.rig import Rig
+from aolink.rig import Rig, parse_rig
 
 _MOST_OUTPUTS = 24
 """The most outputs that a model is fitted to; from more outputs, as many are taken at equal distances."""
 _APART = 2
 """Up to this many outputs of a copy of the plant have a model each; more outputs share one."""
+_BY_PIXELS = 4
+"""The most spots, of one output each, whose pixels distinguish aliases: `profile` takes a tenth of a second for an
+exposure of each."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -95,7 +103,8 @@ def identify(recordings: Sequence[Recording], rig: Rig | None, wanted: Wanted, t
         kinds_of(name)
     first = rig or recordings[0].rig
     plant_known = wanted.plant is None
-    seen = []
+    seen: list[Readings] = []
+    longest: list[Exposure] = []
     for number, recording in enumerate(recordings):
         check_has_exposures(recording)
         own = rig or recording.rig
@@ -103,15 +112,19 @@ def identify(recordings: Sequence[Recording], rig: Rig | None, wanted: Wanted, t
             raise IdentificationError(
                 f"{recording.path} is of another rig than {recordings[0].path}: timing and outputs must be the same"
             )
-        seen.append(readings(own, list(recording.exposures()), plant_known=plant_known, kernel_known=not wanted.kernel))
+        exposures = list(recording.exposures())
+        seen.append(readings(own, exposures, plant_known=plant_known, kernel_known=not wanted.kernel))
+        longest = max(longest, exposures, key=len)
         if tell:
             tell("recordings", number + 1, len(recordings))
-    return from_readings(first, seen, wanted, tell)
+    return from_readings(first, seen, longest, wanted, tell)
 
 
-def from_readings(rig: Rig, seen: Sequence[Readings], wanted: Wanted, tell: Tell | None = None) -> Result:
-    """Identify models as `identify` does, from the readings of each recording."""
-    found = [_of_output(rig, label, each, wanted, tell) for label, each in _by_output(rig, seen)]
+def from_readings(
+    rig: Rig, seen: Sequence[Readings], exposures: Sequence[Exposure], wanted: Wanted, tell: Tell | None = None
+) -> Result:  # fmt: skip
+    """Identify models as `identify` does, from the readings of each recording, and the exposures of one."""
+    found = [_of_output(rig, label, each, exposures, wanted, tell) for label, each in _by_output(rig, seen)]
     one = found[0]
     if wanted.plant and len(found) > 1:
         raise IdentificationError("a plant is identified where one input moves one output of a copy of it")
@@ -144,7 +157,9 @@ def outputs_of(seen: Readings, which: Sequence[int]) -> list[int]:
     return [seeing[k] for k in at]
 
 
-def _of_output(rig: Rig, output: str, seen: Sequence[Readings], wanted: Wanted, tell: Tell | None) -> IdentifiedModel:
+def _of_output(
+    rig: Rig, output: str, seen: Sequence[Readings], exposures: Sequence[Exposure], wanted: Wanted, tell: Tell | None
+) -> IdentifiedModel:  # fmt: skip
     def space(kinds: Sequence[str]) -> Space:
         return space_of(
             kinds, seen, rig.sensor.kernel.variance, with_noise=wanted.noise, with_kernel=wanted.kernel,
@@ -163,18 +178,44 @@ def _of_output(rig: Rig, output: str, seen: Sequence[Readings], wanted: Wanted, 
     of = space(kinds_of(name) if name else ())
     if tell:
         tell(f"fit, {output}", 0, len(of.names) + 1)
-    tops = maxima(of, seen)
+    everything = tops = maxima(of, seen)
+    if rig.plant.n_outputs == 1 and rig.plant.axes <= _BY_PIXELS and rig.plant.wandering is None:
+        tops = by_pixels(everything, lambda each: _with_model(rig, of, each), exposures)
     sets = identified(of, tops, seen, (lambda k: tell(f"fit, {output}", k + 1, len(of.names) + 1)) if tell else None)
     x, plant = tops[0].x, of.fitted_plant(tops[0].x)
-    whole = of.model(x)
     noise, wider = of.others(x)
-    notes = []
+    notes = _ruled_out(of, everything, tops)
     for each in sets:
         if each.name.endswith("frequency_hz") and len(each.pieces) > 1:
             rest = ", ".join(f"{piece.best:.4g}" for piece in each.pieces if not piece.low <= each.best <= piece.high)
             notes.append(f"{each.name}: {rest} Hz explains the exposures nearly as well: an alias that remains")
     return IdentifiedModel(
-        output=output, model=replace(whole, processes=whole.processes[1 if plant else 0 :]), plant=plant, noise=noise,
-        wider=wider, parameters=sets, tried=tuple(candidates), log_likelihood=tops[0].log_likelihood,
+        output=output, model=_without_plant(of, x), plant=plant, noise=noise, wider=wider, parameters=sets,
+        tried=tuple(candidates), log_likelihood=tops[0].log_likelihood,
         exposures=sum(int(each.usable.any(axis=0).sum()) for each in seen), notes=tuple(notes),
     )  # fmt: skip
+
+
+def _without_plant(of: Space, x: FloatArray) -> ProcessSum:
+    """The disturbance, without the noise of a plant that is fitted."""
+    whole = of.model(x)
+    return replace(whole, processes=whole.processes[1 if of.plant else 0 :])
+
+
+def _with_model(rig: Rig, of: Space, at: Maximum) -> Rig:
+    """The rig with the model of a maximum, for a plant of one output."""
+    noise, wider = of.others(at.x)
+    models, plant = [_without_plant(of, at.x)], of.fitted_plant(at.x)
+    return parse_rig(identified_text(rig.toml, rig, models, plant=plant, noise=noise, wider=wider))
+
+
+def _ruled_out(of: Space, found: Sequence[Maximum], left: Sequence[Maximum]) -> list[str]:
+    """A note for each frequency with maxima that the pixels rule out."""
+    notes = []
+    for k, name in enumerate(of.names):
+        if name.endswith("frequency_hz"):
+            kept = {f"{math.exp(each.x[k]):.4g}" for each in left}
+            out = dict.fromkeys(f"{math.exp(each.x[k]):.4g}" for each in found)
+            if gone := [each for each in out if each not in kept]:
+                notes.append(f"{name}: the pixels rule out {', '.join(gone)} Hz, which centroid and width leave")
+    return notes

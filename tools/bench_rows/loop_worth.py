@@ -18,7 +18,7 @@ from scipy import stats
 from aolink.control import ControllerRow
 from aolink.control.loop import centroids
 from aolink.exposure import Exposure, residual_rms
-from aolink.identification import ProcessSum, identified_text, maxima, readings, space_of
+from aolink.identification import ProcessSum, by_pixels, identified_text, maxima, readings, space_of
 from aolink.jobs.closed_loop import closed_loop
 from aolink.numerics.arrays import FloatArray
 from aolink.rig import Rig, load_rig, parse_rig
@@ -244,7 +244,7 @@ def _of_seed(cell: Cell, seed: int, size: Size) -> tuple[dict[str, float], Proce
         for estimator in cell.estimators:
             run(estimator, rig, "lqg", estimator)
         if cell.identified:
-            identified = _identified(before, earlier, cell.kinds)
+            identified = _identified(cell, before, earlier)
             own = played(identified)
             for estimator in cell.identified:
                 run(f"identified {estimator}", own, "lqg", estimator)
@@ -260,11 +260,12 @@ def _played(believes: Rig, slopes: FloatArray, path: Path) -> Rig:
     return load_rig(path)
 
 
-def _identified(rig: Rig, exposures: list[Exposure], kinds: Sequence[str]) -> ProcessSum:
+def _identified(cell: Cell, rig: Rig, exposures: list[Exposure]) -> ProcessSum:
     """The model that `aolink identify --model` finds from blurred frames alone, without its intervals."""
     seen = [readings(rig, exposures)]
-    space = space_of(kinds, seen, rig.sensor.kernel.variance, with_noise=False, with_kernel=False)
-    return space.model(maxima(space, seen)[0].x)
+    space = space_of(cell.kinds, seen, rig.sensor.kernel.variance, with_noise=False, with_kernel=False)
+    found = by_pixels(maxima(space, seen), lambda each: cell.rig(space.model(each.x)), exposures)
+    return space.model(found[0].x)
 
 
 def worth_headline(effort: Effort) -> list[Row]:
