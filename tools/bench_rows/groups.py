@@ -23,6 +23,7 @@ ROWS = {
     "restoration": ("restoration_quality", "restoration_uncertainty", "restoration_time"),
     "shaken": ("shaken",),
     "moving_scene": ("moving_scene",),
+    "family": ("drawn_scenes",),
     "loop": ("residual_slopes", "fall_back"),
     "loop_soak": ("closed_loop_soak",),
     "loop_worth": (
@@ -36,7 +37,7 @@ LONG = frozenset(
     {
         "soak", "closed_loop_soak", "bit_errors", "large_frames", "time_to_park", "restoration_quality", "shaken",
         "moving_scene", "residual_slopes", "fall_back", "worth_headline", "worth_lines", "worth_resonance",
-        "worth_air", "worth_factors", "coverage", "following", "spheres",
+        "worth_air", "worth_factors", "drawn_scenes", "coverage", "following", "spheres",
     }
 )  # fmt: skip
 """Functions that take two minutes or more each, `soak` forty, `closed_loop_soak` sixty.
