@@ -68,17 +68,15 @@ def imported(film: Film, rig: Rig, settings: Settings, account: Account) -> Iter
     scale = settings.scale or default_scale(film, rig)
     inputs = _Inputs(film, rig, settings, periods)
     account.notes += inputs.notes
-    for group in grouped(film, settings.frames_per_exposure, periods):
-        each = [light.of(frame) for frame in group.frames]
-        mean = np.mean([one for one, _ in each], axis=0)
+    for group in grouped(film, settings.frames_per_exposure, periods, light.of):
+        mean = group.mean
         if settings.scale is None and film.dtype.kind == "f" and mean.max() > 1.0:
             raise ImportingError(
                 f"{film.name} has floating-point values up to {mean.max():.6g}, where 1.0 would be full scale: say with"
                 " --scale how many counts a value of one is"
             )
-        usable = ~np.any([bad for _, bad in each], axis=0)
-        pixels, mask = counts_of(offset + scale * mean, usable, rig, account)
-        account.frames += len(each)
+        pixels, mask = counts_of(offset + scale * mean, ~group.bad, rig, account)
+        account.frames += settings.frames_per_exposure
         account.exposures += 1
         frame = rig_frame(film, rig, settings, group.first_period // settings.frames_per_exposure, pixels, mask)
         yield ImportedExposure(frame=frame, inputs=inputs.until(frame.last_step + 1))
@@ -100,9 +98,9 @@ def _of_slopes(
     pixels, mask = np.zeros(rig.sensor.shape, np.uint16), np.zeros(rig.sensor.shape, np.bool_)
     inputs = _Inputs(film, rig, settings, periods)
     account.notes += inputs.notes
-    for group in grouped(film, settings.frames_per_exposure, periods):
-        slopes = np.array(group.frames, dtype=np.float64).mean(axis=0)[0] * (settings.scale or 1.0)
-        account.frames += len(group.frames)
+    for group in grouped(film, settings.frames_per_exposure, periods, lambda frame: (frame.astype(np.float64), ~mask)):
+        slopes = group.mean[0] * (settings.scale or 1.0)
+        account.frames += settings.frames_per_exposure
         account.exposures += 1
         frame = rig_frame(film, rig, settings, group.first_period // settings.frames_per_exposure, pixels, mask)
         yield ImportedExposure(frame=replace(frame, slopes=slopes), inputs=inputs.until(frame.last_step + 1))

@@ -4,7 +4,7 @@ belong to."""
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -217,24 +217,32 @@ class Group:
     """Frame periods from the start of the film to its first frame."""
     first_frame: int
     """Number of its first frame in the film, from 0."""
-    frames: list[Frame]
+    mean: FloatArray
+    """Mean of the light of its frames, (rows, columns)."""
+    bad: NDArray[np.bool_]
+    """Pixels that are bad in one of its frames or more."""
 
 
-def grouped(film: Film, count: int, periods: NDArray[np.int64]) -> Iterator[Group]:
-    """Frames by exposures; a film that lost a frame goes on with the next whole exposure."""
-    group: list[Frame] = []
-    first = 0
+def grouped(
+    film: Film, count: int, periods: NDArray[np.int64], light: Callable[[Frame], tuple[FloatArray, NDArray[np.bool_]]]
+) -> Iterator[Group]:
+    """Frames by exposures, each frame's ``light`` summed as it comes; a film that lost a frame goes on with the next
+    whole exposure."""
+    held = first = 0
+    total, bad = np.zeros(film.shape), np.zeros(film.shape, dtype=np.bool_)
     for k, frame in enumerate(film.frames()):
-        if group and periods[k] != periods[k - 1] + 1:
-            group = []
-        if not group:
+        if held and periods[k] != periods[k - 1] + 1:
+            held = 0
+        if not held:
             if periods[k] % count:
                 continue  # exposures stay at multiples of one period, as a camera's do
             first = k
-        group.append(frame)
-        if len(group) == count:
-            yield Group(int(periods[first]), first, group)
-            group = []
+        shown, wrong = light(frame)
+        total, bad = (total + shown, bad | wrong) if held else (shown, wrong)
+        held += 1
+        if held == count:
+            yield Group(int(periods[first]), first, total / count, bad)
+            held = 0
 
 
 def rig_frame(

@@ -52,13 +52,10 @@ def tracked(
     windows = _Windows(rig, sensor, known)
     far, spread = windows.reach, spread_in(known, settings.frames_per_exposure)
     light, step, area = FilmLight(film, settings), 0, sensor.pixel_size
-    for group in grouped(film, settings.frames_per_exposure, periods):
-        shown = [light.of(frame) for frame in group.frames]
-        mean = np.mean([one for one, _ in shown], axis=0)
-        bad = np.any([wrong for _, wrong in shown], axis=0)
-        blurs = _blurs(mean, known.last[max(group.first_frame - 1, 0)], known.sd, far, spread)
-        values, usable, own = windows.cut(mean, ~bad, blurs)
-        end = group.first_frame + len(shown)
+    for group in grouped(film, settings.frames_per_exposure, periods, light.of):
+        blurs = _blurs(group.mean, known.last[max(group.first_frame - 1, 0)], known.sd, far, spread)
+        values, usable, own = windows.cut(group.mean, ~group.bad, blurs)
+        end = group.first_frame + settings.frames_per_exposure
         seen = np.isfinite(known.places[group.first_frame : end]).all(axis=2)
         usable &= np.asarray(seen.any(axis=0))[:, None, None]  # a window without its object shows nothing of it
         # Beyond an object's reach there is none of its light: light there belongs to others.
@@ -66,7 +63,7 @@ def tracked(
         density = values / known.light[:, None, None] / area
         counts = sensor.black_level + sensor.counts_per_density * windows.as_frame(density)
         pixels, mask = counts_of(counts, windows.as_frame(usable), rig, account)
-        account.frames += len(shown)
+        account.frames += settings.frames_per_exposure
         account.exposures += 1
         frame = rig_frame(film, rig, settings, group.first_period // settings.frames_per_exposure, pixels, mask)
         path = windows.positions(known.places[group.first_frame : end])

@@ -1,8 +1,9 @@
 """Films of spots whose motion is known, imported like the film of spheres: they show which of its figures are chance.
 
 Six spots walk at random, or shake with a resonance that has about a period in an exposure. The rig file is that of
-`aolink rig --from`; for a resonance, which that does not fit, its [plant] is replaced by the right one, as a user
-who knows the resonance would. Errors are against the path that the film was made with, not the tracker's.
+`aolink rig --from`; for a resonance, its fitted [plant] is replaced by the one that the film was made with, so that
+the figures are the estimators' and not the fit's. Errors are against the path that the film was made with, not the
+tracker's.
 """
 
 import re
