@@ -31,7 +31,7 @@ _FINE = 0.01
 """Spacing of the scan for a sharp vibration, cycles per exposure."""
 _SHARP = 0.003
 """Damping of the scan's vibration."""
-_PEAKS = 6
+_PEAKS = 12
 """Most peaks of a scan that are climbed."""
 _MOST = 3000
 """Most points of a grid of several processes."""
@@ -274,7 +274,7 @@ def _sharp(space: Space, x: FloatArray, one: Readings, of: Sequence[Likelihood])
     step = _FINE / (one.n_steps * one.step_s)
     out: list[FloatArray] = []
     for k, name in enumerate(space.names):
-        if not (name.endswith("frequency_hz") and name.startswith(("resonance", "frequency"))):
+        if not (name.startswith("resonance") and name.endswith("frequency_hz")):  # of a sum: alone it is easily found
             continue
         low, high = np.exp(space.bounds[k])
         points = np.tile(x, (int((high - low) / step), 1))
