@@ -27,6 +27,12 @@ _DECAY = 0.4
 _STARTS = 8
 _ROUNDS = 3
 """How often, at most, the aliases of the highest maximum so far are tried again."""
+_FINE = 0.01
+"""Spacing of the scan for a sharp vibration, cycles per exposure."""
+_SHARP = 0.003
+"""Damping of the scan's vibration."""
+_PEAKS = 12
+"""Most peaks of a scan that are climbed."""
 _MOST = 3000
 """Most points of a grid of several processes."""
 KEPT = 30.0
@@ -232,6 +238,8 @@ def maxima(space: Space, seen: Sequence[Readings]) -> list[Maximum]:
         looked_at.append(top)
         for start in _aliases(space, top.x, seen[0]):
             _add(space, best, climb(space, start, of))
+    for start in _sharp(space, max(best, key=lambda each: each.log_likelihood).x, seen[0], of):
+        _add(space, best, climb(space, start, of))
     highest = max(each.log_likelihood for each in best)
     best = [each for each in best if each.log_likelihood > highest - KEPT]
     apart: list[Maximum] = []
@@ -258,6 +266,24 @@ def _aliases(space: Space, x: FloatArray, one: Readings) -> list[FloatArray]:
                         other[k] = math.log(alias)
                         other[k + 1] = np.clip(x[k + 1] + x[k] - other[k], *space.bounds[k + 1])  # its damping
                         out.append(other)
+    return out
+
+
+def _sharp(space: Space, x: FloatArray, one: Readings, of: Sequence[Likelihood]) -> list[FloatArray]:
+    """The highest peaks of a fine scan of each resonance's frequency, sharp, beside the other processes of a point."""
+    step = _FINE / (one.n_steps * one.step_s)
+    out: list[FloatArray] = []
+    for k, name in enumerate(space.names):
+        if not (name.startswith("resonance") and name.endswith("frequency_hz")):  # of a sum: alone it is easily found
+            continue
+        low, high = np.exp(space.bounds[k])
+        points = np.tile(x, (int((high - low) / step), 1))
+        points[:, k] = np.log(low + step * (np.arange(len(points)) + 0.5))
+        points[:, k + 1] = np.clip(math.log(_SHARP), *space.bounds[k + 1])
+        values = np.array([space.log_likelihood(point, of) for point in points])
+        beside = np.pad(values, 1, constant_values=-np.inf)
+        peaks = np.flatnonzero(np.isfinite(values) & (values >= beside[:-2]) & (values > beside[2:]))
+        out += [points[p] for p in peaks[np.argsort(-values[peaks])][:_PEAKS]]
     return out
 
 
