@@ -244,11 +244,20 @@ def maxima(space: Space, seen: Sequence[Readings]) -> list[Maximum]:
     best = [each for each in best if each.log_likelihood > highest - KEPT]
     apart: list[Maximum] = []
     for each in sorted(best, key=lambda each: -each.log_likelihood):
-        # If it is no lower halfway along a ridge, the two are one maximum, not yet reached from both ends.
-        middles = (space.log_likelihood((each.x + other.x) / 2, of, other.nodes) for other in apart)
-        if not any(middle > each.log_likelihood - _RIDGE for middle in middles):
+        if not any(_on_a_ridge(space, each, other, of) for other in apart):
             apart.append(each)
     return apart
+
+
+def _on_a_ridge(space: Space, low: Maximum, high: Maximum, of: Sequence[Likelihood]) -> bool:
+    """Whether two maxima are one that was not reached from both ends: nowhere between them is it lower.
+
+    One point alone between two distant frequencies may be at a third maximum.
+    """
+    return all(
+        space.log_likelihood((1 - share) * low.x + share * high.x, of, high.nodes) > low.log_likelihood - _RIDGE
+        for share in (0.5, 0.25, 0.75)
+    )
 
 
 def _aliases(space: Space, x: FloatArray, one: Readings) -> list[FloatArray]:

@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 
 from aolink.identification import maxima, readings, space_of
+from aolink.jobs.closed_loop import closed_loop
 from aolink.rig import load_rig
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
 from bench_rows.identification import DisturbanceChange, changed
-from bench_rows.loop_worth import Cell, closed_loop
+from bench_rows.loop_worth import Cell
 
 
 @pytest.mark.long

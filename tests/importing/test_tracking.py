@@ -52,6 +52,7 @@ def test_objects_are_found_and_followed_to_a_tenth_of_a_pixel(walkers: SpotFilm)
     assert known.sd == pytest.approx(1.8, rel=0.05)
 
 
+@pytest.mark.long
 def test_light_beside_an_object_is_said_with_its_frames(tmp_path: Path) -> None:
     """A second object sticks to the first one in the second half of the film; a fainter one is no matter."""
     rng = np.random.default_rng(6)
@@ -97,6 +98,7 @@ def test_objects_beside_each_other_are_measured_apart(seed: int) -> None:
     assert np.sqrt(np.mean((known.places - film.places) ** 2)) < 0.1
 
 
+@pytest.mark.long
 def test_objects_that_meet_are_left_out_until_they_part(tmp_path: Path) -> None:
     rng = np.random.default_rng(4)
     film = spot_film(rng, passing(320, 0.0), MIDDLES)
@@ -162,6 +164,7 @@ def test_an_object_that_passes_a_faded_one_is_followed_on() -> None:
     assert np.sqrt(np.mean((known.places[:, 0] - film.places[:, 0]) ** 2)) < 0.1
 
 
+@pytest.mark.long
 def test_an_object_that_leaves_is_said_and_its_window_left_out(walkers: SpotFilm, tmp_path: Path) -> None:
     rng = np.random.default_rng(2)
     frames = walkers.frames.copy()
@@ -202,6 +205,7 @@ def test_pixels_beyond_the_picture_are_no_darkness(tmp_path: Path) -> None:
     assert np.mean(np.abs(errors) < 1.96 * spread) > 0.9
 
 
+@pytest.mark.long
 def test_saturated_pixels_do_not_widen_the_kernel(walkers: SpotFilm) -> None:
     flat = np.minimum(walkers.frames, np.uint16(1700))
     full = np.where(flat == 1700, np.uint16(65535), flat)
