@@ -46,7 +46,7 @@ def imported(film: Film, rig: Rig, settings: Settings, account: Account) -> Iter
         The film does not fit the rig file.
     """
     periods, notes = frame_times(film, rig, settings)
-    account.notes = (*film.notes, *notes)
+    account.notes = (*film.notes, *notes, *(() if settings.invert else film.saturation_notes))
     if film.nonlinear and settings.gamma == 1.0:
         account.notes += (f"light may not be linear: {film.nonlinear}; --gamma 2.2 undoes the usual curve",)
     if film.slopes:

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from functools import cached_property
+from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -12,6 +15,14 @@ from numpy.typing import NDArray
 from aolink.errors import ImportingError
 
 Frame = NDArray[np.generic]
+
+_CONVERTERS = (10, 12, 14)
+"""Bits of cameras whose pixels are stored in 16, at the lower end or at the upper one."""
+_READ_FRAMES = 2000
+"""Frames that are read, at most, to find out where a film saturates."""
+_LEAST_PIXELS = 3
+"""A film saturates at its largest value if that is a converter's last, and so many pixels have it at least, and no
+fewer than are within a hundredth below it."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -47,6 +58,34 @@ class Film:
     """The reason why pixel values may not be proportional to light; empty where there is none."""
     notes: tuple[str, ...] = field(default=())
     """Notes for the user about how it was read."""
+
+    @cached_property
+    def saturates_at(self) -> float:
+        """The value from which on a pixel is saturated; infinite where the values are no integers."""
+        if self.dtype.kind not in "iu":
+            return math.inf
+        full_scale = float(np.iinfo(self.dtype.name).max)
+        lasts = {((1 << bits) - 1) << up for bits in _CONVERTERS for up in (0, 16 - bits)}
+        if self.dtype.itemsize < 2 or self.slopes:
+            return full_scale
+        top, at_top, below = -math.inf, 0, 0
+        for frame in islice(self.frames(), _READ_FRAMES):
+            values = frame.astype(np.float64)
+            if (highest := float(values.max())) > top:
+                top, at_top, below = highest, 0, 0
+            at_top += int(np.count_nonzero(values >= top))
+            below += int(np.count_nonzero((values > 0.99 * top) & (values < top)))
+        return top if top in lasts and at_top >= max(_LEAST_PIXELS, below) else full_scale
+
+    @property
+    def saturation_notes(self) -> tuple[str, ...]:
+        """A note for the user where a film saturates below the largest value of its type."""
+        if self.dtype.kind not in "iu" or self.saturates_at >= np.iinfo(self.dtype.name).max:
+            return ()
+        return (
+            f"the values end at {self.saturates_at:g}, as those of a camera with fewer bits than the film's"
+            f" {8 * self.dtype.itemsize}: pixels that have it are taken as saturated",
+        )
 
 
 def grey(picture: Frame, what: object) -> Frame:

@@ -62,7 +62,7 @@ def first_rig(film: Film, settings: Settings, name: str, progress: Callable[[int
     K = settings.frames_per_exposure
     # The window moves before its object has strayed too far from the middle.
     side = max(_LEAST_WINDOW, 2 * math.ceil(reach(known, K) / (1 - 2 * STRAY)))
-    notes = tuple(_notes(known, motion))
+    notes = (*(() if settings.invert else film.saturation_notes), *_notes(known, motion))
     return FirstRig(_text(film, settings, name, known, motion, side, rate, notes), notes)
 
 

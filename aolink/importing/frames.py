@@ -85,14 +85,14 @@ class FilmLight:
         kind = film.dtype.kind
         self.full_scale = float(np.iinfo(film.dtype.name).max) if kind in "iu" else 1.0
         """The largest value that a pixel can hold."""
-        self._is_integer = kind in "iu"
+        # A saturated background does not harm a dark object.
+        self._saturated = math.inf if settings.invert else film.saturates_at
 
     def of(self, frame: Frame) -> tuple[FloatArray, NDArray[np.bool_]]:
         """Light of a frame and where its pixels are saturated or no numbers, (rows, columns) each."""
         settings = self._settings
         values = frame.astype(np.float64)
-        # A saturated background does not harm a dark object.
-        bad = (values >= self.full_scale) & (self._is_integer and not settings.invert) | ~np.isfinite(values)
+        bad = (values >= self._saturated) | ~np.isfinite(values)
         if not (known := np.isfinite(values)).all():
             values[~known] = np.median(values[known]) if known.any() else 0.0  # as dark as the ground
         if settings.gamma != 1.0:

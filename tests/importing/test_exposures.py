@@ -240,6 +240,26 @@ def test_pixels_at_the_end_of_their_range_are_masked_and_counted(tmp_path):
     np.testing.assert_array_equal([each.mask.all() for each in recording], [True, False, True])
 
 
+@pytest.mark.parametrize(("bits", "up"), [(12, 0), (14, 0), (12, 4)])
+def test_a_camera_with_fewer_bits_than_its_film_saturates_at_its_own_last_value(tmp_path, bits, up):
+    """Light of any strength up to twice what the camera can tell, stored in 16 bits at either end."""
+    last = (1 << bits) - 1
+    light = np.random.default_rng(3).uniform(0, 2 * last, (4, 8, 8))
+    frames = (np.minimum(light, last).astype(np.uint16) << up).astype(np.uint16)
+    recording, account = made(tmp_path, frames)
+    np.testing.assert_array_equal([each.mask for each in recording], frames < last << up)
+    assert account.saturated == np.count_nonzero(light >= last)
+    assert any(f"the values end at {last << up:g}" in note for note in account.notes)
+
+
+def test_a_film_that_only_reaches_a_cameras_last_value_is_not_saturated(tmp_path):
+    frames = np.random.default_rng(3).integers(0, 4096, (40, 8, 8)).astype(np.uint16)
+    frames[0, 0, :5] = 4095
+    _, account = made(tmp_path, frames)
+    assert account.saturated == 0
+    assert not any("the values end" in note for note in account.notes)
+
+
 def test_counts_beyond_the_range_of_the_rig_are_masked_and_counted(tmp_path):
     frames = np.full((2, 8, 8), 4095, np.uint16)
     frames[1, 0, :5] = 4096
