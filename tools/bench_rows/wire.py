@@ -144,13 +144,15 @@ def live_membrane(effort: Effort) -> Row:
             report = record(rig, *ports, Path(folder) / "a.mcap", estimators=names, exposures=effort.of(100, 4))
             lasted_s, after = time.monotonic() - begun_s, _processor_s()
     behind = [(each.estimated_ns - each.complete_ns) / 1e6 for each in report.latencies if each.estimated_ns]
+    late_ms = statistics.median((each.first_byte_ns - each.exposure_end_ns) / 1e6 for each in report.latencies)
     skipped = sum(report.exposures_skipped.values())
     shares = ", ".join(f"{name} {(after[name] - before[name]) / lasted_s:.0%}" for name in after)
     each_took = ", ".join(f"{name} {statistics.median(each.took_ms):.0f}" for name, each in report.estimation.items())
     median_ms, worst_ms = statistics.median(behind), max(behind)
     return Row(
-        f"live session of 288 states, {report.exposures} exposures, {report.frames_lost} lost: first estimate after the"
-        f" frame; of a core: {shares}; an estimate: {each_took} ms; {skipped} skipped",
+        f"live session of 288 states, {report.exposures} exposures, {report.frames_lost} lost, frames {late_ms:.0f} ms"
+        f" after their exposures: first estimate after the frame; of a core: {shares}; an estimate: {each_took} ms;"
+        f" {skipped} skipped",
         f"{median_ms:.0f} ms, worst {worst_ms:.0f}", f"a frame period, {period_ms:.0f} ms", period_ms / worst_ms, 1.0,
     )  # fmt: skip
 
