@@ -7,6 +7,10 @@ far as twelve coefficients do it, no more than the pixels can hardly see. The di
 prior and widen the kernel by their variance. If the pixels could resolve them, the estimate would show a false motion
 instead. Start states are kept whole.
 
+Pixels see the mean of a path best. Noise that is left out and moves it is taken for another start state, and the end
+state, which it moves too, seems less certain than it is. So where the first singular vectors leave too much of that
+out, the directions that move the mean of the path come before them.
+
 The mean over the fast steps is taken by quadrature with few nodes (`aolink.estimation.model.quadrature`).
 """
 
@@ -43,6 +47,10 @@ _LEFT_OUT = 0.1
 # are no more coefficients than this, since the cost of an estimate grows with the square of their number.
 _SEEN = 2.0
 _MOST_SEEN = 12
+# Standard deviation of the mean of the noise path that may be left out, in standard deviations of that position. A
+# plant that moves many spots has as many directions of it: there they are not sought.
+_MEAN_LEFT_OUT = 0.25
+_ONE_SPOT = 2
 # Random paths from which the number of nodes is found.
 _PATHS = 64
 # The table of a pixel's light over the spot's position: points in one standard deviation of the kernel, and its end.
@@ -91,16 +99,8 @@ def reduction(model: ExposureModel, sensor: BaseSensor, *, left_out: float = _LE
     """
     n = model.plant.n_states
     variance = float(np.linalg.eigvalsh(sensor.kernel.covariance)[0])
-    noise = model.basis[..., n:]
-    size = noise.shape[2]
-    paths = noise.reshape(noise.shape[0] * noise.shape[1], size) / math.sqrt(model.n_steps)
-    _, values, vectors = np.linalg.svd(paths, full_matrices=False) if size else (0, np.zeros(0), np.zeros((0, 0)))
-    # Each output by itself: a remainder that is spread over many of them is as small on each.
-    rest = np.append(np.cumsum(values[::-1] ** 2)[::-1], 0.0) / model.plant.n_outputs
-    coarse, fine = left_out * math.sqrt(variance), _SEEN * _resting_sd(sensor, variance)
-    kept = int(np.argmax(rest <= coarse**2))
-    kept = max(kept, min(int(np.argmax(rest <= fine**2)), _MOST_SEEN - n))
-    V = vectors[:kept].T
+    V, rest = _kept(model, left_out * math.sqrt(variance), _resting_sd(sensor, variance))
+    size, kept = V.shape
     expand = np.zeros((n + size, n + kept))
     expand[:n, :n], expand[n:, n:] = np.eye(n), V
     hidden = np.zeros((n + size, n + size))
@@ -112,8 +112,36 @@ def reduction(model: ExposureModel, sensor: BaseSensor, *, left_out: float = _LE
         seen = quadrature.resolution(_paths(model, expand), variance, sensor.profile)
     return Reduction(
         expand=expand, left_out=hidden, end_rows=model.end_rows @ expand, end_remainder=remainder,
-        widening=float(rest[kept]) + model.unmodelled_rest, resolution=seen,
+        widening=rest + model.unmodelled_rest, resolution=seen,
     )  # fmt: skip
+
+
+def _kept(model: ExposureModel, coarse: float, resting_sd: float) -> tuple[FloatArray, float]:
+    """The directions of the noise that are kept, (noise coefficients, kept), and the variance of the remaining path.
+
+    The remaining path's rms is at most ``coarse``.
+    """
+    noise = model.basis[..., model.plant.n_states :]
+    outputs, _, size = noise.shape
+    if not size:
+        return np.zeros((0, 0)), 0.0
+    paths, means = noise.reshape(-1, size) / math.sqrt(model.n_steps), noise.mean(axis=1)
+
+    def after(first: FloatArray) -> tuple[FloatArray, float]:
+        _, values, vectors = np.linalg.svd(paths - paths @ first @ first.T if first.size else paths, full_matrices=False)
+        # Each output by itself: a remainder that is spread over many of them is as small on each.
+        rest = np.append(np.cumsum(values[::-1] ** 2)[::-1], 0.0) / outputs
+        most = _MOST_SEEN - model.plant.n_states - first.shape[1]
+        count = int(np.argmax(rest <= coarse**2))
+        count = max(count, min(int(np.argmax(rest <= (_SEEN * resting_sd) ** 2)), most))
+        return np.concatenate([first, vectors[:count].T], axis=1), float(rest[count])
+
+    V, rest = after(np.zeros((size, 0)))
+    least = _MEAN_LEFT_OUT * resting_sd
+    if outputs <= _ONE_SPOT and np.linalg.norm(means - means @ V @ V.T, 2) > least:
+        _, values, vectors = np.linalg.svd(means, full_matrices=False)
+        V, rest = after(vectors[values > least].T)
+    return V, rest
 
 
 def _resting_sd(sensor: BaseSensor, variance: float) -> float:
