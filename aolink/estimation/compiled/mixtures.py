@@ -234,7 +234,7 @@ def correct_by_importance(
     seen: Line | Plane, prior_weight: FloatArray, prior_mean: FloatArray, prior_covariance: FloatArray,
     log_weight: FloatArray, mean: FloatArray, covariance: FloatArray, uniform: FloatArray, normal: FloatArray,
     enough: FloatArray, least_effective: float, halvings: int, prior_points: float, last_prior_points: float,
-    loosened: float, negligible: float, effective: FloatArray,
+    tightened: float, loosened: float, negligible: float, effective: FloatArray,
 ) -> None:  # fmt: skip
     """The proposal (axes, components, ...) becomes the mixture that fits the posterior, in place.
 
@@ -280,8 +280,8 @@ def correct_by_importance(
             effective[axis] = _weigh(target, drawn, r + 1, end, some, weight)
             _temper(weight, end, effective[axis], least_effective, halvings, tempered)
             last = r + 1 == rounds or effective[axis] >= enough[axis]
-            if last and r > 0:
-                P *= loosened
+            if last:
+                P *= loosened if r else tightened
             beside = last_prior_points if last else prior_points
             _refit(w, x, P, t, end, tempered, logs, drawn[r], beside, negligible, some, more)
             if last:

@@ -57,11 +57,13 @@ _WIDE = 0.3
 _INFLATION = 1.5
 _EVIDENCE = 0.5
 # In a fit, a component's old covariance counts as this many points for each coefficient. Between rounds few, so that a
-# component soon finds its place; in the last fit more, with old covariances that a fit has made widened by the third
+# component soon finds its place; in the last fit more, with old covariances that a fit has made widened by the last
 # number: a covariance of few points is too narrow. (Twice as wide is too much: with twenty coefficients, where the old
-# covariances count as sixty points, intervals of 95 % held 98 to 99 %.)
+# covariances count as sixty points, intervals of 95 % held 98 to 99 %.) Those of a first round, which no fit has made,
+# are wide already: the inflation is taken back.
 PRIOR_POINTS = 2.0
 LAST_PRIOR_POINTS = 3.0
+TIGHTENED = 1 / _INFLATION
 LOOSENED = 1.2
 # A component of the prior has to have this weight for its modes to count as scattered.
 _HEAVY = 0.05
@@ -122,7 +124,7 @@ def importance_corrected(
     compiled_mixtures.correct_by_importance(
         view.seen, *prior.contiguous, *fit.contiguous, np.stack([u for u, _ in numbers]),
         np.stack([e for _, e in numbers]), enough, LEAST_EFFECTIVE, HALVINGS, n * PRIOR_POINTS,
-        n * LAST_PRIOR_POINTS, LOOSENED, NEGLIGIBLE, effective,
+        n * LAST_PRIOR_POINTS, TIGHTENED, LOOSENED, NEGLIGIBLE, effective,
     )  # fmt: skip
     return fit, effective
 

@@ -95,8 +95,9 @@ def importance_corrected(view, prior, proposal, share, enough):
         log_weight -= log_sum(log_weight, axis=1)[:, None]
         effective = np.where(going_on, np.exp(-log_sum(2 * log_weight, axis=1)), effective)
         tempered = _tempered(log_weight, importance.LEAST_EFFECTIVE)
-        loosened = replace(proposal, covariance=proposal.covariance * (importance.LOOSENED if k else 1.0))
-        last = _refitted(proposal, t, tempered, loosened, n * importance.LAST_PRIOR_POINTS)
+        scale = importance.LOOSENED if k else importance.TIGHTENED
+        scaled = replace(proposal, covariance=proposal.covariance * scale)
+        last = _refitted(proposal, t, tempered, scaled, n * importance.LAST_PRIOR_POINTS)
         some = np.flatnonzero(going_on)
         fit = fit.replaced(some, last.part(some))
         going_on &= effective < enough
