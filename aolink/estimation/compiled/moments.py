@@ -15,8 +15,8 @@ _ORDERS = 4  # of `WindowedMoments` as `broad` uses them: u^0 to u^3
 
 @compiled
 def broad_of_lines(
-    line: Line, mean: FloatArray, covariance: FloatArray, passes: int, no_noise: float, path_reach: float,
-    kernel_reach: float, out_mean: FloatArray, out_covariance: FloatArray,
+    line: Line, mean: FloatArray, covariance: FloatArray, memory: FloatArray, passes: int, no_noise: float,
+    path_reach: float, kernel_reach: float, out_mean: FloatArray, out_covariance: FloatArray,
 ) -> None:  # fmt: skip
     """Priors (rows, n) and (rows, n, n) updated with windowed moments, linearised about the previous pass.
 
@@ -38,7 +38,7 @@ def broad_of_lines(
             _window(line, row, path, spread, path_reach, kernel_reach, W)
             _weighted_sums(line, row, W, y, R)
             _responses(line, W, path, spread, g)
-            _add_remainder(line, spread, g, R)
+            _add_remainder(line, spread, g, memory[row], R)
             for a in range(_ORDERS):
                 expected[a] = 0.0
                 for i in range(n):
@@ -144,8 +144,11 @@ def half_erf(u: float, bell: float) -> float:
 
 
 @compiled
-def _add_remainder(line: Line, spread: FloatArray, g: FloatArray, R: FloatArray) -> None:
-    """Mehler's series: Cov(g(a), g(b)) is the sum over j of C^j / j! times the means of the j-th derivatives."""
+def _add_remainder(line: Line, spread: FloatArray, g: FloatArray, memory: float, R: FloatArray) -> None:
+    """Mehler's series: Cov(g(a), g(b)) is the sum over j of C^j / j! times the means of the j-th derivatives.
+
+    It is multiplied by ``memory``.
+    """
     nodes = len(spread)
     second, third = np.empty(_ORDERS), np.empty(_ORDERS)
     for k in range(nodes):
@@ -158,7 +161,7 @@ def _add_remainder(line: Line, spread: FloatArray, g: FloatArray, R: FloatArray)
             for a in range(_ORDERS):
                 second[a] += half * g[2, m, a]
                 third[a] += sixth * g[3, m, a]
-        w = line.weights[k]
+        w = memory * line.weights[k]
         for a in range(_ORDERS):
             for b in range(_ORDERS):
                 R[a, b] += w * (g[2, k, a] * second[b] + g[3, k, a] * third[b])

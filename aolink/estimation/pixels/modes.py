@@ -181,13 +181,17 @@ def without_repeats(modes: Modes) -> Modes:
     return Modes(*(each[:, : max(most, 1)] for each in kept))
 
 
-def broad(view: PixelView, prior: Gaussian) -> Gaussian:
-    """The prior of t updated with windowed moments: wide where the posterior has several modes."""
+def broad(view: PixelView, prior: Gaussian, memory: FloatArray | None = None) -> Gaussian:
+    """The prior of t updated with windowed moments: wide where the posterior has several modes.
+
+    ``memory`` multiplies the covariance of what their linearisation leaves out, (axes,); one where None.
+    """
+    memory = np.ones(len(prior.mean)) if memory is None else memory
     if (line := view.line) is not None:
         after = Gaussian(np.empty_like(prior.mean), np.empty_like(prior.covariance))
         compiled_moments.broad_of_lines(
-            line, np.ascontiguousarray(prior.mean), np.ascontiguousarray(prior.covariance), _BROAD_PASSES, _NO_NOISE,
-            PATH_REACH, KERNEL_REACH, after.mean, after.covariance,
+            line, np.ascontiguousarray(prior.mean), np.ascontiguousarray(prior.covariance), memory, _BROAD_PASSES,
+            _NO_NOISE, PATH_REACH, KERNEL_REACH, after.mean, after.covariance,
         )  # fmt: skip
         return after
     about = prior
@@ -195,7 +199,7 @@ def broad(view: PixelView, prior: Gaussian) -> Gaussian:
         y, noise, fit = view.moments(about)
         innovation = y - fit.expected - batched.matvec(fit.slope, prior.mean - about.mean)
         # A window without a pixel that can be used has neither moments nor noise.
-        spread = noise + fit.remainder + _NO_NOISE * np.eye(y.shape[1])
+        spread = noise + memory[:, None, None] * fit.remainder + _NO_NOISE * np.eye(y.shape[1])
         about = joseph_update(prior, innovation, fit.slope, spread).posterior
     return about
 

@@ -25,6 +25,7 @@ from scipy import special
 
 from aolink.estimation.kalman.gaussian import Gaussian
 from aolink.estimation.model.base import ExposureModel
+from aolink.estimation.moments.windowed import MOST_MEMORY, error_memory, slowest
 from aolink.estimation.pixels.filter import MixtureUpdate
 from aolink.estimation.pixels.gaussian_mixture import GaussianMixture, joined, log_sum, single
 from aolink.estimation.pixels.importance import posterior, proposed, scattered, tempered
@@ -39,6 +40,7 @@ from aolink.estimation.pixels.modes import (
     with_more,
     without_repeats,
 )
+from aolink.numerics import batched
 from aolink.numerics.arrays import BoolArray
 from aolink.optics.sensor import BaseSensor
 
@@ -131,6 +133,8 @@ class ImportanceUpdater:
                 starts = whitened(own.part(few), best)
                 modes = without_repeats(with_more(modes, few, find_modes(some, own.part(few), starts)))
                 new = innovation(view, own, modes)
+            else:
+                fit = _remembering(some, prior.part(few), fit)
             after = after.replaced(few, fit)
         carried = after.mapped(reduced.end_rows, reduced.end_remainder).reduced(self.carried, self.free)
         return MixtureUpdate(after, after.gaussian, carried, new, modes.total_evidence, has_several(modes), poor)
@@ -171,6 +175,23 @@ def _wide_part(proposal: GaussianMixture, prior: GaussianMixture) -> GaussianMix
     """The Gaussians of windowed moments, the last ones of a proposal density, with the weights of the prior's."""
     count = prior.mean.shape[1]
     return GaussianMixture(prior.log_weight, proposal.mean[:, -count:], proposal.covariance[:, -count:])
+
+
+def _remembering(view: PixelView, prior: GaussianMixture, wide: GaussianMixture) -> GaussianMixture:
+    """The wide Gaussians, those of the prior's components computed again with errors that the plant remembers.
+
+    Where they are the whole posterior, the errors of their linearisation are alike from exposure to exposure, and count
+    as in `aolink.estimation.moments.windowed`.
+    """
+    there = np.nonzero(np.isfinite(prior.log_weight))
+    own, rows = view.reduced.prior(Gaussian(prior.mean[there], prior.covariance[there])), view.reduced.end_rows
+    n = prior.mean.shape[2]
+    kept = batched.matmul(wide.covariance[there], batched.inverse(own.covariance))[:, :, :n]  # I - K H
+    goes_on = batched.matmul(np.broadcast_to(rows, (len(kept), *rows.shape)), kept)
+    rho = np.sqrt(slowest(rows[None, :, :n]) * slowest(goes_on))
+    after, found = broad(view.part(there[0]), own, error_memory(rho, MOST_MEMORY)), wide.copy()
+    found.mean[there], found.covariance[there] = after.mean, after.covariance
+    return found
 
 
 def _by_share_of(points: GaussianMixture, wide: GaussianMixture) -> GaussianMixture:
