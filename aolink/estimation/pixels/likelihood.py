@@ -128,7 +128,9 @@ def _kept(model: ExposureModel, coarse: float, resting_sd: float) -> tuple[Float
     paths, means = noise.reshape(-1, size) / math.sqrt(model.n_steps), noise.mean(axis=1)
 
     def after(first: FloatArray) -> tuple[FloatArray, float]:
-        _, values, vectors = np.linalg.svd(paths - paths @ first @ first.T if first.size else paths, full_matrices=False)
+        _, values, vectors = np.linalg.svd(
+            paths - paths @ first @ first.T if first.size else paths, full_matrices=False
+        )
         # Each output by itself: a remainder that is spread over many of them is as small on each.
         rest = np.append(np.cumsum(values[::-1] ** 2)[::-1], 0.0) / outputs
         most = _MOST_SEEN - model.plant.n_states - first.shape[1]

@@ -184,12 +184,13 @@ def _remembering(view: PixelView, prior: GaussianMixture, wide: GaussianMixture)
     as in `aolink.estimation.moments.windowed`.
     """
     there = np.nonzero(np.isfinite(prior.log_weight))
-    own, rows = view.reduced.prior(Gaussian(prior.mean[there], prior.covariance[there])), view.reduced.end_rows
-    n = prior.mean.shape[2]
-    kept = batched.matmul(wide.covariance[there], batched.inverse(own.covariance))[:, :, :n]  # I - K H
-    goes_on = batched.matmul(np.broadcast_to(rows, (len(kept), *rows.shape)), kept)
-    rho = np.sqrt(slowest(rows[None, :, :n]) * slowest(goes_on))
-    after, found = broad(view.part(there[0]), own, error_memory(rho, MOST_MEMORY)), wide.copy()
+    seen, own = view.part(there[0]), view.reduced.prior(Gaussian(prior.mean[there], prior.covariance[there]))
+    rows, n = view.reduced.end_rows, prior.mean.shape[2]
+    rho = np.repeat(slowest(rows[None, :, :n]), len(own.mean))
+    first = broad(seen, own, error_memory(rho, MOST_MEMORY))
+    kept = batched.matmul(first.covariance, batched.inverse(own.covariance))[:, :, :n]  # I - K H
+    goes_on = slowest(batched.matmul(np.broadcast_to(rows, (len(kept), *rows.shape)), kept))
+    after, found = broad(seen, own, error_memory(np.sqrt(rho * goes_on), MOST_MEMORY)), wide.copy()
     found.mean[there], found.covariance[there] = after.mean, after.covariance
     return found
 

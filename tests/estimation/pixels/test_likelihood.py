@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import linalg
 
-from aolink.estimation import Profile, SpotWindows, exposure_model
+from aolink.estimation import Profile, SpotWindows, exposure_model, run
 from aolink.estimation.frames.measure import measure
 from aolink.estimation.kalman.gaussian import Gaussian
 from aolink.estimation.moments.lines import WindowedMoments
@@ -18,6 +18,7 @@ from aolink.optics.sensor import Kernel
 from aolink.rig import load_rig
 from aolink.simulation.model import simulate
 from tests.estimation.pixels.plain import PlainView
+from tests.kinds import truth_of
 
 LINE = load_rig("section-vi-lively")
 PLANE = load_rig("single-lenslet")
@@ -170,3 +171,55 @@ def test_no_more_of_the_path_is_left_out_than_the_pixels_can_hardly_see(noise_de
     kernel_sd = np.sqrt(line.kernel.variance)
     assert rms <= 0.1 * kernel_sd
     assert rms <= 2.01 / np.sqrt(information) or reduced.size == 12
+
+
+def slow_and_fast():
+    """A spot that one plant moves slowly to one side and fast to the other, where nearly all noise inside an exposure
+    is."""
+    blocks, kernel = [], np.sqrt(PLANE.sensor.kernel.variance)
+    for swings, damping in ((0.11, 0.6), (4.5, 0.02)):
+        w = 2 * np.pi * swings / 100
+        A = linalg.expm(np.array([[0.0, w], [-w, -2 * damping * w]]))
+        push = np.array([[0.0], [1.0]])
+        P = linalg.solve_discrete_lyapunov(A, push @ push.T)
+        gain = 0.24 * kernel / np.sqrt(P[0, 0])
+        blocks.append((A, gain * push, gain**2 * P))
+    A, B_w, P = (linalg.block_diag(*each) for each in zip(*blocks, strict=True))
+    plant = dataclasses.replace(
+        PLANE.plant, A=A, B=B_w, B_w=B_w, C=np.eye(4)[::2], process_noise=np.eye(2), initial_mean=np.zeros(4),
+        initial_covariance=P, axes=1,
+    )  # fmt: skip
+    sensor = dataclasses.replace(PLANE.sensor, noise_density=1e-3)
+    timing = dataclasses.replace(PLANE.timing, exposure_steps=100, frame_period_steps=100)
+    return dataclasses.replace(PLANE, plant=plant, sensor=sensor, timing=timing)
+
+
+def test_noise_that_moves_the_mean_of_a_path_visibly_is_kept():
+    """Position's information is that of all pixels, by finite differences along one axis."""
+    rig = slow_and_fast()
+    model = exposure_model(rig.plant, 100)
+    reduced = likelihood.reduction(model, rig.sensor)
+    mean = model.basis.mean(axis=1)
+    line, step = rig.sensor.profile, 1e-4
+    places = np.linspace(0, line.pixel_size, 50)[:, None]
+    above, below = (exposure_density(line.kernel, line.edges, places + d) for d in (step, -step))
+    information = (((above - below) / (2 * step)) ** 2).sum(axis=1).mean() * line.pixel_size / line.noise_density
+    left_out = np.linalg.eigvalsh(mean @ reduced.left_out @ mean.T)
+    assert np.sqrt(left_out.max()) <= 0.26 / np.sqrt(information)
+
+
+def test_both_ends_of_an_exposure_are_as_sure_as_they_are_right_where_a_slow_process_is_the_weaker():
+    rig = slow_and_fast()
+    start, end = [], []
+    for seed in range(16):
+        exposures = simulate(rig, 8, seed=seed, inputs=np.zeros((800, 2)))
+        for exposure, estimate in list(zip(exposures, run(rig, exposures, ["profile"])["profile"], strict=True))[2:]:
+            truth = truth_of(exposure)
+            for found, mean, P, true in (
+                (start, estimate.start_state, estimate.start_covariance, truth.start_state),
+                (end, estimate.end_state, estimate.end_covariance, truth.end_state),
+            ):
+                away = (mean - true)[0]
+                found.append(away @ np.linalg.solve(P[0], away) / 4)
+    assert 0.85 < np.mean(start) < 1.15
+    assert 0.85 < np.mean(end) < 1.15

@@ -463,3 +463,27 @@ def test_a_frame_that_cannot_be_believed_is_not_tempered(updates):
     assert not of_a_lie.innovation.within_gate[0]
     assert not of_a_lie.poor[0]
     assert updates.update(view, single(state), state, 0).poor[0]
+
+
+def test_windowed_moments_are_as_sure_as_the_estimator_moments_where_nothing_else_is_done():
+    """Their errors are alike from exposure to exposure where the plant is a resonance: as independent ones they would
+    leave it much too sure."""
+    turn, decay, sd = 2 * np.pi * 2.4 / 200, np.exp(-1 / 4000), 0.2
+    A = decay * np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+    plant = dataclasses.replace(
+        RIG.plant, A=A, B=np.zeros((2, 1)), B_w=np.eye(2), process_noise=sd**2 * (1 - decay**2) * np.eye(2),
+        initial_covariance=sd**2 * np.eye(2),
+    )  # fmt: skip
+    rig = quiet(dataclasses.replace(RIG, plant=plant), 1e-3)
+    (exposure,) = simulate(rig, 1, seed=3)
+    view, state = seen(rig)
+    observation = WindowedMoments(rig.sensor)
+    measured = must_be(Profile, measure(rig, exposure, observation.needs)[0])
+    model = exposure_model(plant, exposure.n_steps)
+    prior = state.with_noise(model.n_coefficients)
+    theirs = observation.update(model, model.response(exposure.inputs), prior, measured).posterior
+    update = dataclasses.replace(PROFILE, points=1, enough=np.inf).update(view, single(state), state, 0)
+    assert update.poor[0]
+    sd, ours = (np.sqrt(np.diag(each.covariance[0])[:2]) for each in (theirs, update.coefficients))
+    np.testing.assert_allclose(ours / sd, 1.0, atol=0.1)
+    np.testing.assert_allclose(update.coefficients.mean[0, :2] / sd, theirs.mean[0, :2] / sd, atol=0.4)
