@@ -115,11 +115,15 @@ def significantly_worse(rows: Rows, name: str, reference: str, level: float = 0.
 
 
 def nees_inside(row: Row) -> bool:
-    """Whether the bootstrap's 95 % bounds of a scene's mean NEES, over its runs, have the number of states inside."""
+    """Whether the 95 % bounds of a scene's mean NEES, over its runs, have the number of states inside.
+
+    They are Student's. A bootstrap's percentiles are too near each other where runs are few: of four, ten and 24 runs
+    they have `open-loop`, whose covariance is exact, inside in 78 %, 91 % and 100 % of planes, these in 91 %, 94 % and
+    100 %.
+    """
     nees = np.array(row.nees)
-    chosen = np.random.default_rng(row.seed).integers(0, len(nees), (_RESAMPLES, len(nees)))
-    low, high = np.quantile(nees[chosen].mean(axis=1), [0.025, 0.975])
-    return bool(low <= row.states <= high)
+    se = nees.std(ddof=1) / math.sqrt(len(nees))
+    return bool(abs(nees.mean() - row.states) <= stats.t.ppf(0.975, len(nees) - 1) * se)
 
 
 def told_of_nees(row: Row) -> bool:

@@ -210,7 +210,7 @@ def test_noise_that_moves_the_mean_of_a_path_visibly_is_kept():
 
 def test_both_ends_of_an_exposure_are_as_sure_as_they_are_right_where_a_slow_process_is_the_weaker():
     rig = slow_and_fast()
-    start, end = [], []
+    start, end = list[float](), list[float]()
     for seed in range(16):
         exposures = simulate(rig, 8, seed=seed, inputs=np.zeros((800, 2)))
         for exposure, estimate in list(zip(exposures, run(rig, exposures, ["profile"])["profile"], strict=True))[2:]:

@@ -484,6 +484,6 @@ def test_windowed_moments_are_as_sure_as_the_estimator_moments_where_nothing_els
     theirs = observation.update(model, model.response(exposure.inputs), prior, measured).posterior
     update = dataclasses.replace(PROFILE, points=1, enough=np.inf).update(view, single(state), state, 0)
     assert update.poor[0]
-    sd, ours = (np.sqrt(np.diag(each.covariance[0])[:2]) for each in (theirs, update.coefficients))
-    np.testing.assert_allclose(ours / sd, 1.0, atol=0.1)
-    np.testing.assert_allclose(update.coefficients.mean[0, :2] / sd, theirs.mean[0, :2] / sd, atol=0.4)
+    theirs_sd, ours_sd = (np.sqrt(np.diag(each.covariance[0])[:2]) for each in (theirs, update.coefficients))
+    np.testing.assert_allclose(ours_sd / theirs_sd, 1.0, atol=0.1)
+    np.testing.assert_allclose(update.coefficients.mean[0, :2] / theirs_sd, theirs.mean[0, :2] / theirs_sd, atol=0.4)
