@@ -76,8 +76,8 @@ class Row:
     several: float
     """Share of exposures with more than one mode, where the estimator searches for modes; otherwise 0."""
     statuses: dict[str, int]
-    """Exposures by their status, the worst of all runs: where a faint spot is not seen in each tenth run, hardly an exposure
-    is OK."""
+    """Exposures by their status, the worst of all runs: where a tenth of the runs does not see a faint spot, hardly an
+    exposure is OK."""
     seconds: float
     """Time of the processor, s, for an exposure of one run."""
     commit: str = ""
