@@ -8,6 +8,7 @@ import numpy as np
 
 from aolink.estimation.compiled.line import Line, path_of
 from aolink.estimation.compiled.small import cholesky_into, cholesky_solve, compiled, times
+from aolink.estimation.compiled.window_sums import edges_of
 from aolink.numerics.arrays import FloatArray
 
 _ORDERS = 4  # of `WindowedMoments` as `broad` uses them: u^0 to u^3
@@ -106,17 +107,8 @@ def _weighted_sums(line: Line, row: int, W: FloatArray, y: FloatArray, R: FloatA
 @compiled
 def _responses(line: Line, W: FloatArray, path: FloatArray, spread: FloatArray, g: FloatArray) -> None:
     """Expectations of the sums and of their derivatives by the spot's position at each node: as `expected_response`."""
-    change, places, edges = np.empty((W.shape[1] + 1, _ORDERS)), np.empty(W.shape[1] + 1), 0
-    for edge in range(W.shape[1] + 1):
-        changes = False
-        for a in range(_ORDERS):
-            left = W[a, edge - 1] if edge else 0.0
-            right = W[a, edge] if edge < W.shape[1] else 0.0
-            change[edges, a] = left - right
-            changes = changes or left != right
-        if changes:
-            places[edges] = line.low + edge * line.pixel
-            edges += 1
+    change, places = np.empty((W.shape[1] + 1, _ORDERS)), np.empty(W.shape[1] + 1)
+    edges = edges_of(line.low, line.pixel, W, places, change)
     g[:] = 0.0
     for k in range(len(path)):
         per_width = 1.0 / math.sqrt(2 * line.kernel_variance + 2 * max(spread[k, k], 0.0))
