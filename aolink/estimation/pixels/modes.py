@@ -52,7 +52,7 @@ _DIRECTIONS = 3
 _START_REACH = 1.3
 # A start for a reversed path fits it to this many standard deviations of the kernel, if the prior allows.
 _REVERSED_TO = 0.2
-# Directions of the pixels, for each output, in which an innovation is given; in the others there is hardly but noise.
+# Directions of the pixels, for each output, in which an innovation is given; the others hold hardly more than noise.
 _NEW_DIRECTIONS = 4
 # Information of a direction, as a share of the largest, that is rounding.
 _NO_INFORMATION = 1e-13
