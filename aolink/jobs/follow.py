@@ -30,7 +30,7 @@ FITTED = 96
 HELD_OUT = 32
 """Exposures after these on which it is judged."""
 LEAST_GAIN = 3.0
-"""A new model is offered if it makes their log-likelihood higher than any before by this, nats: odds of twenty to one."""
+"""A new model is offered if it raises their log-likelihood by more than this, nats: odds of twenty to one."""
 REPORT = 60
 """Exposures between two lines of output about the models' fit."""
 

@@ -116,7 +116,7 @@ def _responses(line: Line, W: FloatArray, path: FloatArray, spread: FloatArray, 
         for edge in range(edges):
             u = (places[edge] - path[k]) * per_width
             bell = math.exp(-u * u)
-            d0, d1 = half_erf(u, bell), -bell * peak
+            d0, d1 = rough_half_erf(u, bell), -bell * peak
             d2 = 2 * u * per_width * d1
             d3 = (4 * u * u - 2) * per_width * per_width * d1
             for a in range(_ORDERS):
@@ -127,7 +127,7 @@ def _responses(line: Line, W: FloatArray, path: FloatArray, spread: FloatArray, 
 
 
 @compiled
-def half_erf(u: float, bell: float) -> float:
+def rough_half_erf(u: float, bell: float) -> float:
     """erf(u) / 2 where ``bell`` is exp(-u^2), to 8e-8: Abramowitz and Stegun, 7.1.26."""
     s = 1.0 / (1.0 + 0.3275911 * abs(u))
     rest = s * (0.254829592 + s * (-0.284496736 + s * (1.421413741 + s * (-1.453152027 + s * 1.061405429))))

@@ -56,7 +56,7 @@ def _function(functions: int, order: int, u: float) -> float:
 
 
 @compiled
-def weighted_sums(
+def sums_of_row(
     row: int, density: FloatArray, pixel: float, read_noise: float, shot_noise: float, W: FloatArray, y: FloatArray,
     noise: FloatArray,
 ) -> None:  # fmt: skip

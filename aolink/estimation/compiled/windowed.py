@@ -21,7 +21,7 @@ from aolink.estimation.compiled.window_sums import (
     remainder_of,
     responses_at_nodes,
     slopes_of,
-    weighted_sums,
+    sums_of_row,
     window_weights,
 )
 from aolink.numerics.arrays import BoolArray, FloatArray, IntArray
@@ -116,7 +116,7 @@ def linearise(
             path_reach, kernel_reach * math.sqrt(lines.kernel_variance + lines.pixel * lines.pixel / 12.0), W,
         )  # fmt: skip
         light = lines.light[row]
-        weighted_sums(
+        sums_of_row(
             row, lines.density, lines.pixel, lines.read_noise / (light * light), lines.shot_noise / light, W, y, noise
         )
         edges = edges_of(lines.low, lines.pixel, W, places, change)
