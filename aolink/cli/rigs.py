@@ -49,7 +49,7 @@ if TYPE_CHECKING:
     "  |  aolink rig my.toml --from film.tif --rate 500 --track 3 --sum 8 (writes my.toml)"
 )
 def rig(
-    rig: RigArgument,
+    rig: RigArgument = "",
     check: Annotated[bool, typer.Option("--check", help="Check the rig file, print the findings, and end.")] = False,
     exposure_scan: Annotated[
         bool, typer.Option("--exposure-scan", help="Print the error of o1 to expect at other exposure times, and end.")
@@ -81,7 +81,11 @@ def rig(
     tied: Annotated[bool, typer.Option("--tied", help="End when standard input ends, for a parent process.")] = False,
     film: Annotated[
         Path | None,
-        typer.Option("--from", metavar="FILM", help="Write a first rig file for the objects of a film, and end."),
+        typer.Option(
+            "--from",
+            metavar="FILM",
+            help="Write a first rig file for the objects of a film, RIG or FILM's name with .toml, and end.",
+        ),
     ] = None,
     rate: RateOption = None,
     frames: SumOption = 1,
@@ -97,8 +101,11 @@ def rig(
     from aolink.rig import load_rig, parse_light, with_faults
 
     if film is not None:
-        _write_first_rig(Path(rig), film, topic, film_settings(rate, frames, track, at, invert, gamma), overwrite)
+        path = Path(rig or f"{film.stem}.toml")
+        _write_first_rig(path, film, topic, film_settings(rate, frames, track, at, invert, gamma), overwrite)
         return
+    if not rig:
+        raise typer.BadParameter("name a rig file, or a rig that comes with aolink")
     if check:
         _print_findings(load_rig(rig), as_json)
         return

@@ -111,18 +111,23 @@ def grey(picture: Frame, what: object) -> Frame:
 
 
 def array_film(frames: NDArray[Any], name: str, **known: Any) -> Film:
-    """A film of frames in memory, (frames, rows, columns); (spots, frames, rows, columns) stand side by side.
+    """A film of frames in memory, (frames, rows, columns).
+
+    Colours, (frames, rows, columns, 3 or 4), become grey; films of spots, (spots, frames, rows, columns), stand side
+    by side.
 
     Raises
     ------
     ImportingError
         The array has another shape, or does not hold numbers.
     """
-    if frames.ndim == 4:  # one film for each spot, all with the same times
+    # A spot's window is a square, so one of 3 or 4 columns has no more rows.
+    colours = frames.ndim == 4 and frames.shape[3] in (3, 4) and frames.shape[2] > 4
+    if frames.ndim == 4 and not colours:  # one film for each spot, all with the same times
         spots, count, rows, columns = frames.shape
         frames = np.moveaxis(frames, 0, 2).reshape(count, rows, spots * columns)
         known["notes"] = (*known.get("notes", ()), f"the films of {spots} spots stand side by side in one picture")
-    if frames.ndim != 3 or min(frames.shape) < 1 or frames.dtype.kind not in "biuf":
+    if frames.ndim != 3 + colours or min(frames.shape) < 1 or frames.dtype.kind not in "biuf":
         raise ImportingError(
             f"{name} holds {frames.dtype} of shape {frames.shape}, expected numbers as (frames, rows, columns)"
         )
@@ -130,4 +135,7 @@ def array_film(frames: NDArray[Any], name: str, **known: Any) -> Film:
     if times is not None and times.shape != (len(frames),):
         raise ImportingError(f"{name} has {len(frames)} frames and times of shape {times.shape}: give one for each")
     shape = (int(frames.shape[1]), int(frames.shape[2]))
-    return Film(name=name, shape=shape, dtype=frames.dtype, count=len(frames), frames=lambda: iter(frames), **known)
+    return Film(
+        name=name, shape=shape, dtype=frames.dtype, count=len(frames), **known,
+        frames=lambda: (grey(each, name) for each in frames) if colours else iter(frames),
+    )  # fmt: skip

@@ -30,7 +30,7 @@ FITTED = 96
 HELD_OUT = 32
 """Exposures after these on which it is judged."""
 LEAST_GAIN = 3.0
-"""Least gain in their log-likelihood, nats."""
+"""A new model is offered if it raises their log-likelihood by more than this, nats: odds of twenty to one."""
 REPORT = 60
 """Exposures between two lines of output about the models' fit."""
 
@@ -117,9 +117,6 @@ class Following:
         The file of the first offer.
     tell:
         Called with the progress of a fit.
-    least_gain:
-        By how much the log-likelihood of exposures that were held out must be higher by a new model than by any before,
-        nats: the default is odds of twenty to one.
 
     Raises
     ------
@@ -127,13 +124,10 @@ class Following:
         There is no such kind of process.
     """
 
-    def __init__(
-        self, rig: Rig, wanted: Wanted, target: Path, tell: Tell | None = None, *, least_gain: float = LEAST_GAIN
-    ) -> None:
+    def __init__(self, rig: Rig, wanted: Wanted, target: Path, tell: Tell | None = None) -> None:
         for name in wanted.models:
             kinds_of(name)
         self.exposures = self.offers = 0
-        self._least_gain = least_gain
         self.judged = False
         """Whether the models could be judged at all."""
         self._rig, self._wanted, self._target, self._tell = rig, with_own_kinds(wanted, rig), target, tell
@@ -210,11 +204,11 @@ class Following:
         values = [_log_likelihood(each.rig, held) for each in self._followed]
         best = max(range(len(values)), key=values.__getitem__)
         before, old = values[best], self._followed[best]
-        if not value > before + self._least_gain:
+        if not value > before + LEAST_GAIN:
             text = (
                 f"a new model was fitted and is not offered: on {HELD_OUT} exposures after those that it was fitted to"
                 f" its log-likelihood is {value - before:+.1f} nats beside {old.name}, and"
-                f" {self._least_gain:+g} are needed"
+                f" {LEAST_GAIN:+g} are needed"
             )
             return News(frame_id=frame_id, fits=None, text=text)
         self.offers += 1

@@ -8,8 +8,9 @@ estimators with light that their models do not describe.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Literal
 
 import numpy as np
@@ -118,13 +119,16 @@ def _image_windows(psi: Psi, side: int, path_px: FloatArray) -> FloatArray:
     """Windows of spots by `_image_of_some`, for groups of spots whose paths are about as long."""
     light = np.empty((len(path_px), side, side))
     order = np.argsort(np.ptp(path_px, axis=2).max(axis=1))
+    spectrum = lru_cache(partial(_image_spectrum, psi))  # groups next to each other have squares of one size
     for k in range(0, len(order), _AT_ONCE):
         some = order[k : k + _AT_ONCE]
-        light[some] = _image_of_some(psi, side, path_px[some])
+        light[some] = _image_of_some(psi, side, path_px[some], spectrum)
     return light
 
 
-def _image_of_some(psi: Psi, side: int, path_px: FloatArray) -> FloatArray:
+def _image_of_some(
+    psi: Psi, side: int, path_px: FloatArray, image_spectrum: Callable[[int], NDArray[np.complex128]]
+) -> FloatArray:
     """Convolve the image with the path's histogram on the fine grid, by their spectra.
 
     The light of a step is divided among the four nearest fine points by its distances, so that its mean is exact. Spots
@@ -153,20 +157,21 @@ def _image_of_some(psi: Psi, side: int, path_px: FloatArray) -> FloatArray:
     weights = np.stack([upper * (1 - right), upper * right, lower * (1 - right), lower * right])
     trace = np.bincount(places.ravel(), weights.ravel(), spots * size**2).reshape(spots, size, size)
     spectrum = fft.rfft2(trace)
-    spectrum *= _image_spectrum(psi.image, fine, size)
+    spectrum *= image_spectrum(size)
     # Every fine-th row has the spectrum of all rows, with frequencies folded together as an aliased sum.
     folded = spectrum.reshape(spots, fine, pixels, -1).sum(axis=1) / fine
     light = fft.irfft2(folded, (pixels, size)).reshape(spots, pixels, pixels, fine).sum(axis=3)
     return _cut(light, corner[..., 0].astype(np.int64), side)
 
 
-def _image_spectrum(image: FloatArray, fine: int, size: int) -> NDArray[np.complex128]:
-    """Spectrum of the image, with each row the sum over a pixel's rows from it on."""
-    rows, columns = image.shape
+def _image_spectrum(psi: Psi, size: int) -> NDArray[np.complex128]:
+    """Spectrum of the image on a square of fine points, with each row the sum over a pixel's rows from it on."""
+    assert psi.image is not None
+    rows, columns = psi.image.shape
     kernel = np.zeros((size, size))
-    kernel[:rows, :columns] = image / image.sum()
+    kernel[:rows, :columns] = psi.image / psi.image.sum()
     kernel = np.roll(kernel, (-(rows // 2), -(columns // 2)), (0, 1))
-    over_pixel = np.sum([np.roll(kernel, -k, axis=0) for k in range(fine)], axis=0)
+    over_pixel = np.sum([np.roll(kernel, -k, axis=0) for k in range(psi.finer)], axis=0)
     return np.asarray(fft.rfft2(over_pixel))
 
 

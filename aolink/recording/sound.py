@@ -20,6 +20,8 @@ _LAST_NS = 1 << 62
 """Times and fast steps up to this, in ns, can be added and subtracted in 64 bits: 146 years."""
 _MOST_INPUT = 1e100
 """No mirror takes a larger input, whatever its unit; beyond it, sums and quotients may overflow."""
+_FEW = 10_000
+"""Up to so many numbers, BLAS computes on one thread."""
 _WITHOUT_INPUTS = (wire.Applied.AWAITED, wire.Applied.NOT_REPORTED)
 
 
@@ -40,8 +42,10 @@ def _of_run(run: wire.Applied | wire.CommandBlock | Run, rig: Rig) -> str:
     if (len(inputs) / 8 if isinstance(inputs, bytes) else len(inputs)) != run.n_steps * rig.n_inputs:
         return "u has not the inputs of its steps"
     u = np.frombuffer(inputs, "<f8") if isinstance(inputs, bytes) else np.array(inputs)
-    # The sum of squares is fast, and is NaN or infinite where one of them is.
-    fine = np.vdot(u, u) <= _MOST_INPUT**2 or np.abs(u).max(initial=0.0) <= _MOST_INPUT
+    # The sum of squares is fast, and is NaN or infinite where one of them is; of many numbers BLAS computes it on several
+    # threads, which wait for each other where the cores are busy.
+    fine = len(u) < _FEW and np.vdot(u, u) <= _MOST_INPUT**2
+    fine = fine or bool(u.max(initial=0.0) <= _MOST_INPUT and u.min(initial=0.0) >= -_MOST_INPUT)
     return "" if fine else "u has an input that is no number, or beyond all"
 
 

@@ -43,8 +43,12 @@ _LARGEST_BASIS = 32 << 20
 """Bytes of an exposure basis that are kept whole."""
 
 
-_Item = tuple[str, Message, bytes, int]
-"""A message on its way to the file: topic, message, its bytes, log time."""
+_Item = tuple[str, Message | None, bytes, int]
+"""A message on its way to the file: topic, the message itself where a later part may need it, its bytes, log time.
+
+Without the message, Python's collector of reference cycles soon forgets these tuples: it would look through all of a
+long queue again and again, and through everything else that the process holds.
+"""
 
 
 def begin_recording(
@@ -117,7 +121,10 @@ class RecordingWriter:
         self._rig, self._metadata, self._overwrite = rig, metadata, overwrite
         self._attachments = attachments or {}
         self._deterministic = deterministic
-        self._schemas: dict[type[Message], Schema] = {}
+        self._classes: dict[str, type[Message]] = {}
+        """The class of each topic's messages."""
+        self._schemas: dict[str, Schema] = {}
+        """The schema of each topic so far."""
         self._lead = Lead() if self._options.split_bytes or self._options.split_s else None
         self._sequence = 0
         self._end_metadata: dict[str, str] = {}
@@ -147,8 +154,10 @@ class RecordingWriter:
         since = self._busy_since  # `_is_stalled`, for less: most messages come this way
         if (since is not None and time.monotonic() - since > _STALL_S) or self._is_full():
             self._wait_for_room()
+        if topic not in self._classes:
+            self._classes[topic] = type(message)
         self._put_bytes += len(data)
-        self._queue.append((topic, message, data, log_time_ns))
+        self._queue.append((topic, None if self._lead is None else message, data, log_time_ns))
 
     def _wait_for_room(self) -> None:
         while self._is_stalled() or self._is_full():
@@ -262,12 +271,12 @@ class RecordingWriter:
                 self._lead_in(self._lead, topic, message, log_time_ns)
             # Streams may share a log time: the sequence is the order.
             self._sequence += 1
-            schema = schemas.get(type(message)) or self._schema(type(message))
+            schema = schemas.get(topic) or self._schema(topic)
             self._file.add(topic, schema, data, log_time_ns, self._sequence)
             taken += _MESSAGE_BYTES + len(data)
             self._taken_bytes += len(data)
 
-    def _lead_in(self, lead: Lead, topic: str, message: Message, log_time_ns: int) -> None:
+    def _lead_in(self, lead: Lead, topic: str, message: Message | None, log_time_ns: int) -> None:
         """Begin the next part if this one is full, with the messages that it needs from this one; keep those that the
         part after it may need."""
         if topic == topics.EXPOSURE and self._part_is_full(log_time_ns):
@@ -275,17 +284,17 @@ class RecordingWriter:
             self._begin(log_time_ns)
             for lead_topic, each, time_ns, sequence in lead.messages():
                 lead_data = each.SerializeToString()
-                self._file.add(lead_topic, self._schema(type(each)), lead_data, time_ns, sequence)
+                self._file.add(lead_topic, self._schema(lead_topic), lead_data, time_ns, sequence)
         lead.add(topic, message, log_time_ns, self._sequence + 1)
 
     def _part_is_full(self, now_ns: int) -> bool:
         size, seconds = self._options.split_bytes, self._options.split_s
         return bool((size and self._file.size >= size) or (seconds and now_ns - self._part_start_ns >= seconds * 1e9))
 
-    def _schema(self, message_class: type[Message]) -> Schema:
-        if message_class not in self._schemas:
-            self._schemas[message_class] = schema_of(message_class)
-        return self._schemas[message_class]
+    def _schema(self, topic: str) -> Schema:
+        if topic not in self._schemas:
+            self._schemas[topic] = schema_of(self._classes[topic])
+        return self._schemas[topic]
 
     def _finish(self, end_metadata: dict[str, str]) -> None:
         if end_metadata:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import gc
 import io
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -197,6 +198,7 @@ def record(
             show = aside.enter_context(_shown_aside(show, rig, report)) if show else None
             beside = aside.enter_context(BesideTheLoop(rig, estimators, controlling.estimator if controlling else ""))
             clock.beside = beside.processes
+            aside.enter_context(_spared_collections())
         loop = SessionLoop(rig, clock, camera, mirror, writer, driver, inputs, show, beside, report, controlling)
         try:
             loop.run(exposures, stop, progress)
@@ -222,6 +224,18 @@ def record(
         writer.close(report.counts())
     report.files = [str(each) for each in writer.paths]
     return report
+
+
+@contextlib.contextmanager
+def _spared_collections() -> Iterator[None]:
+    """Leave all objects that exist by now out of Python's garbage collections until the session's end: to go through
+    them stops every thread for longer than a block of commands lasts."""
+    gc.collect()
+    gc.freeze()
+    try:
+        yield
+    finally:
+        gc.unfreeze()
 
 
 def _shown(rig: Rig, watch: Watch | None) -> Show | None:

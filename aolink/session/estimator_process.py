@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import gc
 import os
 import pickle
 import signal
@@ -68,6 +69,8 @@ def _serve(connection: socket.socket, stream: Any) -> None:
     # An estimator computes or loads some things once for a rig; a session must not wait for them.
     make_estimator(rig, name).step(_dark(rig))
     estimator = make_estimator(rig, name)
+    gc.collect()
+    gc.freeze()  # later collections leave out all that exists by now
     connection.sendall(packed(READY))
     while True:
         exposure: Exposure = _received(stream)

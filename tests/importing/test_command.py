@@ -164,3 +164,16 @@ def test_bad_input_gets_one_line_and_leaves_nothing(source, options, code, says,
     assert refused.stderr.count("\n") == 1
     assert refused.stdout == ""
     assert not list(tmp_path.rglob("*.mcap")) + list(tmp_path.rglob("*.partial"))
+
+
+def test_a_first_rig_file_has_the_films_name_where_none_is_given(aolink, tmp_path):
+    at = np.stack([np.full(60, 20.0), 20 + np.cumsum(np.random.default_rng(3).normal(0, 0.4, 60))], axis=1)
+    along_x, along_y = np.exp(-(((np.arange(40) - at[..., None]) / 1.6) ** 2) / 2).swapaxes(0, 1)
+    np.save(tmp_path / "bead.npy", (500 + 2000 * along_y[:, :, None] * along_x[:, None, :]).astype(np.uint16))
+    done = aolink("rig", "--from", "bead.npy", "--rate", "50", "--track", "1")
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "bead.toml: written from bead.npy" in done.stdout
+    assert aolink("rig", "bead.toml", "--check").returncode == 0
+    done = aolink("rig")
+    assert done.returncode == 2
+    assert "name a rig file" in done.stderr

@@ -72,6 +72,18 @@ def test_films_of_several_spots_stand_side_by_side(tmp_path):
     assert "3 spots stand side by side" in film.notes[0]
 
 
+@pytest.mark.parametrize("channels", [3, 4])
+def test_an_array_of_colours_is_the_mean_of_red_green_and_blue(tmp_path, channels):
+    colours = np.stack([numbers(np.uint8, seed=k) for k in range(channels)], axis=3)
+    np.save(tmp_path / "a.npy", colours)
+    check(open_film(tmp_path / "a.npy"), colours[..., :3].sum(axis=3) / 3, dtype=np.uint8)
+
+
+def test_spots_of_three_by_three_pixels_are_no_colours(tmp_path):
+    np.save(tmp_path / "a.npy", np.zeros((5, 7, 3, 3), np.uint8))
+    assert open_film(tmp_path / "a.npy").shape == (3, 15)
+
+
 def test_of_several_stacks_the_one_called_frames_is_the_film(tmp_path):
     frames, more = numbers(np.uint8), numbers(np.uint8, seed=2)
     np.savez(tmp_path / "a.npz", darks=more, frames=frames)

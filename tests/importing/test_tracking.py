@@ -297,7 +297,7 @@ def test_a_walk_and_a_bound_motion_are_told_apart_and_fitted(seed: int) -> None:
 
 
 def test_a_lost_frame_is_no_step_of_the_motion() -> None:
-    """Of a vibration every fifth frame is lost: what is left is fitted with the times that it has."""
+    """Every fifth frame of a vibration is lost: the other frames are fitted with their own times."""
     rng = np.random.default_rng(14)
     film = spot_film(rng, resonance(rng, 320, 2, 1.0, 7.0), MIDDLES, light=60_000.0)
     kept = np.flatnonzero(np.arange(320) % 5 > 0)

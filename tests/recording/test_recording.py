@@ -32,7 +32,6 @@ from aolink.assembly import Frame
 from aolink.errors import RecordingError
 from aolink.estimation import exposure_model
 from aolink.recording import convert, schemas_pb2, topics
-from aolink.recording.mcap_file import McapFile
 from aolink.recording.reader import Recording
 from aolink.recording.reestimate import write_reestimated
 from aolink.recording.writer import RecordingWriter
@@ -261,9 +260,15 @@ def test_whatever_goes_wrong_in_the_writers_thread_reaches_the_session(tmp_path:
 def test_a_disk_that_does_not_answer_is_an_error_not_a_hang(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A write that blocks: a pipe whose reader has stopped reading stands for the disk."""
     reader, disk = os.pipe()
-    monkeypatch.setattr("aolink.files.create", lambda *_, **__: disk)  # which refuses a pipe that has a name
     fcntl.fcntl(disk, fcntl.F_SETPIPE_SZ, 1 << 20)  # for what a recording begins with
-    writer = RecordingWriter(tmp_path / "a.mcap", load_rig("section-vi"), {}, 0)
+    path, open_file = tmp_path / "a.mcap", os.open
+
+    def of_a_slow_disk(name: Any, *rest: Any) -> int:
+        return disk if name == path else open_file(name, *rest)
+
+    monkeypatch.setattr(os, "open", of_a_slow_disk)
+    monkeypatch.setattr(os, "ftruncate", lambda *_: None)  # which no pipe has
+    writer = RecordingWriter(path, load_rig("section-vi"), {}, 0)
     os.read(reader, 1 << 20)
 
     def record_much() -> None:
@@ -280,24 +285,22 @@ def test_a_disk_that_does_not_answer_is_an_error_not_a_hang(tmp_path: Path, monk
 def test_a_writer_that_is_never_idle_synchronises_all_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Every second of its clock, while messages wait: a power cut must not cost more because there is much to do."""
     may_write, seconds, sizes = threading.Event(), itertools.count(), list[int]()
-    path, sync, session, begin = tmp_path / "a.mcap", McapFile.sync, threading.current_thread(), time.monotonic()
+    path, sync, session, begin = tmp_path / "a.mcap", os.fsync, threading.current_thread(), time.monotonic()
 
-    class Clock:
-        """For the writer's thread, each look at it is a fifth of a second later than the one before."""
+    def monotonic() -> float:
+        """For the writer's thread, each look at the clock is a fifth of a second later than the one before."""
+        if threading.current_thread() is session:
+            return begin
+        may_write.wait()
+        return begin + next(seconds) / 5
 
-        @staticmethod
-        def monotonic() -> float:
-            if threading.current_thread() is session:
-                return begin
-            may_write.wait()
-            return begin + next(seconds) / 5
+    def watched(descriptor: int) -> None:
+        if threading.current_thread() is not session:
+            sizes.append(path.stat().st_size)
+        sync(descriptor)
 
-    def watched(file: McapFile) -> None:
-        sizes.append(path.stat().st_size)
-        sync(file)
-
-    monkeypatch.setattr(McapFile, "sync", watched)
-    monkeypatch.setattr("aolink.recording.writer.time", Clock)
+    monkeypatch.setattr(os, "fsync", watched)
+    monkeypatch.setattr(time, "monotonic", monotonic)
     writer = RecordingWriter(path, load_rig("section-vi"), {}, 0)
     for k in range(2000):  # 8 MB, in 500 portions
         writer.write(topics.LOG, Log(message="x" * 4000), k)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import gc
 import json
 import os
 import pty
@@ -356,6 +357,22 @@ def test_a_watcher_that_fails_is_a_warning(rig_file: Path, tmp_path: Path) -> No
         report = record(parse_rig(FAST), *ports, tmp_path / "a.mcap", exposures=3, watch=watch)
     assert (report.ended, report.unwatched) == ("complete", 2)
     assert report.warnings == ["the watcher of this session failed: no more paper"]
+
+
+def test_what_exists_before_a_session_is_not_garbage_collected_during_it(rig_file: Path, tmp_path: Path) -> None:
+    old, collected = [object()], list[bool]()
+
+    def collects_old() -> bool:
+        return any(each is old for each in gc.get_objects())
+
+    def watch(exposure: Exposure, estimates: object) -> None:
+        collected.append(collects_old())
+
+    with simulated_rig(rig_file, "--real-time") as ports:
+        record(parse_rig(FAST), *ports, tmp_path / "a.mcap", exposures=3, watch=watch)
+    assert collected
+    assert not any(collected)
+    assert collects_old()
 
 
 def test_a_queue_keeps_order_and_when_it_is_full_goes_on_with_the_newest() -> None:

@@ -116,8 +116,8 @@ def test_it_is_stopped_and_continued(tmp_path: Path) -> None:
 
 @pytest.mark.long
 def test_rows_that_the_repository_keeps_are_those_of_todays_code() -> None:
-    """Of two scenes, a line and a spot on a plane: to one part in a thousand, which other machines and another order of
-    sums do not reach."""
+    """The rows of two scenes, a line and a spot on a plane, agree to one part in a thousand; other machines and another
+    order of sums change them by less."""
     from paper_report.family import SEEDS, draw
     from paper_report.judge import RECORDED, Size, judge, read_rows
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from aolink.estimation.compiled.line import Line, path_of
 from aolink.estimation.compiled.small import cholesky_into, cholesky_solve, compiled, times
+from aolink.estimation.compiled.window_sums import edges_of
 from aolink.numerics.arrays import FloatArray
 
 _ORDERS = 4  # of `WindowedMoments` as `broad` uses them: u^0 to u^3
@@ -106,17 +107,8 @@ def _weighted_sums(line: Line, row: int, W: FloatArray, y: FloatArray, R: FloatA
 @compiled
 def _responses(line: Line, W: FloatArray, path: FloatArray, spread: FloatArray, g: FloatArray) -> None:
     """Expectations of the sums and of their derivatives by the spot's position at each node: as `expected_response`."""
-    change, places, edges = np.empty((W.shape[1] + 1, _ORDERS)), np.empty(W.shape[1] + 1), 0
-    for edge in range(W.shape[1] + 1):
-        changes = False
-        for a in range(_ORDERS):
-            left = W[a, edge - 1] if edge else 0.0
-            right = W[a, edge] if edge < W.shape[1] else 0.0
-            change[edges, a] = left - right
-            changes = changes or left != right
-        if changes:
-            places[edges] = line.low + edge * line.pixel
-            edges += 1
+    change, places = np.empty((W.shape[1] + 1, _ORDERS)), np.empty(W.shape[1] + 1)
+    edges = edges_of(line.low, line.pixel, W, places, change)
     g[:] = 0.0
     for k in range(len(path)):
         per_width = 1.0 / math.sqrt(2 * line.kernel_variance + 2 * max(spread[k, k], 0.0))
@@ -124,7 +116,7 @@ def _responses(line: Line, W: FloatArray, path: FloatArray, spread: FloatArray, 
         for edge in range(edges):
             u = (places[edge] - path[k]) * per_width
             bell = math.exp(-u * u)
-            d0, d1 = half_erf(u, bell), -bell * peak
+            d0, d1 = rough_half_erf(u, bell), -bell * peak
             d2 = 2 * u * per_width * d1
             d3 = (4 * u * u - 2) * per_width * per_width * d1
             for a in range(_ORDERS):
@@ -135,7 +127,7 @@ def _responses(line: Line, W: FloatArray, path: FloatArray, spread: FloatArray, 
 
 
 @compiled
-def half_erf(u: float, bell: float) -> float:
+def rough_half_erf(u: float, bell: float) -> float:
     """erf(u) / 2 where ``bell`` is exp(-u^2), to 8e-8: Abramowitz and Stegun, 7.1.26."""
     s = 1.0 / (1.0 + 0.3275911 * abs(u))
     rest = s * (0.254829592 + s * (-0.284496736 + s * (1.421413741 + s * (-1.453152027 + s * 1.061405429))))

@@ -32,7 +32,7 @@ _weighted = compiled_exactly(two_states.weighted)
 
 
 @compiled_exactly
-def run(
+def update_and_predict(
     transition: FloatArray, weights: FloatArray, mean_row: FloatArray, quadratic: FloatArray, added: FloatArray,
     means: FloatArray, slopes: FloatArray, squares: FloatArray, kicks: FloatArray, values: FloatArray,
     noises: FloatArray, gate: float, state: FloatArray, covariance: FloatArray, unseen: FloatArray, out: FloatArray,

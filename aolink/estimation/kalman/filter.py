@@ -264,7 +264,7 @@ class TwoStateFilter(BlurFilter):
         P, R = np.broadcast_to(self.prior.covariance, (self.plant.axes, 2, 2)), measured.single_block
         state, unseen = (np.array(each, order="C") for each in (self.prior.mean, self._unseen.mean))
         covariance, table = np.ascontiguousarray(_upper(P)), np.empty((*shape, two_state_runs.NUMBERS))
-        count = two_state_runs.run(
+        count = two_state_runs.update_and_predict(
             np.array(model.transition), np.array(two_states.weights_of(model.transition)), np.array(model.mean_row[0]),
             np.array(model.quadratic[0]), _upper(added_noise(model, self._process_noise)),
             series(responses.mean[:, 0]), series(responses.slope[:, 0]), series(responses.square[:, 0]),

@@ -52,7 +52,7 @@ _DIRECTIONS = 3
 _START_REACH = 1.3
 # A start for a reversed path fits it to this many standard deviations of the kernel, if the prior allows.
 _REVERSED_TO = 0.2
-# Directions of the pixels, for each output, in which an innovation is given; in the others there is hardly but noise.
+# Directions of the pixels, for each output, in which an innovation is given; the others hold hardly more than noise.
 _NEW_DIRECTIONS = 4
 # Information of a direction, as a share of the largest, that is rounding.
 _NO_INFORMATION = 1e-13
@@ -93,9 +93,7 @@ class Modes:
         return np.asarray(np.argmin(self.objective, axis=1))
 
 
-def find_modes(
-    view: PixelView, prior: Gaussian, starts: FloatArray, passes: int = _PASSES, converged: float = _CONVERGED
-) -> Modes:
+def find_modes(view: PixelView, prior: Gaussian, starts: FloatArray) -> Modes:
     """The mode that each start leads to.
 
     Parameters
@@ -107,7 +105,7 @@ def find_modes(
     """
     axes, count, n = starts.shape
     if (line := view.line) is not None:
-        return found_compiled(line, prior, starts, np.full(axes, count), 0, 0.0, passes, converged)
+        return found_compiled(line, prior, starts, np.full(axes, count), 0, 0.0)
     if prior.mean.ndim == 2:
         prior = Gaussian(
             np.repeat(prior.mean[:, None], count, axis=1), np.repeat(prior.covariance[:, None], count, axis=1)
@@ -118,7 +116,7 @@ def find_modes(
     def at(s: FloatArray, which: Indices) -> Points:
         return _at(rows.part(which), m[which], L[which], s)
 
-    s, found = minimise(at, starts.reshape(-1, n), passes, converged)
+    s, found = minimise(at, starts.reshape(-1, n), _PASSES, _CONVERGED)
     covariance = batched.congruence(L, batched.symmetric(np.asarray(np.linalg.inv(found.hessian), dtype=np.float64)))
     _, log_H = np.linalg.slogdet(found.hessian)
     evidence = -found.objective - 0.5 * log_H
@@ -131,16 +129,15 @@ def find_modes(
 
 
 def found_compiled(
-    line: Line, prior: Gaussian, starts: FloatArray, of_axis: Indices, whole: int, reversed_precision: float,
-    passes: int = _PASSES, converged: float = _CONVERGED,
-) -> Modes:  # fmt: skip
+    line: Line, prior: Gaussian, starts: FloatArray, of_axis: Indices, whole: int, reversed_precision: float
+) -> Modes:
     """`find_modes` for line sensors, in compiled code."""
     axes, count, n = starts.shape
     count += 3 if reversed_precision else 0
     found = Modes.none(axes, count, n)
     compiled_modes.find_modes_of_lines(
         line, np.ascontiguousarray(prior.mean), np.ascontiguousarray(prior.covariance), np.ascontiguousarray(starts),
-        of_axis, whole, reversed_precision, passes, FIRST_DAMPING, LARGEST_DAMPING, FREE_DAMPING, converged,
+        of_axis, whole, reversed_precision, _PASSES, FIRST_DAMPING, LARGEST_DAMPING, FREE_DAMPING, _CONVERGED,
         *found.arrays,
     )  # fmt: skip
     return found

@@ -9,6 +9,7 @@ from aolink.estimation import Profile
 from aolink.estimation.pixels import importance
 from aolink.estimation.pixels.gaussian_mixture import GaussianMixture, log_sum, with_noise
 from aolink.estimation.pixels.likelihood import PixelView
+from aolink.estimation.pixels.modes import find_modes, whitened
 from aolink.numerics import batched
 from aolink.numerics.covariance import cholesky
 from aolink.optics.kernel import pixel_masses
@@ -76,6 +77,14 @@ class PlainView(PixelView):
 
     def log_likelihoods(self, t):
         return self.log_likelihood(self.predicted(t))
+
+
+def settled_modes(view, prior, starts):
+    """`find_modes` again from where it has ended, until a search leads next to nowhere."""
+    modes = find_modes(view, prior, starts)
+    for _ in range(4):
+        modes = find_modes(view, prior, whitened(prior, modes.mean))
+    return modes
 
 
 def importance_corrected(view, prior, proposal, share, enough):

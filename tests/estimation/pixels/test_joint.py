@@ -28,12 +28,12 @@ from aolink.estimation.moments.windowed import Regression
 from aolink.estimation.pixels import joint_pixels
 from aolink.estimation.pixels.joint_pixels import JointPixels, find_mode
 from aolink.estimation.pixels.likelihood import PixelView, Reduction
-from aolink.estimation.pixels.modes import find_modes, whitened
+from aolink.estimation.pixels.modes import whitened
 from aolink.exposure import Exposure
 from aolink.optics.sensor import Kernel
 from aolink.rig import Rig, load_rig, parse_rig
 from aolink.simulation.model import simulate
-from tests.estimation.pixels.plain import PlainView
+from tests.estimation.pixels.plain import PlainView, settled_modes
 from tests.kinds import must_be, spots_of, truth_of
 
 NAMES = ("o1", "o3", "moments", "profile")
@@ -158,7 +158,7 @@ def test_the_mode_and_its_covariance_are_those_of_the_dense_search(rig, frame):
     paths = JointPaths(frame.model, rig.sensor)
     before = whole_prior(frame, paths.size)
     dense = dense_view(rig, frame, paths)
-    modes = find_modes(dense, before, whitened(before, before.mean[:, None]), passes=40, converged=1e-4)
+    modes = settled_modes(dense, before, whitened(before, before.mean[:, None]))
     view = joint_view(rig, frame, paths)
     precision = paths.prior_information(frame.prior.covariance[0])
     theirs = find_mode(view, before.mean[0], precision, modes.mean[0, 0])

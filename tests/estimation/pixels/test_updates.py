@@ -16,14 +16,14 @@ from aolink.estimation.pixels import likelihood
 from aolink.estimation.pixels.filter import MixtureFilter
 from aolink.estimation.pixels.gaussian_mixture import GaussianMixture, single
 from aolink.estimation.pixels.importance import importance_corrected
-from aolink.estimation.pixels.modes import broad, find_modes, whitened
+from aolink.estimation.pixels.modes import broad, whitened
 from aolink.estimation.pixels.updates import MIXTURE, PROFILE, explored
 from aolink.numerics.covariance import cholesky
 from aolink.optics.camera import to_counts
 from aolink.optics.kernel import exposure_density
 from aolink.rig import load_rig
 from aolink.simulation.model import simulate
-from tests.estimation.pixels.plain import PlainView
+from tests.estimation.pixels.plain import PlainView, settled_modes
 from tests.kinds import line_of, must_be, truth_of
 
 RIG = load_rig("section-vi-lively")
@@ -75,7 +75,7 @@ def test_the_gradient_is_zero_at_a_mode():
     prior = view.reduced.prior(state)
     start = whitened(prior, broad(view, prior).mean[:, None])
     view = PlainView.of(view)  # its error function is exact; what is compiled has a test of its own
-    modes = find_modes(view, prior, start, passes=60, converged=1e-5)
+    modes = settled_modes(view, prior, start)
     inverse = np.linalg.inv(prior.covariance[0])
 
     def objective(t):
@@ -138,20 +138,21 @@ def test_profile_carries_as_many_gaussians_as_it_takes():
     assert np.abs(end.log_density(points) - whole.log_density(points)).max() > 0.05
 
 
-def test_many_points_are_to_count_where_there_is_a_second_mode(monkeypatch):
-    asked = []
-
-    def noted(view, prior, proposal, share, enough):
-        asked.append((share, enough))
-        return importance_corrected(view, prior, proposal, share, enough)
-
-    monkeypatch.setattr("aolink.estimation.pixels.importance.importance_corrected", noted)
+def test_all_points_are_drawn_where_there_is_a_second_mode():
+    """With one mode `profile` draws a share of the points, and reaches it; `mixture` always draws all."""
     one, state = seen(quiet(load_rig("section-vi"), 0.005))
     two, other = seen(quiet(RIG, 0.003), width=0.5, seed=10)
-    PROFILE.update(one, single(state), state, 0)
-    PROFILE.update(two, single(other), other, 0)
-    MIXTURE.update(one, single(state), state, 0)
-    assert [(share, enough.tolist()) for share, enough in asked] == [(0.25, [25.0]), (1.0, [100.0]), (1.0, [100.0])]
+
+    def mean(updates, view, state, **changed):
+        updates = dataclasses.replace(updates, **changed)
+        return updates.update(view, single(state), state, 0).coefficients.mean.tobytes()
+
+    assert mean(PROFILE, two, other) == mean(PROFILE, two, other, share=1.0)
+    assert mean(PROFILE, one, state) == mean(PROFILE, one, state, share=0.25) != mean(PROFILE, one, state, share=1.0)
+    assert mean(MIXTURE, one, state) == mean(MIXTURE, one, state, share=1.0)
+    # The effective sample size to reach is less by the same share: here a single round has it, and does not have all.
+    assert mean(PROFILE, one, state) == mean(PROFILE, one, state, enough=0.0)
+    assert mean(PROFILE, one, state) != mean(PROFILE, one, state, enough=400.0)
 
 
 def test_evidence_of_a_mode_has_the_weight_of_its_prior():
