@@ -16,7 +16,7 @@ from aolink.estimation import run, smooth
 from aolink.importing.film import array_film
 from aolink.importing.first_rig import first_rig
 from aolink.importing.frames import Settings
-from aolink.importing.motion import fit_motion
+from aolink.importing.motion import Motion, fit_motion
 from aolink.importing.recording import import_film
 from aolink.importing.survey import survey
 from aolink.importing.tracker import find_objects
@@ -296,6 +296,24 @@ def test_a_walk_and_a_bound_motion_are_told_apart_and_fitted(seed: int) -> None:
     assert abs(found.q - 0.16) < 5 * found.q_sd
 
 
+@pytest.mark.parametrize("forgets", [5.0, 50.0, np.inf])
+def test_the_path_in_an_exposure_has_the_covariances_of_means_over_frames(forgets: float) -> None:
+    """Those of a process that forgets in so many frames, and of the steps of a walk, by integrals over two frames."""
+    rate = 1 / forgets
+    a = np.exp(-rate)
+    rest = dict.fromkeys(("a_sd", "turn", "turn_sd", "q_sd", "walk_sd", "drift", "drift_sd", "r", "unexplained"), 0.0)
+    if rate == 0:
+        _, step = Motion(a=1.0, q=0.0, walk=1.0, **rest).frame_mean
+        # A step of the output is the plant's own, less a share of it, with that share of the step before.
+        assert ((1 - step) ** 2 + step**2, step * (1 - step)) == pytest.approx((2 / 3, 1 / 6), rel=1e-12)
+        return
+    process, step = Motion(a=a, q=1 - a**2, walk=0.0, **rest).frame_mean
+    same = process**2 - 2 * process * step * (1 - a**2) + step**2 * (1 - a**2)
+    next_ = a * (process**2 - process * step * (1 - a**2))
+    assert same == pytest.approx(2 * (rate - 1 + a) / rate**2, abs=0.02)
+    assert next_ == pytest.approx(((1 - a) / rate) ** 2, abs=0.02)
+
+
 def test_a_lost_frame_is_no_step_of_the_motion() -> None:
     """Every fifth frame of a vibration is lost: the other frames are fitted with their own times."""
     rng = np.random.default_rng(14)
@@ -385,9 +403,7 @@ def test_a_resonance_inside_the_exposure_is_found(tmp_path: Path) -> None:
 
 @pytest.mark.long
 def test_a_rig_whose_inputs_do_not_shift_its_spots_keeps_its_windows(walkers: SpotFilm, tmp_path: Path) -> None:
-    text = first_rig(array_film(walkers.frames, "film"), SETTINGS, "film").text.replace(
-        "\nB = [[1.0]]", "\nB = [[0.0]]"
-    )
+    text = first_rig(array_film(walkers.frames, "film"), SETTINGS, "film").text.replace("\nB = [[1.0]", "\nB = [[0.0]")
     rig = parse_rig(text)
     import_film(array_film(walkers.frames, "film"), rig, SETTINGS, tmp_path / "a.mcap")
     assert not any(each.inputs.any() for each in Recording(tmp_path / "a.mcap").exposures())
