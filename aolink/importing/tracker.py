@@ -62,7 +62,8 @@ class Tracker:
         there are two lights again. Which is which is then not known."""
         self._sd, self._locate = objects.sd, locate
         self._usual = np.full(len(self.places), np.nan)
-        self._light = np.zeros(len(self.places))
+        self.light = np.zeros(len(self.places))
+        """Light of each object under the weight in the last frame, (n,); zero where it is not seen."""
         self._lost = np.zeros(len(self.places), dtype=np.int64)
 
     def follow(self, light: FloatArray) -> FloatArray:
@@ -70,7 +71,7 @@ class Tracker:
         start = self.places.copy()
         for pair in np.argwhere(np.triu(self.together)):
             start[pair] = self._apart_again(light, pair)
-            self._light[pair] = self._usual[pair]
+            self.light[pair] = self._usual[pair]
         found, brightness = self._measured(light, start)
         self._usual = np.where(np.isfinite(self._usual), self._usual, brightness)
         moved = np.linalg.norm(found - self.places, axis=1)
@@ -83,7 +84,7 @@ class Tracker:
         self.together |= meets & seen[:, None] & seen
         seen &= ~self.together.any(axis=1)
         self._usual[seen] += 0.1 * (brightness - self._usual)[seen]
-        self._light = np.where(seen, brightness, 0.0)
+        self.light = np.where(seen, brightness, 0.0)
         self.places[seen] = found[seen]
         self._lost = np.where(seen, 0, self._lost + 1)
         return np.where(seen[:, None], found, np.nan)
@@ -98,7 +99,7 @@ class Tracker:
         near = self._within(_BESIDE, start)
         crowded = np.asarray(near.any(axis=1))
         pixels = np.arange(2 * half + 1)
-        found, brightness = start, self._light
+        found, brightness = start, self.light
         for _ in range(_ROUNDS if crowded.any() else 1):
             own = windows.copy()
             # A Gaussian's share of light under the weight is W^2 / (1 + W^2).
