@@ -26,6 +26,10 @@ _EDGE = 4.0
 deviations."""
 _REACH = 3.0
 """How far an object may go from one frame to the next, in its standard deviations."""
+_FAR = 6.0
+"""The same of one that is searched for, because there is no light of it nearer."""
+_LIKE = 0.6
+"""Share of an object's usual light that it must have to be found so far away."""
 _FAINT = 0.3
 """Share of an object's usual light below which it is lost."""
 _BESIDE = 6.0
@@ -76,6 +80,10 @@ class Tracker:
         self._usual = np.where(np.isfinite(self._usual), self._usual, brightness)
         moved = np.linalg.norm(found - self.places, axis=1)
         seen = (moved <= _REACH * self._sd * (1 + self._lost)) & (brightness > _FAINT * self._usual)
+        for k in np.flatnonzero(~seen & ~self.together.any(axis=1)):
+            place, shine = self._farther(light, int(k), found[seen])
+            if shine > _LIKE * self._usual[k]:
+                found[k], brightness[k], seen[k] = place, shine, True
         self.together &= ~(seen[:, None] & seen)
         meets = self._within(_MEET, found)
         # A track that had lost its object comes upon the light of another one.
@@ -117,6 +125,24 @@ class Tracker:
         if self._locate is not None:
             found = np.where(crowded[:, None], found, self._nearest(light, found))
         return found, brightness
+
+    def _farther(self, light: FloatArray, k: int, others: FloatArray) -> tuple[FloatArray, float]:
+        """Place and brightness of the brightest light farther from the last place of an object, (2,), without that of
+        others."""
+        half = math.ceil((_FAR + 2 * WEIGHT) * self._sd)
+        windows, (corner,) = cut_windows(light, self.places[k][None], half)
+        pixels = np.arange(2 * half + 1)
+        at = np.stack(np.meshgrid(pixels, pixels), axis=-1) + corner
+        usable = np.linalg.norm(at - self.places[k], axis=2) <= _FAR * self._sd
+        for other in others:
+            usable &= np.linalg.norm(at - other, axis=2) > _EDGE * self._sd
+        smooth = np.where(usable, ndimage.gaussian_filter(windows[0], self._sd), -np.inf)
+        y, x = np.unravel_index(int(np.argmax(smooth)), smooth.shape)
+        found = weighted_centroid(windows, WEIGHT * self._sd, start=np.array([[x, y]], dtype=np.float64))[0]
+        shine = (
+            float((windows[0] * _gaussian(found, WEIGHT * self._sd, pixels)).sum()) if np.isfinite(found).all() else 0.0
+        )
+        return found + corner, shine if usable.any() else 0.0
 
     def _within(self, far: float, places: FloatArray) -> BoolArray:
         """Which objects are nearer to each other than so many standard deviations, (n, n)."""

@@ -15,11 +15,11 @@ from aolink.errors import ImportingError
 from aolink.estimation import run, smooth
 from aolink.importing.film import array_film
 from aolink.importing.first_rig import first_rig
-from aolink.importing.frames import Settings
+from aolink.importing.frames import FilmLight, Settings
 from aolink.importing.motion import Motion, fit_motion
 from aolink.importing.recording import import_film
 from aolink.importing.survey import survey
-from aolink.importing.tracker import find_objects
+from aolink.importing.tracker import Objects, Tracker, find_objects
 from aolink.recording.reader import Recording
 from aolink.rig import Rig, parse_rig
 from tests.kinds import truth_of
@@ -147,6 +147,19 @@ def test_objects_that_stay_together_on_a_long_way_are_found_again() -> None:
     assert np.isfinite(known.places[230:]).all()
     errors = [np.abs(known.places[230:, order] - film.places[230:]).max() for order in ([0, 1], [1, 0])]
     assert min(errors) < 0.5
+
+
+def test_an_object_that_moves_by_more_than_its_width_is_followed() -> None:
+    """By up to five of its standard deviations from frame to frame, while the other one rests."""
+    rng = np.random.default_rng(9)
+    motion = np.zeros((60, 1, 2, 2))
+    motion[:, 0, 0] = np.where(np.arange(60)[:, None] % 3 == 2, [7.0, 5.0], [0.0, 0.0])
+    film = spot_film(rng, motion, MIDDLES)
+    light = FilmLight(array_film(film.frames, "film"), SETTINGS)
+    tracker = Tracker(Objects(MIDDLES, 1.8), None)
+    places = np.array([tracker.follow(light.of(frame)[0]) for frame in film.frames])
+    assert np.linalg.norm(np.diff(film.places[:, 0], axis=0), axis=1).max() > 4.5 * 1.8
+    assert np.abs(places - film.places).max() < 0.3
 
 
 def test_an_object_that_passes_a_faded_one_is_followed_on() -> None:
