@@ -67,7 +67,8 @@ def tracked(
         account.frames += settings.frames_per_exposure
         account.exposures += 1
         frame = rig_frame(film, rig, settings, group.first_period // settings.frames_per_exposure, pixels, mask)
-        path = windows.positions(np.where(seen.all(axis=0)[:, None], known.places[group.first_frame : end], np.nan))
+        whole = np.asarray(seen.all(axis=0))[:, None]
+        path = windows.positions(np.where(whole, known.places[group.first_frame : end], np.nan))
         inputs = np.tile(rig.mirror.park, (frame.last_step + 1 - step, 1))
         step = frame.last_step + 1
         inputs[-1] += windows.follow(known.places[end - 1])
