@@ -22,7 +22,7 @@ from aolink.rig import Rig
 class Truth:
     """The true states and path of one exposure, from a simulated rig or the single frames of a film.
 
-    No estimator reads it. Unknown states are NaN.
+    No estimator reads it. What is not known is NaN: states, and the whole path of an output.
     """
 
     start_state: NDArray[np.float64]
@@ -34,6 +34,11 @@ class Truth:
     path_sd: float = 0.0
     """Standard deviation of an error in ``path``, slope units: zero for a simulated rig, larger where the path was
     measured."""
+
+    @property
+    def known(self) -> NDArray[np.bool_]:
+        """Which outputs have a known path, (n_outputs,)."""
+        return np.asarray(np.isfinite(self.path).all(axis=1))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -148,5 +153,5 @@ def step_shares(n_steps: int, offset: float) -> NDArray[np.float64]:
 
 def residual_rms(series: Iterable[Exposure]) -> float:
     """Root mean square of the true slopes at each fast step, slope units; NaN without truth."""
-    squares = [float(np.mean(each.truth.path**2)) for each in series if each.truth is not None]
+    squares = [float(np.mean(each.truth.path[each.truth.known] ** 2)) for each in series if each.truth is not None]
     return float(np.sqrt(np.mean(squares))) if squares else float("nan")

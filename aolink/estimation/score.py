@@ -142,15 +142,17 @@ class Scorer:
         if truth is None:
             return
         self._exposures += 1
-        self._path.add(np.mean((estimate.path - truth.path) ** 2, keepdims=True))
+        self._path.add(np.mean((estimate.path - truth.path)[truth.known] ** 2, keepdims=True))
         at_start, at_end = estimate.start_state - truth.start_state, estimate.end_state - truth.end_state
-        if not (np.isfinite(at_start).all() and np.isfinite(at_end).all()):
+        known = np.isfinite(at_start).all(axis=1) & np.isfinite(at_end).all(axis=1)
+        if not known.any():
             return  # the truth of a film is its path
+        at_start, at_end = at_start[known], at_end[known]
         self._states += at_start.size
         self._start.add((at_start**2).sum(axis=1))
         self._end.add((at_end**2).sum(axis=1))
-        self._start_nees.add(_normalised(at_start, estimate.start_covariance))
-        self._end_nees.add(_normalised(at_end, estimate.end_covariance))
+        self._start_nees.add(_normalised(at_start, estimate.start_covariance[known]))
+        self._end_nees.add(_normalised(at_end, estimate.end_covariance[known]))
 
     def result(self) -> Score:
         """The score of what was added so far."""

@@ -83,18 +83,26 @@ def _notes(known: Survey, motion: Motion) -> Iterator[str]:
 
 
 def _plant(motion: Motion, unit: float, copies: int) -> str:
-    """The table of the plant: the process, and an offset that the window shifts and that may walk and drift."""
+    """The table of the plant: the process, and an offset that the window shifts and that may walk and drift.
+
+    A place in a frame is the mean of the motion in it, which has not the whole last step of a random motion yet: the
+    last state is that step.
+    """
     turning = np.exp(complex(0, motion.turn)) * motion.a
     process = np.array([[turning.real, -turning.imag], [turning.imag, turning.real]])
     n = 0 if motion.a == 1 else 2 if motion.turn else 1
     drifts = int(motion.drift > 0)
-    size = n + 1 + drifts
-    A, B, C = np.eye(size), np.zeros((size, 1)), np.zeros((1, size))
-    A[:n, :n], B[n], C[0, n] = process[:n, :n], 1.0, 1.0
-    C[0, : min(n, 1)] = 1.0
-    A[n, n + 1 :] = 1.0
     noises = [motion.q] * n + [motion.walk] * (n == 0 or motion.walk > 0)
-    initial = [motion.variance / unit**2] * n + [_ANYWHERE] + [motion.drift / unit**2] * drifts
+    mean = motion.frame_mean
+    size = n + 1 + drifts + int(mean.step > 0)
+    A, B, C, B_w = np.eye(size), np.zeros((size, 1)), np.zeros((1, size)), np.eye(size)[:, : len(noises)]
+    A[:n, :n], B[n], C[0, n] = process[:n, :n], 1.0, 1.0
+    C[0, : min(n, 1)] = mean.process
+    A[n, n + 1 : n + 1 + drifts] = 1.0
+    initial = np.diag([motion.variance] * n + [_ANYWHERE * unit**2] + [motion.drift] * drifts + [noises[-1]])
+    initial = initial[:size, :size] / unit**2
+    if mean.step:
+        A[-1, -1], B_w[-1, -1], C[0, -1] = 0.0, 1.0, -mean.step
     a_frame = f"{motion.a:.5g} +- {motion.a_sd:.2g} a frame"
     if motion.turn:
         period, lasts = 2 * math.pi / motion.turn, -motion.turn / (2 * math.pi * math.log(motion.a))
@@ -118,16 +126,17 @@ def _plant(motion: Motion, unit: float, copies: int) -> str:
             f"\n# and a constant velocity, another one for each object and direction: {math.sqrt(motion.drift):.3g} +-"
             f" {share * math.sqrt(motion.drift):.2g} pixels rms a frame"
         )
+    last = "\n# The last state is the last step, which the mean over a frame has in part." if mean.step else ""
     return f"""[plant]               # a copy for each object along x and along y
 {said}.
-# The last state{" but one" if drifts else ""} is shifted by the input, as the window is.
+# The input shifts state {n + 1}, as the window is.{last}
 axes = {copies}
 A = {_matrix(A)}
 B = {_matrix(B)}
-B_w = {_matrix(np.eye(size)[:, : len(noises)])}
+B_w = {_matrix(B_w)}
 C = {_matrix(C)}
 process_noise = {_matrix(np.diag(noises) / unit**2)}
-initial_covariance = {_matrix(np.diag(initial))}
+initial_covariance = {_matrix(initial)}
 """
 
 

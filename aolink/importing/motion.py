@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy import optimize
@@ -29,6 +29,13 @@ _LASTS = (1.0, 3.0, 10.0, 30.0, 100.0)
 """Periods that a vibration lasts, of which the best one starts its fit."""
 _SLOWEST = 4
 """Periods in a film of the slowest vibration."""
+
+
+class FrameMean(NamedTuple):
+    """The mean over a frame of the motion: z times ``process``, and the offset, less ``step`` of the last step."""
+
+    process: float
+    step: float
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,6 +67,22 @@ class Motion:
     def variance(self) -> float:
         """The variance of Re z, pixels squared."""
         return self.q / (1 - self.a**2) if self.a < 1 else 0.0
+
+    @property
+    def frame_mean(self) -> FrameMean:
+        """The mean over a frame as an output, with the covariances that `_filter` takes.
+
+        Those of a walk's mean are those of the walk less .211 of its last step. With a process of variance s about
+        zero, z g - h (last step) has those of z less q / 6 at lag zero for g h = (g^2 - 1) s / q = u, where
+        u^2 (1 - q / s) - u (1 - q / 6 s) + 1 / 6 = 0. A vibration's own kicks are small beside its motion.
+        """
+        if self.turn and not self.walk:
+            return FrameMean(1.0, 0.0)
+        share = 0.0 if self.a == 1 or self.turn else self.q / self.variance
+        b = 1 - share / 6
+        u = (1 / 3) / (b + math.sqrt(b * b - (2 / 3) * (1 - share)))
+        g = math.sqrt(1 + u * share)
+        return FrameMean(g, u / g)
 
     @property
     def kind(self) -> str:

@@ -11,6 +11,7 @@ from scipy import ndimage, optimize
 
 from aolink.errors import ImportingError
 from aolink.importing.accuracy import pixel_noise, tracker_errors
+from aolink.importing.brightness import brightness_of
 from aolink.importing.film import Film
 from aolink.importing.frames import FilmLight, Settings
 from aolink.importing.tracker import FIRST_FRAMES, WEIGHT, Objects, Tracker, trackpy_locator
@@ -46,7 +47,9 @@ class Survey:
     sd_sd: float
     """Standard deviation of ``sd``, from the differences of the objects."""
     light: FloatArray
-    """Light of each object, (n,)."""
+    """Light of each object, a mean over the film, (n,)."""
+    brightness: FloatArray
+    """The light of all objects in each frame, over its mean, (frames,); one where it does not change."""
     ground: FloatArray
     """Remaining background under each object, for one pixel, (n,)."""
     residual: FloatArray
@@ -80,6 +83,10 @@ class Survey:
                 f"objects {a + 1} and {b + 1} come together in frames {frames}: they are left out there, and which is"
                 " which is not known afterwards"
             )
+        begin, end = self.brightness[[0, -1]]
+        if begin != end:
+            change = f"fades by {1 - end / begin:.0%}" if end < begin else f"grows by {end / begin - 1:.0%}"
+            yield f"the light of the objects {change} over the film: exposures are scaled to the same light"
         steps = np.diff(self.places, axis=0)
         drift, count = np.nanmean(steps, axis=(0, 1)), max(int(np.isfinite(steps).all(axis=2).sum()), 1)
         if np.linalg.norm(drift) > _DRIFTS * math.sqrt(np.nanvar(steps) / count):
@@ -92,8 +99,8 @@ class Survey:
             if gone.any():
                 frames = _stretches(np.flatnonzero(gone), 1, len(gone))
                 yield (
-                    f"object {number} is not seen in frames {frames}: exposures with one of them have no true path, and"
-                    " its window is left out where it is never seen"
+                    f"object {number} is not seen in frames {frames}: its true path is not known in exposures with one"
+                    " of them, and its window is left out where it is never seen"
                 )
         for k, beside in enumerate(self.beside.T):
             stretches = np.flatnonzero(beside >= _ALONE)
@@ -127,7 +134,7 @@ def survey(film: Film, settings: Settings, objects: Objects, progress: Callable[
     light = FilmLight(film, settings)
     tracker = Tracker(objects, trackpy_locator(objects.sd))
     every, half = max(1, film.count // _SAMPLES), math.ceil(4 * objects.sd)
-    places, last, together = [], [], []
+    places, last, together, shine = [], [], [], []
     windows, centres = [], []
     for k, frame in enumerate(film.frames()):
         shown, bad = light.of(frame)
@@ -135,6 +142,7 @@ def survey(film: Film, settings: Settings, objects: Objects, progress: Callable[
         places.append(found)
         last.append(tracker.places.copy())
         together.append(tracker.together.copy())
+        shine.append(tracker.light)
         if k % every == 0:
             shown[bad] = np.nan
             cut, corners = cut_windows(shown, tracker.places, half)
@@ -145,14 +153,15 @@ def survey(film: Film, settings: Settings, objects: Objects, progress: Callable[
     path, near = np.array(places), np.array(together)
     if np.isfinite(path).all(axis=2).sum() < 2 * FIRST_FRAMES:
         raise ImportingError(f"{film.name}: no object can be followed from frame to frame: do they move too far?")
-    cuts = np.array(windows)
+    brightness = brightness_of(np.array(shine))
+    cuts = np.array(windows) / brightness[::every, None, None, None]
     sd, sd_sd, amounts, ground, residual, model, beside = _fitted(cuts, np.array(centres), objects.sd)
     noise = pixel_noise(cuts.reshape(-1, *cuts.shape[2:]), np.concatenate(centres), sd)
     place_sd = tracker_errors(path, range(0, film.count, every), amounts, sd, noise)
     return Survey(
-        places=path, last=np.array(last), together=near, sd=sd, sd_sd=sd_sd, light=amounts, ground=ground,
-        residual=residual, model=model, place_sd=place_sd, beside=beside, stretch=every * _STRETCH,
-        left_out=float(np.isnan(cuts).mean()),
+        places=path, last=np.array(last), together=near, sd=sd, sd_sd=sd_sd, light=amounts,
+        brightness=brightness, ground=ground, residual=residual, model=model, place_sd=place_sd, beside=beside,
+        stretch=every * _STRETCH, left_out=float(np.isnan(cuts).mean()),
     )  # fmt: skip
 
 

@@ -26,6 +26,10 @@ _EDGE = 4.0
 deviations."""
 _REACH = 3.0
 """How far an object may go from one frame to the next, in its standard deviations."""
+_FAR = 6.0
+"""The same of one that is searched for, because there is no light of it nearer."""
+_LIKE = 0.6
+"""Share of an object's usual light that it must have to be found so far away."""
 _FAINT = 0.3
 """Share of an object's usual light below which it is lost."""
 _BESIDE = 6.0
@@ -62,7 +66,8 @@ class Tracker:
         there are two lights again. Which is which is then not known."""
         self._sd, self._locate = objects.sd, locate
         self._usual = np.full(len(self.places), np.nan)
-        self._light = np.zeros(len(self.places))
+        self.light = np.zeros(len(self.places))
+        """Light of each object under the weight in the last frame, (n,); zero where it is not seen."""
         self._lost = np.zeros(len(self.places), dtype=np.int64)
 
     def follow(self, light: FloatArray) -> FloatArray:
@@ -70,11 +75,15 @@ class Tracker:
         start = self.places.copy()
         for pair in np.argwhere(np.triu(self.together)):
             start[pair] = self._apart_again(light, pair)
-            self._light[pair] = self._usual[pair]
+            self.light[pair] = self._usual[pair]
         found, brightness = self._measured(light, start)
         self._usual = np.where(np.isfinite(self._usual), self._usual, brightness)
         moved = np.linalg.norm(found - self.places, axis=1)
         seen = (moved <= _REACH * self._sd * (1 + self._lost)) & (brightness > _FAINT * self._usual)
+        for k in np.flatnonzero(~seen & ~self.together.any(axis=1)):
+            place, shine = self._farther(light, int(k), found[seen])
+            if shine > _LIKE * self._usual[k]:
+                found[k], brightness[k], seen[k] = place, shine, True
         self.together &= ~(seen[:, None] & seen)
         meets = self._within(_MEET, found)
         # A track that had lost its object comes upon the light of another one.
@@ -83,7 +92,7 @@ class Tracker:
         self.together |= meets & seen[:, None] & seen
         seen &= ~self.together.any(axis=1)
         self._usual[seen] += 0.1 * (brightness - self._usual)[seen]
-        self._light = np.where(seen, brightness, 0.0)
+        self.light = np.where(seen, brightness, 0.0)
         self.places[seen] = found[seen]
         self._lost = np.where(seen, 0, self._lost + 1)
         return np.where(seen[:, None], found, np.nan)
@@ -98,7 +107,7 @@ class Tracker:
         near = self._within(_BESIDE, start)
         crowded = np.asarray(near.any(axis=1))
         pixels = np.arange(2 * half + 1)
-        found, brightness = start, self._light
+        found, brightness = start, self.light
         for _ in range(_ROUNDS if crowded.any() else 1):
             own = windows.copy()
             # A Gaussian's share of light under the weight is W^2 / (1 + W^2).
@@ -116,6 +125,24 @@ class Tracker:
         if self._locate is not None:
             found = np.where(crowded[:, None], found, self._nearest(light, found))
         return found, brightness
+
+    def _farther(self, light: FloatArray, k: int, others: FloatArray) -> tuple[FloatArray, float]:
+        """Place and brightness of the brightest light farther from the last place of an object, (2,), without that of
+        others."""
+        half = math.ceil((_FAR + 2 * WEIGHT) * self._sd)
+        windows, (corner,) = cut_windows(light, self.places[k][None], half)
+        pixels = np.arange(2 * half + 1)
+        at = np.stack(np.meshgrid(pixels, pixels), axis=-1) + corner
+        usable = np.linalg.norm(at - self.places[k], axis=2) <= _FAR * self._sd
+        for other in others:
+            usable &= np.linalg.norm(at - other, axis=2) > _EDGE * self._sd
+        smooth = np.where(usable, ndimage.gaussian_filter(windows[0], self._sd), -np.inf)
+        y, x = np.unravel_index(int(np.argmax(smooth)), smooth.shape)
+        found = weighted_centroid(windows, WEIGHT * self._sd, start=np.array([[x, y]], dtype=np.float64))[0]
+        shine = (
+            float((windows[0] * _gaussian(found, WEIGHT * self._sd, pixels)).sum()) if np.isfinite(found).all() else 0.0
+        )
+        return found + corner, shine if usable.any() else 0.0
 
     def _within(self, far: float, places: FloatArray) -> BoolArray:
         """Which objects are nearer to each other than so many standard deviations, (n, n)."""

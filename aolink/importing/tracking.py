@@ -60,18 +60,20 @@ def tracked(
         usable &= np.asarray(seen.any(axis=0))[:, None, None]  # a window without its object shows nothing of it
         # Beyond an object's reach there is none of its light: light there belongs to others.
         values = np.where(own, values - known.ground[:, None, None], 0.0)
-        density = values / known.light[:, None, None] / area
+        shine = known.light * known.brightness[group.first_frame : end].mean()
+        density = values / shine[:, None, None] / area
         counts = sensor.black_level + sensor.counts_per_density * windows.as_frame(density)
         pixels, mask = counts_of(counts, windows.as_frame(usable), rig, account)
         account.frames += settings.frames_per_exposure
         account.exposures += 1
         frame = rig_frame(film, rig, settings, group.first_period // settings.frames_per_exposure, pixels, mask)
-        path = windows.positions(known.places[group.first_frame : end])
+        whole = np.asarray(seen.all(axis=0))[:, None]
+        path = windows.positions(np.where(whole, known.places[group.first_frame : end], np.nan))
         inputs = np.tile(rig.mirror.park, (frame.last_step + 1 - step, 1))
         step = frame.last_step + 1
         inputs[-1] += windows.follow(known.places[end - 1])
         truth = None
-        if len(path.T) == rig.timing.exposure_steps and np.isfinite(path).all():
+        if len(path.T) == rig.timing.exposure_steps and np.isfinite(path).any():
             follows = end < len(periods) and periods[end] == periods[end - 1] + 1
             after = windows.positions(known.places[end : end + 1] if follows else known.places[:0])
             truth = Truth(

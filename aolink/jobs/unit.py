@@ -144,7 +144,7 @@ def exposure_row(time_ns: int, exposure: Exposure, estimate: Estimate) -> dict[s
     ``time_ns`` is the log time. ``nis`` is the sum over the axes that were measured, and follows chi-square with
     ``nis_degrees`` degrees of freedom. In slope units: ``path_rms`` of the estimated path, ``path_sd`` of its standard
     deviation (root mean squares over outputs and fast steps), and the errors ``path_rmse``, ``start_rmse`` and
-    ``end_rmse`` (as in `aolink.estimation.Score`), which are None where there is no truth.
+    ``end_rmse`` (as in `aolink.estimation.Score`) of what is known, which are None where there is no truth.
     """
     seen, truth = estimate.nis > 0, exposure.truth
     row: dict[str, Any] = {
@@ -155,12 +155,13 @@ def exposure_row(time_ns: int, exposure: Exposure, estimate: Estimate) -> dict[s
         "path_rmse": None, "start_rmse": None, "end_rmse": None,
     }  # fmt: skip
     if truth is not None:
-        row["path_rmse"] = _rms(estimate.path - truth.path)
+        row["path_rmse"] = _rms((estimate.path - truth.path)[truth.known])
         for name, error in (
             ("start_rmse", estimate.start_state - truth.start_state),
             ("end_rmse", estimate.end_state - truth.end_state),
         ):
-            row[name] = _rms(np.linalg.norm(error, axis=1))
+            known = np.isfinite(error).all(axis=1)
+            row[name] = _rms(np.linalg.norm(error[known] if known.any() else error, axis=1))
     return row
 
 

@@ -135,7 +135,7 @@ def _draw_row(
     line: Sensor = series.rig.sensor.profile
     seen = profile_density(series.rig.sensor, exposure, output)
     paths = {name: each.path[output] for name, each in estimates.items()}
-    if exposure.truth is not None:
+    if exposure.truth is not None and exposure.truth.known[output]:
         paths = {"truth": exposure.truth.path[output], **paths}
     low, high = limits_of(line, list(paths.values()))
     scale = series.rig.timing.fast_step_s * 1e3 if unit == "s" else 1.0
@@ -191,7 +191,7 @@ def _draw_spot(
     axes.figure.colorbar(picture, ax=axes, label="counts", orientation="horizontal", shrink=0.9)
     outputs = [2 * spot, 2 * spot + 1]
     paths = {name: each.path[outputs] for name, each in estimates.items()}
-    if exposure.truth is not None:
+    if exposure.truth is not None and exposure.truth.known[outputs].all():
         paths = {"truth": exposure.truth.path[outputs], **paths}
     for name, path in paths.items():
         axes.plot(*path, color=colour(name), linewidth=1.6 if name == "truth" else 1.0)

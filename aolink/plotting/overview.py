@@ -197,10 +197,13 @@ class _Gathered:
             (exposure.frame_id, exposure.first_step, exposure.n_steps, missing, exposure.inputs_assumed)
         )  # fmt: skip
         truth = None if exposure.truth is None else exposure.truth.path
+        known = slice(None) if exposure.truth is None else exposure.truth.known
         found = {"truth": truth} if truth is not None else {}
         for name, estimate in zip(self.names, estimates, strict=True):
             self.status[name].append(_NONE if estimate is None else int(estimate.status))
-            self.errors[name].append(np.nan if estimate is None or truth is None else _rms(estimate.path - truth))
+            self.errors[name].append(
+                np.nan if estimate is None or truth is None else _rms((estimate.path - truth)[known])
+            )
             nis = (np.nan, np.nan)
             if estimate is not None:
                 self.scorers[name].add(exposure, estimate)
@@ -212,10 +215,11 @@ class _Gathered:
             self.nis[name].append(nis)
         last = self.names[-1] if self.names else ""
         about = truth if truth is not None else found.get(last)
-        self.moved.append(np.nan if about is None else _rms(about - about.mean(axis=1, keepdims=True)))
+        self.moved.append(np.nan if about is None else _rms((about - about.mean(axis=1, keepdims=True))[known]))
         other = truth if truth is not None else found.get(self.names[0]) if len(self.names) > 1 else None
-        self.apart.append(np.nan if other is None or last not in found else _rms(found[last] - other))
-        self.column.append((exposure, {name: path[self.output] for name, path in found.items()}))
+        self.apart.append(np.nan if other is None or last not in found else _rms((found[last] - other)[known]))
+        shown = {name: path[self.output] for name, path in found.items() if np.isfinite(path[self.output]).all()}
+        self.column.append((exposure, shown))
         if len(self.column) == self.stride:
             self._close_column()
 

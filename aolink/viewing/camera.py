@@ -123,7 +123,7 @@ def log_spot_paths(
         some = _drawn(path.shape[1], _POINTS_OF_SPOT)
         inside = np.clip((path[:, some] - sensor.field[0]) / sensor.pixel_width, 0, width)
         spots = inside.reshape(sensor.spots, 2, -1).swapaxes(1, 2) + corner[:, None]
-        strips.append(list(spots.astype(np.float32)))
+        strips.append(list(spots[np.isfinite(spots).all(axis=(1, 2))].astype(np.float32)))
     _send_strips(drawing, f"camera/image/path/{name}", timebase, known, strips, colour_of(name), 1.5)
 
 

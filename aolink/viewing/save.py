@@ -379,7 +379,10 @@ def send_camera(
         for name, by_frame in outputs.items():
             camera.log_spot_paths(drawing, sensor, timebase, new, name, by_frame)
     # The following is about one slope over time.
-    paths = {name: {k: path[output] for k, path in by_frame.items()} for name, by_frame in outputs.items()}
+    paths = {
+        name: {k: path[output] for k, path in by_frame.items() if np.isfinite(path[output]).all()}
+        for name, by_frame in outputs.items()
+    }
     line, seen = sensor.profile, camera.one_profile(sensor, exposures, output)
     if top is None:
         top = camera.density_top(line, seen)

@@ -15,11 +15,11 @@ from aolink.errors import ImportingError
 from aolink.estimation import run, smooth
 from aolink.importing.film import array_film
 from aolink.importing.first_rig import first_rig
-from aolink.importing.frames import Settings
-from aolink.importing.motion import fit_motion
+from aolink.importing.frames import FilmLight, Settings
+from aolink.importing.motion import Motion, fit_motion
 from aolink.importing.recording import import_film
 from aolink.importing.survey import survey
-from aolink.importing.tracker import find_objects
+from aolink.importing.tracker import Objects, Tracker, find_objects
 from aolink.recording.reader import Recording
 from aolink.rig import Rig, parse_rig
 from tests.kinds import truth_of
@@ -147,6 +147,19 @@ def test_objects_that_stay_together_on_a_long_way_are_found_again() -> None:
     assert np.isfinite(known.places[230:]).all()
     errors = [np.abs(known.places[230:, order] - film.places[230:]).max() for order in ([0, 1], [1, 0])]
     assert min(errors) < 0.5
+
+
+def test_an_object_that_moves_by_more_than_its_width_is_followed() -> None:
+    """By up to five of its standard deviations from frame to frame, while the other one rests."""
+    rng = np.random.default_rng(9)
+    motion = np.zeros((60, 1, 2, 2))
+    motion[:, 0, 0] = np.where(np.arange(60)[:, None] % 3 == 2, [7.0, 5.0], [0.0, 0.0])
+    film = spot_film(rng, motion, MIDDLES)
+    light = FilmLight(array_film(film.frames, "film"), SETTINGS)
+    tracker = Tracker(Objects(MIDDLES, 1.8), None)
+    places = np.array([tracker.follow(light.of(frame)[0]) for frame in film.frames])
+    assert np.linalg.norm(np.diff(film.places[:, 0], axis=0), axis=1).max() > 4.5 * 1.8
+    assert np.abs(places - film.places).max() < 0.3
 
 
 def test_an_object_that_passes_a_faded_one_is_followed_on() -> None:
@@ -296,6 +309,24 @@ def test_a_walk_and_a_bound_motion_are_told_apart_and_fitted(seed: int) -> None:
     assert abs(found.q - 0.16) < 5 * found.q_sd
 
 
+@pytest.mark.parametrize("forgets", [5.0, 50.0, np.inf])
+def test_the_path_in_an_exposure_has_the_covariances_of_means_over_frames(forgets: float) -> None:
+    """Those of a process that forgets in so many frames, and of the steps of a walk, by integrals over two frames."""
+    rate = 1 / forgets
+    a = np.exp(-rate)
+    rest = dict.fromkeys(("a_sd", "turn", "turn_sd", "q_sd", "walk_sd", "drift", "drift_sd", "r", "unexplained"), 0.0)
+    if rate == 0:
+        _, step = Motion(a=1.0, q=0.0, walk=1.0, **rest).frame_mean
+        # A step of the output is the plant's own, less a share of it, with that share of the step before.
+        assert ((1 - step) ** 2 + step**2, step * (1 - step)) == pytest.approx((2 / 3, 1 / 6), rel=1e-12)
+        return
+    process, step = Motion(a=a, q=1 - a**2, walk=0.0, **rest).frame_mean
+    same = process**2 - 2 * process * step * (1 - a**2) + step**2 * (1 - a**2)
+    next_ = a * (process**2 - process * step * (1 - a**2))
+    assert same == pytest.approx(2 * (rate - 1 + a) / rate**2, abs=0.02)
+    assert next_ == pytest.approx(((1 - a) / rate) ** 2, abs=0.02)
+
+
 def test_a_lost_frame_is_no_step_of_the_motion() -> None:
     """Every fifth frame of a vibration is lost: the other frames are fitted with their own times."""
     rng = np.random.default_rng(14)
@@ -385,9 +416,7 @@ def test_a_resonance_inside_the_exposure_is_found(tmp_path: Path) -> None:
 
 @pytest.mark.long
 def test_a_rig_whose_inputs_do_not_shift_its_spots_keeps_its_windows(walkers: SpotFilm, tmp_path: Path) -> None:
-    text = first_rig(array_film(walkers.frames, "film"), SETTINGS, "film").text.replace(
-        "\nB = [[1.0]]", "\nB = [[0.0]]"
-    )
+    text = first_rig(array_film(walkers.frames, "film"), SETTINGS, "film").text.replace("\nB = [[1.0]", "\nB = [[0.0]")
     rig = parse_rig(text)
     import_film(array_film(walkers.frames, "film"), rig, SETTINGS, tmp_path / "a.mcap")
     assert not any(each.inputs.any() for each in Recording(tmp_path / "a.mcap").exposures())

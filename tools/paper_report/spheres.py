@@ -47,7 +47,7 @@ def places() -> tuple[tuple[float, float], ...]:
 
 
 def spheres(K: int) -> tuple[Rig, list[Exposure], BoolArray]:
-    """A rig of 12 axes, its exposures of K frames, read back from a recording, and where a sphere is alone.
+    """A rig of 12 axes, its exposures of K frames, read back from a recording, and where a sphere is seen and alone.
 
     The last is (exposures, 12).
     """
@@ -59,7 +59,11 @@ def spheres(K: int) -> tuple[Rig, list[Exposure], BoolArray]:
         import_film(film, rig, settings, path)
         exposures = list(Recording(path).exposures())
     known = survey(film, settings, find_objects(film, settings))
-    alone = [known.alone(each.first_step, each.first_step + K) for each in exposures]
+    alone = [
+        known.alone(each.first_step, each.first_step + K)
+        & np.isfinite(known.places[each.first_step : each.first_step + K]).all(axis=(0, 2))
+        for each in exposures
+    ]
     return rig, exposures, np.repeat(alone, 2, axis=1)
 
 
