@@ -27,7 +27,7 @@ ROWS = {
     "loop": ("residual_slopes", "fall_back"),
     "loop_soak": ("closed_loop_soak",),
     "loop_worth": (
-        "worth_headline", "worth_lines", "worth_resonance", "worth_air", "worth_factors",
+        "worth_headline", "worth_long_past", "worth_lines", "worth_resonance", "worth_air", "worth_factors",
     ),
     "identification": ("coverage", "following", "spheres"),
 }  # fmt: skip
@@ -36,8 +36,8 @@ ROWS = {
 LONG = frozenset(
     {
         "soak", "closed_loop_soak", "bit_errors", "large_frames", "time_to_park", "restoration_quality", "shaken",
-        "moving_scene", "residual_slopes", "fall_back", "worth_headline", "worth_lines", "worth_resonance",
-        "worth_air", "worth_factors", "drawn_scenes", "coverage", "following", "spheres",
+        "moving_scene", "residual_slopes", "fall_back", "worth_headline", "worth_long_past", "worth_lines",
+        "worth_resonance", "worth_air", "worth_factors", "drawn_scenes", "coverage", "following", "spheres",
     }
 )  # fmt: skip
 """Functions that take two minutes or more each, `soak` forty, `closed_loop_soak` sixty.
