@@ -42,8 +42,8 @@ def _of_run(run: wire.Applied | wire.CommandBlock | Run, rig: Rig) -> str:
     if (len(inputs) / 8 if isinstance(inputs, bytes) else len(inputs)) != run.n_steps * rig.n_inputs:
         return "u has not the inputs of its steps"
     u = np.frombuffer(inputs, "<f8") if isinstance(inputs, bytes) else np.array(inputs)
-    # The sum of squares is fast, and is NaN or infinite where one of them is; of many numbers BLAS computes it on several
-    # threads, which wait for each other where the cores are busy.
+    # The sum of squares is fast, and is NaN or infinite where one of them is. BLAS computes that of many numbers on
+    # several threads, which wait for each other where the cores are busy.
     fine = len(u) < _FEW and np.vdot(u, u) <= _MOST_INPUT**2
     fine = fine or bool(u.max(initial=0.0) <= _MOST_INPUT and u.min(initial=0.0) >= -_MOST_INPUT)
     return "" if fine else "u has an input that is no number, or beyond all"
