@@ -9,7 +9,7 @@ instead. Start states are kept whole.
 
 Pixels see the mean of a path best. Noise that is left out and moves it is taken for another start state, and the end
 state, which it moves too, seems less certain than it is. So where the first singular vectors leave too much of that
-out, the directions that move the mean of the path come before them.
+out for a spot on a plane, the directions that move the mean of the path come before them.
 
 The mean over the fast steps is taken by quadrature with few nodes (`aolink.estimation.model.quadrature`).
 """
@@ -47,8 +47,9 @@ _LEFT_OUT = 0.1
 # are no more coefficients than this, since the cost of an estimate grows with the square of their number.
 _SEEN = 2.0
 _MOST_SEEN = 12
-# Standard deviation of the mean of the noise path that may be left out, in standard deviations of that position. A
-# plant that moves many spots has as many directions of it: there they are not sought.
+# Standard deviation of the mean of the noise path that may be left out, in standard deviations of that position. These
+# directions are sought for a spot on a plane. A plant that moves many spots has as many of them; on a line NEES holds
+# without them, and a mixture that is sure of a wrong mode is longer in finding the right one with them.
 _MEAN_LEFT_OUT = 0.25
 _ONE_SPOT = 2
 # Random paths from which the number of nodes is found.
@@ -140,7 +141,7 @@ def _kept(model: ExposureModel, coarse: float, resting_sd: float) -> tuple[Float
 
     V, rest = after(np.zeros((size, 0)))
     least = _MEAN_LEFT_OUT * resting_sd
-    if outputs <= _ONE_SPOT and np.linalg.norm(means - means @ V @ V.T, 2) > least:
+    if outputs == _ONE_SPOT and np.linalg.norm(means - means @ V @ V.T, 2) > least:
         _, values, vectors = np.linalg.svd(means, full_matrices=False)
         V, rest = after(vectors[values > least].T)
     return V, rest
