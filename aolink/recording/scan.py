@@ -354,12 +354,11 @@ def record_at(
 def broken_up(chunk: Chunk, offset: int, on_loss: Callable[[Loss], None], budget: Budget) -> Iterator[McapRecord]:
     """The records in a chunk, one by one; none if it is damaged."""
     try:
-        data, heads = _decompressed(chunk, budget), []
+        data, count = _decompressed(chunk, budget), 0
         if chunk.uncompressed_crc and zlib.crc32(data) != chunk.uncompressed_crc:
             raise ValueError("checksum")
-        for opcode, at, length in _heads(data):
-            heads.append((opcode, at, length))
-            if len(heads) > budget.records:
+        for count, (opcode, at, length) in enumerate(_heads(data), 1):
+            if count > budget.records:
                 break
             if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
                 _parsed(opcode, data[at : at + length])
@@ -368,8 +367,8 @@ def broken_up(chunk: Chunk, offset: int, on_loss: Callable[[Loss], None], budget
     except _DAMAGE:
         on_loss(_chunk_loss(offset, HEAD.size + len(chunk.data), chunk))
         return
-    budget.take_records(len(heads))
-    for opcode, at, length in heads:
+    budget.take_records(count)
+    for opcode, at, length in _heads(data):
         if opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE):
             yield _parsed(opcode, data[at : at + length])
 
