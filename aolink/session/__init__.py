@@ -229,8 +229,7 @@ def record(
 @contextlib.contextmanager
 def _spared_collections() -> Iterator[None]:
     """Leave all objects that exist by now out of Python's garbage collections until the session's end: to go through
-    them stops every thread for longer than a block of commands lasts."""
-    gc.collect()
+    them stops every thread for longer than a block of commands lasts. For the same reason none is made before."""
     gc.freeze()
     try:
         yield
