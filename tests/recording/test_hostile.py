@@ -25,6 +25,7 @@ from aolink.recording import schemas_pb2 as pb
 from aolink.recording import topics
 from aolink.recording.mcap_file import McapFile, WriteOptions, schema_of
 from aolink.recording.reader import Recording
+from aolink.recording.sound import what_is_wrong
 from aolink.recording.writer import begin_recording
 from aolink.rig import load_rig, parse_rig
 from aolink.simulation.scene import SceneCamera
@@ -239,3 +240,13 @@ def test_no_flip_is_silent_to_a_check(recorded: Session, tmp_path: Path) -> None
         path.write_bytes(changed)
         with contextlib.suppress(RecordingError):
             assert not Recording(path, check=True).complete, f"byte {at}"
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e300, -1e300])
+@pytest.mark.parametrize("count", [100, 20_000])
+def test_an_impossible_input_is_found_among_few_and_among_many(count: int, value: float) -> None:
+    rig, u = load_rig("section-vi"), np.zeros(count)
+    run = wire.Applied(n_steps=count, u=u)
+    assert what_is_wrong(run, rig) == ""
+    run.u[count // 2] = value
+    assert "no number, or beyond all" in what_is_wrong(run, rig)
