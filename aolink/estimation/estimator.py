@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from aolink.estimation.alignment import Shifted, considered, matters, share_of_shift
 from aolink.estimation.batch import Batch
-from aolink.estimation.estimate import Estimate, Status, in_single_precision
+from aolink.estimation.estimate import Estimate, Status, as_recorded
 from aolink.estimation.frames.measure import Measured, Measurements
 from aolink.estimation.kalman.filter import Filter, Posterior, Run
 from aolink.exposure import Exposure
@@ -135,7 +135,7 @@ class Estimator:
         self.posterior = posterior
         reasons = [*([remark] if remark else []), *reasons, *_status_reasons(posterior)]
         coefficients, n = posterior.coefficients.mean, self.rig.plant.n_states
-        covariance = in_single_precision(posterior.coefficients.covariance)
+        covariance = as_recorded(posterior.coefficients.covariance)
         return Estimate(
             estimator=self.name,
             frame_id=exposure.frame_id,
@@ -146,7 +146,7 @@ class Estimator:
             start_state=posterior.start.mean,
             start_covariance=covariance[:, :n, :n],
             end_state=posterior.end.mean,
-            end_covariance=in_single_precision(posterior.end.covariance),
+            end_covariance=as_recorded(posterior.end.covariance),
             coefficients=coefficients,
             coefficient_covariance=covariance,
             inputs=exposure.inputs,

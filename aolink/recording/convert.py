@@ -16,9 +16,10 @@ from numpy.typing import NDArray
 from aolink.assembly import Frame
 from aolink.errors import RecordingError
 from aolink.estimation import ExposureModel
-from aolink.estimation.estimate import LARGE, AlignmentError, Estimate, Status, in_single_precision
+from aolink.estimation.estimate import LARGE, AlignmentError, Estimate, Status
 from aolink.exposure import Exposure, Truth
 from aolink.limits import limits
+from aolink.numerics.covariance import CORRELATION_STEP, correlation_steps, from_correlation_steps
 from aolink.recording import schemas_pb2 as pb
 from aolink.wire import messages_pb2 as wire
 
@@ -152,8 +153,8 @@ def estimate_message(estimate: Estimate) -> pb.Estimate:
     )
     for name in ("end_covariance", "coefficient_covariance"):
         covariance = getattr(estimate, name)
-        if covariance.shape[-1] > LARGE and np.array_equal(covariance, in_single_precision(covariance)):
-            setattr(message, f"packed_{name}", packed(covariance))
+        if covariance.shape[-1] > LARGE and (data := correlated(covariance)):
+            setattr(message, f"correlated_{name}", data)
         else:
             _fill(message, name, covariance)
     if estimate.alignment is not None:
@@ -163,46 +164,81 @@ def estimate_message(estimate: Estimate) -> pb.Estimate:
     return message
 
 
-def packed(covariance: NDArray[np.float64]) -> bytes:
-    """Symmetric matrices (axes, n, n) of numbers in single precision, as schemas.proto says."""
-    numbers = np.ascontiguousarray(covariance[:, _lower(covariance.shape[-1])], dtype="<f4")
-    planes = np.ascontiguousarray(numbers.view(np.uint8).reshape(-1, 4).T)
-    # Bytes of exponents and of mantissas are coded separately, because they are distributed differently.
-    frame = zstandard.ZstdCompressor(level=1).compressobj(size=planes.nbytes)
-    blocks = (frame.compress(each.tobytes()) + frame.flush(zstandard.COMPRESSOBJ_FLUSH_BLOCK) for each in planes)
+def correlated(covariance: NDArray[np.float64]) -> bytes:
+    """Matrices (axes, n, n) that were rounded by `as_recorded`, as schemas.proto says; empty where they were not."""
+    sd = np.sqrt(np.einsum("aii->ai", covariance)).astype(np.float32).astype(np.float64)
+    steps = correlation_steps(covariance, sd)
+    if not np.array_equal(from_correlation_steps(sd, steps), covariance):
+        return b""
+    signed = np.take(steps.reshape(len(steps), -1), _below_diagonal(steps.shape[-1]), axis=1).astype("<i4")
+    numbers = np.ascontiguousarray((signed << 1) ^ (signed >> 31))
+    planes = np.ascontiguousarray(numbers.view(np.uint8).reshape(-1, 4).T[:3])
+    parts = [sd.astype("<f4").tobytes(), *(each.tobytes() for each in planes)]
+    # Low and high bytes are coded separately, because they are distributed differently.
+    frame = zstandard.ZstdCompressor(level=1).compressobj(size=sum(map(len, parts)))
+    blocks = (frame.compress(each) + frame.flush(zstandard.COMPRESSOBJ_FLUSH_BLOCK) for each in parts)
     return b"".join(blocks) + frame.flush()
 
 
-def is_packed(data: bytes, axes: int, n: int) -> bool:
-    """Whether bytes declare such a matrix of this size, and memory has room for it."""
+def is_compressed(data: bytes, axes: int, n: int, *, correlations: bool) -> bool:
+    """Whether bytes declare such matrices of this size, and memory has room for them.
+
+    Parameters
+    ----------
+    correlations:
+        Whether they are those of `correlated`; otherwise an older version's, which are in single precision.
+    """
     try:
         size = zstandard.get_frame_parameters(data).content_size
     except zstandard.ZstdError:
         return False
-    return 8 * axes * n * n <= limits().chunk_bytes and size == 2 * axes * n * (n + 1)
+    expected = axes * (4 * n + 3 * (n * (n - 1) // 2)) if correlations else 2 * axes * n * (n + 1)
+    return 8 * axes * n * n <= limits().chunk_bytes and size == expected
 
 
-def _unpacked(data: bytes, axes: int, n: int) -> NDArray[np.float64]:
-    """Inverse of `packed`."""
+def _decompressed(data: bytes, axes: int, n: int, *, correlations: bool) -> NDArray[np.uint8]:
     try:
-        planes = np.frombuffer(zstandard.decompress(data) if is_packed(data, axes, n) else b"", np.uint8)
-        numbers = np.ascontiguousarray(planes.reshape(4, -1).T).view("<f4").reshape(axes, -1)
-        lower = np.zeros((axes, n, n))
-        lower[:, _lower(n)] = numbers
-    except (zstandard.ZstdError, ValueError):
-        raise RecordingError("an estimate in the file has the wrong size: the file is damaged") from None
-    return np.where(_lower(n), lower, lower.swapaxes(-1, -2))
+        if is_compressed(data, axes, n, correlations=correlations):
+            return np.frombuffer(zstandard.decompress(data), np.uint8)
+    except zstandard.ZstdError:
+        pass
+    raise RecordingError("an estimate in the file has the wrong size: the file is damaged") from None
+
+
+def decoded(data: bytes, axes: int, n: int) -> NDArray[np.float64]:
+    """Inverse of `correlated`."""
+    content = _decompressed(data, axes, n, correlations=True)
+    sd = np.frombuffer(content[: 4 * axes * n], "<f4").astype(np.float64).reshape(axes, n)
+    planes = np.zeros((axes * (n * (n - 1) // 2), 4), np.uint8)
+    planes[:, :3] = content[4 * axes * n :].reshape(3, -1).T
+    numbers = planes.view("<i4").reshape(axes, -1)
+    steps = np.zeros((axes, n, n))
+    np.einsum("aii->ai", steps)[...] = 0.5 / CORRELATION_STEP
+    steps.reshape(axes, -1)[:, _below_diagonal(n)] = (numbers >> 1) ^ -(numbers & 1)
+    return from_correlation_steps(sd, steps + steps.swapaxes(-1, -2))
+
+
+def decoded_older(data: bytes, axes: int, n: int) -> NDArray[np.float64]:
+    """Matrices in single precision, as older versions recorded them."""
+    planes = _decompressed(data, axes, n, correlations=False)
+    numbers = np.ascontiguousarray(planes.reshape(4, -1).T).view("<f4").reshape(axes, -1)
+    lower, triangle = np.zeros((axes, n, n)), np.tri(n, dtype=bool)
+    lower[:, triangle] = numbers
+    return np.where(triangle, lower, lower.swapaxes(-1, -2))
 
 
 @lru_cache(maxsize=8)
-def _lower(n: int) -> NDArray[np.bool_]:
-    """The indices of the lower triangle of a matrix."""
-    return np.tri(n, dtype=bool)
+def _below_diagonal(n: int) -> NDArray[np.int64]:
+    """The indices of the lower triangle without the diagonal, in a matrix that is read row by row."""
+    return np.flatnonzero(np.tri(n, k=-1, dtype=bool))
 
 
 def _covariance(message: pb.Estimate, name: str, axes: int, n: int) -> NDArray[np.float64]:
-    data: bytes = getattr(message, f"packed_{name}")
-    return _unpacked(data, axes, n) if data else _array(getattr(message, name), axes, n, n)
+    correlations: bytes = getattr(message, f"correlated_{name}")
+    older: bytes = getattr(message, f"packed_{name}")
+    if correlations:
+        return decoded(correlations, axes, n)
+    return decoded_older(older, axes, n) if older else _array(getattr(message, name), axes, n, n)
 
 
 def _fill(message: Message, field: str, values: NDArray[np.float64]) -> None:

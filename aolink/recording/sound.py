@@ -11,7 +11,7 @@ from google.protobuf.message import Message
 
 from aolink.estimation.estimate import Status
 from aolink.recording import schemas_pb2 as pb
-from aolink.recording.convert import is_packed
+from aolink.recording.convert import is_compressed
 from aolink.rig import Rig
 from aolink.wire import messages_pb2 as wire
 from aolink.wire.runs_pb2 import Run
@@ -74,14 +74,7 @@ def _of_estimate(message: pb.Estimate, rig: Rig) -> str:
         (message.end_state, (axes * n,)), (message.coefficients, (axes * c,)), (message.innovation, (axes * m,)),
         (spread, (axes * m, axes * m * m)), (message.nis, (axes,)),
     )  # fmt: skip
-    covariances = (
-        (message.end_covariance, message.packed_end_covariance, n),
-        (message.coefficient_covariance, message.packed_coefficient_covariance, c),
-    )
-    whole = (
-        is_packed(packed, axes, size) if packed else len(numbers) == axes * size**2
-        for numbers, packed, size in covariances
-    )
+    whole = (_is_whole(message, name, size) for name, size in (("end_covariance", n), ("coefficient_covariance", c)))
     if (axes, n) != (rig.plant.axes, rig.plant.n_states) or c < n:
         return "the states are not the rig's"
     if not (all(len(values) in expected for values, expected in lengths) and all(whole)):
@@ -91,6 +84,13 @@ def _of_estimate(message: pb.Estimate, rig: Rig) -> str:
     if int(message.status) not in {int(each) for each in Status}:
         return "its status is none that this aolink knows"
     return "" if 0 < message.n_steps <= rig.timing.exposure_steps else "n_steps is beyond the end of an exposure"
+
+
+def _is_whole(message: pb.Estimate, name: str, n: int) -> bool:
+    for kind, correlations in (("correlated", True), ("packed", False)):
+        if data := getattr(message, f"{kind}_{name}"):
+            return is_compressed(data, message.axes, n, correlations=correlations)
+    return len(getattr(message, name)) == message.axes * n * n
 
 
 def _of_truth(message: wire.Truth, rig: Rig) -> str:

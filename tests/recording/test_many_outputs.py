@@ -11,10 +11,10 @@ import pytest
 import zstandard
 
 from aolink.estimation import run
-from aolink.estimation.estimate import in_single_precision, motion
+from aolink.estimation.estimate import as_recorded, motion
 from aolink.estimation.model.factored import FactoredModel
 from aolink.jobs.demo import simulated_rig
-from aolink.numerics.covariance import psd_root
+from aolink.numerics.covariance import from_correlation_steps, in_correlation_steps, psd_root
 from aolink.recording import convert
 from aolink.recording.reader import Recording
 from aolink.recording.reestimate import first_difference, reestimate
@@ -84,7 +84,7 @@ def test_a_plant_of_hundreds_of_states_is_recorded_as_patterns_and_courses(tmp_p
         )
         assert estimate.end_covariance.shape == (1, 288, 288)
         message = convert.estimate_message(estimate)
-        assert message.ByteSize() < {"o3": 0.31e6, "profile": 0.5e6}[name]  # of 1.3 and 4.5 MB as doubles
+        assert message.ByteSize() < {"o3": 0.2e6, "profile": 0.3e6}[name]  # of 1.3 and 4.5 MB as doubles
         assert not len(message.end_covariance) + len(message.coefficient_covariance)
     mix = np.eye(2, 200)
     mixed, root = motion(estimate, mix, psd_root(estimate.coefficient_covariance))
@@ -113,33 +113,66 @@ def large_covariances(count: int) -> np.ndarray[Any, np.dtype[np.float64]]:
     return root @ root.swapaxes(-1, -2)
 
 
-def test_large_covariances_are_symmetric_and_in_single_precision_and_others_as_they_are() -> None:
-    given = large_covariances(300)
-    rounded = in_single_precision(given)
-    np.testing.assert_allclose(rounded, given, rtol=6e-8)
-    np.testing.assert_array_equal(rounded, rounded.swapaxes(-1, -2))
-    np.testing.assert_array_equal(in_single_precision(rounded), rounded)
+def test_large_covariances_are_rounded_and_stay_positive_semidefinite_and_others_are_as_they_are() -> None:
+    singular = np.random.default_rng(2).standard_normal((2, 400, 3)) * np.geomspace(1e-9, 1e9, 400)[:, None]
+    for given in (large_covariances(300), singular @ singular.swapaxes(-1, -2)):
+        rounded = as_recorded(given)
+        sd, before = (np.sqrt(np.einsum("aii->ai", each)) for each in (rounded, given))
+        assert (sd >= before).all()
+        np.testing.assert_allclose(sd, before, rtol=1.05e-4)
+        scale, old_scale = (each[:, :, None] * each[:, None, :] for each in (sd, before))
+        np.testing.assert_allclose(rounded / scale, given / old_scale, atol=2.5e-4)
+        np.testing.assert_array_equal(rounded, rounded.swapaxes(-1, -2))
+        assert np.linalg.eigvalsh(rounded / scale).min() > -1e-13
     few = large_covariances(256)
-    assert in_single_precision(few) is few
+    assert as_recorded(few) is few
+
+
+def test_a_state_without_uncertainty_stays_certain() -> None:
+    given = large_covariances(300)
+    given[:, 7] = given[:, :, 7] = 0.0
+    rounded = as_recorded(given)
+    assert not rounded[:, 7].any() and not rounded[:, :, 7].any()
+    assert np.isfinite(rounded).all()
+    np.testing.assert_array_equal(convert.decoded(convert.correlated(rounded), 2, 300), rounded)
 
 
 @pytest.mark.parametrize("count", [1, 2, 300])
-def test_packed_matrices_are_read_as_the_proto_file_says(count: int) -> None:
-    given = in_single_precision(large_covariances(count).astype(np.float32).astype(np.float64))
-    given = np.where(np.tri(count, dtype=bool), given, given.swapaxes(-1, -2))
-    planes = np.frombuffer(zstandard.decompress(convert.packed(given)), np.uint8).reshape(4, -1)
-    numbers = np.ascontiguousarray(planes.T).view("<f4")
-    rows, columns = np.tril_indices(count)
-    np.testing.assert_array_equal(numbers.reshape(2, -1), given[:, rows, columns])
+def test_correlations_are_recorded_as_the_proto_file_says(count: int) -> None:
+    given = from_correlation_steps(*in_correlation_steps(large_covariances(count)))
+    data = convert.correlated(given)
+    content = zstandard.decompress(data)
+    sd = np.frombuffer(content[: 8 * count], "<f4").reshape(2, count).astype(float)
+    planes = np.frombuffer(content[8 * count :], np.uint8).reshape(3, -1).astype(int)
+    stored = planes[0] + 256 * planes[1] + 65536 * planes[2]
+    r = np.where(stored % 2, -(stored + 1) // 2, stored // 2).reshape(2, -1) / 2**20
+    rows, columns = np.tril_indices(count, -1)
+    np.testing.assert_array_equal(r * sd[:, rows] * sd[:, columns], given[:, rows, columns])
+    np.testing.assert_array_equal(sd**2, np.einsum("aii->ai", given))
+    np.testing.assert_array_equal(convert.decoded(data, 2, count), given)
 
 
-def test_what_is_packed_is_damage_where_it_is_not_what_it_says() -> None:
+def test_covariances_that_were_not_rounded_are_recorded_as_doubles() -> None:
+    assert convert.correlated(large_covariances(300)) == b""
+
+
+def test_covariances_of_older_recordings_are_read() -> None:
+    """In single precision: lower triangles, first the lowest bytes of all numbers, then the second ones, and so on."""
+    given = large_covariances(300).astype(np.float32)
+    rows, columns = np.tril_indices(300)
+    data = zstandard.compress(given[:, rows, columns].ravel().view(np.uint8).reshape(-1, 4).T.tobytes())
+    np.testing.assert_array_equal(convert.decoded_older(data, 2, 300), given)
+
+
+def test_compressed_covariances_are_damage_where_they_are_not_what_they_say() -> None:
     """Also what would not fit into memory: a frame of nothing but zeros is small."""
-    data = convert.packed(in_single_precision(large_covariances(300)))
-    zeros = zstandard.ZstdCompressor().compress(bytes(2 * 8000 * 8001))
-    assert convert.is_packed(data, 2, 300)
+    data = convert.correlated(as_recorded(large_covariances(300)))
+    zeros = zstandard.compress(bytes(4 * 8000 + 3 * 8000 * 7999 // 2))
+    older = zstandard.compress(bytes(2 * 8000 * 8001))
+    assert convert.is_compressed(data, 2, 300, correlations=True)
     wrong = [(data, 2, 299), (data, 1, 300), (b"", 2, 300), (data[4:], 2, 300), (zeros, 1, 8000)]
-    assert not any(convert.is_packed(*each) for each in wrong)
+    assert not any(convert.is_compressed(*each, correlations=True) for each in wrong)
+    assert not any(convert.is_compressed(*each, correlations=False) for each in ((data, 2, 300), (older, 1, 8000)))
 
 
 def test_a_truth_of_very_many_outputs_is_in_single_precision() -> None:
