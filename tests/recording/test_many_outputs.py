@@ -132,7 +132,8 @@ def test_a_state_without_uncertainty_stays_certain() -> None:
     given = large_covariances(300)
     given[:, 7] = given[:, :, 7] = 0.0
     rounded = as_recorded(given)
-    assert not rounded[:, 7].any() and not rounded[:, :, 7].any()
+    assert not rounded[:, 7].any()
+    assert not rounded[:, :, 7].any()
     assert np.isfinite(rounded).all()
     np.testing.assert_array_equal(convert.decoded(convert.correlated(rounded), 2, 300), rounded)
 
