@@ -56,7 +56,12 @@ def read(path: str | Path, side: Sequence[str | Path] = ()) -> Recording:
     path:
         A file, or a URL that fsspec knows (``pip install 'aolink[remote]'``).
     side:
-        Side files of the recording, whose estimates replace its own.
+        Side files of the recording, whose estimates replace its own by the same names.
+
+    Returns
+    -------
+    A `Recording`, which is an `aolink.series.Series` of exposures; `aolink.exposure.Exposure` states the shape and unit
+    of each field.
 
     Raises
     ------
@@ -80,6 +85,10 @@ def simulate(rig: Rig | str | Path, n_exposures: int, seed: int | None = None) -
     seed:
         Seed of all random numbers; that of the rig file where None.
 
+    Returns
+    -------
+    A sequence of `aolink.exposure.Exposure`, each with its ``truth``, and with ``rig``, the rig that they are from.
+
     Raises
     ------
     RigError
@@ -102,13 +111,19 @@ def exposures(
     Parameters
     ----------
     frames:
-        Counts of the rig's camera, (exposures, rows, columns).
+        Counts of the rig's camera, (exposures, rows, columns): whole numbers of any type, from 0 to full scale.
     rig:
         A rig, a rig file, or the name of one that comes with aolink.
     inputs:
-        Inputs that the mirror held in each fast step from step 0 on, (steps, n_inputs); None: its parked input.
+        Inputs that the mirror held in each fast step from step 0 on, in the mirror's units, (steps, n_inputs), up to
+        the end of the last exposure at least; None: its parked input.
     start_steps:
-        Fast step at which each exposure starts; None: each begins a frame period after the one before.
+        Fast step at which each exposure starts, (exposures,), in order and without overlap; None: the first starts at
+        step 0, each other one a frame period after the one before.
+
+    Returns
+    -------
+    A sequence of `aolink.exposure.Exposure` without truth, whose ``frame_id`` counts from 1.
 
     Raises
     ------
@@ -129,14 +144,22 @@ def estimate(exposures: Exposures | Series | str | Path, estimator: str) -> list
     Parameters
     ----------
     exposures:
-        The result of `simulate`, or a recording, a slice of one, or its path.
+        The result of `simulate` or `exposures`, or a recording, a slice of one, or its path.
     estimator:
-        One of `aolink.estimation.ESTIMATOR_NAMES`.
+        One of `aolink.estimation.ESTIMATOR_NAMES`, which options may follow: ``"moments:orders=012"``.
+
+    Returns
+    -------
+    One estimate for each exposure. Paths are in slope units and states in the plant's units; `aolink.estimation.Estimate`
+    states the shape of each field. An exposure that cannot be used has a prediction, whose ``status`` and ``reason`` say
+    so.
 
     Raises
     ------
     EstimatorError
-        There is no such estimator, or it cannot work on this rig.
+        There is no such estimator or option, or it cannot work on this rig.
+    RecordingError
+        ``exposures`` is a path, and no recording can be read from it.
     """
     from aolink.estimation import Driver
     from aolink.exposure import Exposures
@@ -164,10 +187,16 @@ def smooth(
     lag:
         Number of later exposures that correct each; None: all of them.
 
+    Returns
+    -------
+    One estimate for each given one, with other states, paths and covariances; status, innovation and NIS are kept.
+
     Raises
     ------
     EstimatorError
         The estimates are not those of the exposures, or the lag is negative.
+    RecordingError
+        ``exposures`` is a path, and no recording can be read from it.
     """
     from aolink.estimation import smooth as smooth_estimates
     from aolink.exposure import Exposures
