@@ -150,9 +150,9 @@ def estimate(exposures: Exposures | Series | str | Path, estimator: str) -> list
 
     Returns
     -------
-    One estimate for each exposure. Paths are in slope units and states in the plant's units; `aolink.estimation.Estimate`
-    states the shape of each field. An exposure that cannot be used has a prediction, whose ``status`` and ``reason`` say
-    so.
+    One estimate for each exposure. Paths are in slope units and states in the plant's units;
+    `aolink.estimation.Estimate` states the shape of each field. An exposure that cannot be used has a prediction, whose
+    ``status`` and ``reason`` say so.
 
     Raises
     ------
