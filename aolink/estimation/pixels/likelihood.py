@@ -11,6 +11,10 @@ Pixels see the mean of a path best. Noise that is left out and moves it is taken
 state, which it moves too, seems less certain than it is. So where the first singular vectors leave too much of that
 out for a spot on a plane, the directions that move the mean of the path come before them.
 
+A direction that moves the path far may hardly change the frame, as a vibration with many swings in an exposure does,
+and one that moves it less may change the frame much. So where twelve coefficients leave much of the noise visible, the
+directions that change the pixels most come first.
+
 The mean over the fast steps is taken by quadrature with few nodes (`aolink.estimation.model.quadrature`).
 """
 
@@ -52,8 +56,12 @@ _MOST_SEEN = 12
 # without them, and a mixture that is sure of a wrong mode is longer in finding the right one with them.
 _MEAN_LEFT_OUT = 0.25
 _ONE_SPOT = 2
-# Random paths from which the number of nodes is found.
-_PATHS = 64
+# Variance that the noise left out may add to the pixels together, in variances of a pixel's noise, where there are as
+# many coefficients as that. Where it adds more, directions are chosen by how much they change the pixels, until what is
+# left out adds no more than the second number.
+_MOST_VISIBLE, _HARDLY_VISIBLE = 4.0, 0.2
+# Random paths from which the number of nodes is found, and those from which it is found what changes the pixels.
+_PATHS, _FEW_PATHS = 64, 16
 # The table of a pixel's light over the spot's position: points in one standard deviation of the kernel, and its end.
 _POINTS = 16
 _REACH = 5.0
@@ -100,7 +108,7 @@ def reduction(model: ExposureModel, sensor: BaseSensor, *, left_out: float = _LE
     """
     n = model.plant.n_states
     variance = float(np.linalg.eigvalsh(sensor.kernel.covariance)[0])
-    V, rest = _kept(model, left_out * math.sqrt(variance), _resting_sd(sensor, variance))
+    V, rest = _kept(model, sensor, left_out * math.sqrt(variance), _resting_sd(sensor, variance))
     size, kept = V.shape
     expand = np.zeros((n + size, n + kept))
     expand[:n, :n], expand[n:, n:] = np.eye(n), V
@@ -117,7 +125,7 @@ def reduction(model: ExposureModel, sensor: BaseSensor, *, left_out: float = _LE
     )  # fmt: skip
 
 
-def _kept(model: ExposureModel, coarse: float, resting_sd: float) -> tuple[FloatArray, float]:
+def _kept(model: ExposureModel, sensor: BaseSensor, coarse: float, resting_sd: float) -> tuple[FloatArray, float]:
     """The directions of the noise that are kept, (noise coefficients, kept), and the variance of the remaining path.
 
     The remaining path's rms is at most ``coarse``.
@@ -144,7 +152,37 @@ def _kept(model: ExposureModel, coarse: float, resting_sd: float) -> tuple[Float
     if outputs == _ONE_SPOT and np.linalg.norm(means - means @ V @ V.T, 2) > least:
         _, values, vectors = np.linalg.svd(means, full_matrices=False)
         V, rest = after(vectors[values > least].T)
+    if outputs <= _ONE_SPOT and rest > (_SEEN * resting_sd) ** 2:
+        S = _visibility(model, sensor, noise)
+        if np.trace(S) - np.trace(V.T @ S @ V) > _MOST_VISIBLE:
+            values, vectors = np.linalg.eigh(S)
+            vectors = vectors[:, ::-1]
+            visible = np.append(np.cumsum(values)[::-1], 0.0)
+            left = np.append(np.cumsum(((paths @ vectors) ** 2).sum(axis=0)[::-1])[::-1], 0.0) / outputs
+            count = min(int(np.argmax(visible <= _HARDLY_VISIBLE)), _MOST_SEEN - model.plant.n_states)
+            count = max(count, int(np.argmax(left <= coarse**2)))
+            V, rest = vectors[:, :count], float(left[count])
     return V, rest
+
+
+def _visibility(model: ExposureModel, sensor: BaseSensor, noise: FloatArray) -> FloatArray:
+    """How much the noise changes the pixels: V' S V is the information that they have on its directions V, if all else
+    is known. S is the mean over some of the plant's paths, (noise coefficients, noise coefficients).
+
+    A spot's window on a plane counts by its sums over rows and over columns.
+    """
+    line = sensor.profile
+    every = _paths(model, np.eye(model.basis.shape[-1]), _FEW_PATHS).reshape(_FEW_PATHS, len(noise), -1)
+    S = np.zeros((noise.shape[-1],) * 2)
+    for output, changed in enumerate(noise):
+        variance = float(sensor.kernel.covariance[output, output])
+        for path in every[:, output]:
+            light, slope = (each[0] / line.pixel_size for each in pixel_masses(variance, line.edges, path[None], 1))
+            variances = effective_noise_density(line) / line.pixel_size
+            variances = variances + shot_gain(line) * np.maximum(light.mean(axis=0), 0.0)
+            change = slope.T @ changed / (len(path) * np.sqrt(variances)[:, None])
+            S += change.T @ change / _FEW_PATHS
+    return S
 
 
 def _resting_sd(sensor: BaseSensor, variance: float) -> float:
@@ -159,9 +197,9 @@ def _resting_sd(sensor: BaseSensor, variance: float) -> float:
     return float((slope**2 / noise).sum(axis=1).mean() ** -0.5)
 
 
-def _paths(model: ExposureModel, expand: FloatArray) -> FloatArray:
-    """Random paths of the outputs by the plant's prior, (paths, n_steps)."""
-    t = np.random.default_rng(0).standard_normal((_PATHS, expand.shape[1]))
+def _paths(model: ExposureModel, expand: FloatArray, count: int = _PATHS) -> FloatArray:
+    """Random paths of the outputs by the plant's prior, (count * n_outputs, n_steps)."""
+    t = np.random.default_rng(0).standard_normal((count, expand.shape[1]))
     n = model.plant.n_states
     t[:, :n] = t[:, :n] @ psd_root(model.plant.initial_covariance).T
     return np.asarray(np.tensordot(t, model.basis @ expand, axes=(1, 2))).reshape(-1, model.n_steps)

@@ -223,3 +223,49 @@ def test_both_ends_of_an_exposure_are_as_sure_as_they_are_right_where_a_slow_pro
                 found.append(away @ np.linalg.solve(P[0], away) / 4)
     assert 0.85 < np.mean(start) < 1.15
     assert 0.85 < np.mean(end) < 1.15
+
+
+def fast_and_bright():
+    """A vibration of five swings in an exposure, seen much better than it moves the centroid."""
+    kernel, steps, swings, damping = np.sqrt(LINE.sensor.kernel.variance), 100, 4.9, 0.009
+    rate = 2 * np.pi * swings / steps
+    A = linalg.expm(np.array([[0, 1], [-(rate**2), -2 * damping * rate]]))
+    P = linalg.solve_discrete_lyapunov(A, np.diag([0.0, 1.0]))
+    gain = 0.35 * kernel / np.sqrt(P[0, 0])
+    plant = dataclasses.replace(
+        LINE.plant, A=A, B=np.zeros((2, LINE.plant.n_inputs)), B_w=gain * np.array([[0.0], [1.0]]), C=np.eye(2)[:1],
+        process_noise=np.eye(1), initial_mean=np.zeros(2), initial_covariance=gain**2 * P,
+    )  # fmt: skip
+    line = LINE.sensor.profile
+    peak = line.pixel_size / (np.sqrt(2 * np.pi) * kernel)
+    sensor = dataclasses.replace(LINE.sensor, noise_density=(peak / 400) ** 2 / line.pixel_size)
+    timing = dataclasses.replace(LINE.timing, exposure_steps=steps, frame_period_steps=steps)
+    return dataclasses.replace(LINE, plant=plant, sensor=sensor, timing=timing)
+
+
+def test_noise_that_is_left_out_hardly_changes_the_pixels():
+    """By finite differences along each noise coefficient, about a path of the plant."""
+    rig = fast_and_bright()
+    model = exposure_model(rig.plant, 100)
+    reduced = likelihood.reduction(model, rig.sensor)
+    line, step = rig.sensor.profile, 1e-5
+    path = truth_of(simulate(rig, 1, seed=3)[0]).path[0]
+
+    def pixels(along):
+        return exposure_density(line.kernel, line.edges, (path + along)[None])[0]
+
+    noise = model.basis[0, :, 2:].T
+    change = np.array([(pixels(step * each) - pixels(-step * each)) / (2 * step) for each in noise])
+    seen = change.T @ reduced.left_out[2:, 2:] @ change / (line.noise_density / line.pixel_size)
+    assert np.trace(seen) < 0.5
+
+
+def test_a_bright_spot_that_vibrates_fast_is_known_as_well_as_the_estimate_says():
+    rig = fast_and_bright()
+    nees = []
+    for seed in range(12):
+        exposures = simulate(rig, 12, seed=seed)
+        for exposure, estimate in list(zip(exposures, run(rig, exposures, ["profile"])["profile"], strict=True))[4:]:
+            away = (estimate.end_state - truth_of(exposure).end_state)[0]
+            nees.append(away @ np.linalg.solve(estimate.end_covariance[0], away) / 2)
+    assert 0.7 < np.mean(nees) < 1.4
