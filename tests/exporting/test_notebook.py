@@ -48,6 +48,14 @@ def test_a_table_of_some_exposures_and_one_estimator(lively: NotebookRecording) 
     assert table["o3_nis"].tolist() == [each.nis[0] for each in lively[5:8].estimates("o3")]
 
 
+def test_a_slice_of_a_slice_has_tables_and_an_exposure_by_its_number(lively: NotebookRecording) -> None:
+    part = lively[2:12][1:5]
+    assert part.to_pandas(["o3"])["frame_id"].tolist() == [each.frame_id for each in lively[3:7]]
+    assert part.to_xarray(["o3"]).sizes["time"] == 4
+    assert part[-1].frame_id == lively[6].frame_id
+    assert repr(part).startswith("<Recording section-vi-lively.mcap[3:7]: 4 exposures")
+
+
 def test_a_dataset_is_taken_apart_by_time_and_estimator(lively: NotebookRecording) -> None:
     dataset = lively.to_xarray()
     estimate = lively.estimates("moments")[3]
