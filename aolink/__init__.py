@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from aolink.estimation import Estimate
     from aolink.exposure import Exposures
-    from aolink.recording.reader import Recording
+    from aolink.notebook import NotebookRecording
     from aolink.rig import Rig, load_rig
     from aolink.series import Series
 
@@ -45,7 +45,7 @@ if not TYPE_CHECKING:  # the type checker would accept any name
         raise AttributeError(f"module 'aolink' has no attribute {name!r}")
 
 
-def read(path: str | Path, side: Sequence[str | Path] = ()) -> Recording:
+def read(path: str | Path, side: Sequence[str | Path] = ()) -> NotebookRecording:
     """Open a recording: a series of exposures, read when they are used.
 
     ``len(recording)``, ``recording[7]``, ``recording[-10:]`` and a loop give exposures; ``to_pandas()``,
@@ -68,9 +68,9 @@ def read(path: str | Path, side: Sequence[str | Path] = ()) -> Recording:
     RecordingError
         The file cannot be read, or is not a recording of aolink; or a side file is not of this recording.
     """
-    from aolink.recording.reader import Recording
+    from aolink.notebook import NotebookRecording
 
-    return Recording(path, side=side)
+    return NotebookRecording(path, side=side)
 
 
 def simulate(rig: Rig | str | Path, n_exposures: int, seed: int | None = None) -> Exposures:

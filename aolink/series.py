@@ -1,22 +1,17 @@
-"""The class `Series`: exposures of one rig and their estimates, with methods for notebooks."""
+"""The class `Series`: exposures of one rig and their estimates."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from html import escape
-from typing import TYPE_CHECKING, Any, overload
+from typing import Any, overload
 
 from aolink.errors import RecordingError
 from aolink.estimation.estimate import Estimate
 from aolink.exposure import Exposure
 from aolink.rig import Rig
 from aolink.units import duration
-
-if TYPE_CHECKING:
-    import pandas as pd
-    import xarray as xr
-    from matplotlib.axes import Axes
 
 
 class Series(ABC):
@@ -88,72 +83,6 @@ class Series(ABC):
                     f"{self.path} holds no estimates of {name} (it has: {known}): `aolink estimate` makes them"
                 )
         return self.estimators if estimators is None else list(dict.fromkeys(estimators))
-
-    def to_pandas(self, estimators: Sequence[str] | None = None) -> pd.DataFrame:
-        """A table with a row for each exposure and axis, indexed by time (UTC).
-
-        The columns are those of `aolink.exporting.table`, for all estimators or for those that are named.
-
-        Raises
-        ------
-        RecordingError
-            There are no estimates of such a name.
-        ExportError
-            There is no exposure, or pandas is missing.
-        """
-        from aolink.exporting.table import to_pandas
-
-        return to_pandas(self, estimators)
-
-    def to_xarray(self, estimators: Sequence[str] | None = None) -> xr.Dataset:
-        """The whole series as one dataset along ``time`` (UTC): frames, inputs, truth, and estimates along
-        ``estimator``.
-
-        The variables are those of `aolink.exporting.arrays`, all in memory: take a slice of a long recording.
-
-        Raises
-        ------
-        RecordingError
-            There are no estimates of such a name.
-        ExportError
-            There is no exposure, the exposures have different sizes, it would be too large, or xarray is missing.
-        """
-        from aolink.exporting.arrays import to_xarray
-
-        return to_xarray(self, estimators)
-
-    def plot(
-        self,
-        estimators: Sequence[str] | None = None,
-        *,
-        output: int = 0,
-        axes: tuple[Axes, Axes] | None = None,
-    ) -> tuple[Axes, Axes]:
-        """Draw with matplotlib the camera's blur of one output with the paths over it, and the NIS of the estimates.
-
-        Parameters
-        ----------
-        estimators:
-            Estimators whose paths and NIS are drawn; all by default.
-        output:
-            Number of the output (a row of a path).
-        axes:
-            The two axes to draw on; by default those of a new figure.
-
-        Returns
-        -------
-        The axes with the paths, and those with the NIS.
-
-        Raises
-        ------
-        RecordingError
-            There are no estimates of such a name.
-        ExportError
-            There is no exposure or no such output, or matplotlib is missing.
-        """
-        from aolink.plotting.series import plot_series
-
-        return plot_series(self, estimators, output, axes)
 
     def facts(self) -> dict[str, str]:
         """A summary of the series, in words."""

@@ -111,7 +111,7 @@ def report(
 def _with_sides(files: list[str]) -> "list[Recording]":
     """The recordings, each with its side files among the others. Raises RecordingError for a side file of none of these
     recordings."""
-    from aolink.recording.reader import check_stands_alone
+    from aolink.recording.side_files import check_stands_alone
 
     opened = [open_recording(each) for each in files]
     alone, sides = [e for e in opened if not e.side_of], [e for e in opened if e.side_of]

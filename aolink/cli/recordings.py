@@ -334,8 +334,8 @@ def compare(
     from aolink.cli.tables import recordings as tables
     from aolink.recording import topics
     from aolink.recording.compare import compare as compare_recordings
-    from aolink.recording.reader import check_is_side_of
     from aolink.recording.reestimate import write_reestimated
+    from aolink.recording.side_files import check_is_side_of
 
     one = open_recording(first)
     if accept and topic:

@@ -86,8 +86,6 @@ class ControlLoop:
     ----------
     controller:
         Its name, or its row.
-    first_step:
-        First fast step of the session. Until the first exposure is seen the mirror holds its safe input.
 
     Raises
     ------
@@ -95,7 +93,7 @@ class ControlLoop:
         As `find_controller`.
     """
 
-    def __init__(self, rig: Rig, controller: str | ControllerRow, first_step: int = 0) -> None:
+    def __init__(self, rig: Rig, controller: str | ControllerRow) -> None:
         row = find_controller(controller, rig) if isinstance(controller, str) else controller
         self.name, self.needs_state = row.name, row.needs_state
         self.delay_steps = delay_steps(rig)
@@ -108,7 +106,7 @@ class ControlLoop:
         mirror = rig.mirror
         self._low, self._high, self._park = mirror.input_min, mirror.input_max, mirror.park
         self._most_change = mirror.slew_max_per_s * rig.timing.fast_step_s or math.inf
-        self._oldest = first_step
+        self._oldest = 0
         """Fast step of the first row in the lists below; older rows are dropped."""
         self._sent: list[FloatArray] = []
         """The commanded inputs, step by step."""
@@ -118,7 +116,7 @@ class ControlLoop:
         """Whether limits or the slew limit have changed the wanted input."""
         self._before = (self._park, self._park)
         """The commanded and the held input of the step before the oldest row."""
-        self._last_end = first_step
+        self._last_end = 0
         """End of the newest exposure with a measurement; before there is one, the session's beginning."""
         self._seen_any = False
         self._blind = self._trusted = 0
@@ -133,7 +131,8 @@ class ControlLoop:
         return self._oldest + len(self._sent)
 
     def begin(self, first_step: int) -> None:
-        """Set the first fast step, before any other call."""
+        """Set the session's first fast step, before any other call; it is 0 otherwise. Until the first exposure is seen
+        the mirror holds its safe input."""
         self._oldest = self._last_end = first_step
 
     def inputs(self, first_step: int, n_steps: int) -> FloatArray:

@@ -230,7 +230,7 @@ def _check_size(series: Series, n_estimators: int) -> None:
 
 
 def to_xarray(series: Series, estimators: Sequence[str] | None = None, progress: Progress = no_progress) -> xr.Dataset:
-    """The result of `Series.to_xarray`. Raises as `arrays`, and ExportError where xarray is missing."""
+    """The arrays as a dataset of xarray. Raises as `arrays`, and ExportError where xarray is missing."""
     xarray = needed("xarray", "tables", "a dataset")
     found = arrays(series, estimators, progress)
     coordinates = ("time", "frame_id", "estimator")

@@ -149,7 +149,7 @@ def _of_path(path: FloatArray, axes: int, lists: bool) -> dict[str, ByAxis]:
 
 
 def to_pandas(series: Series, estimators: Sequence[str] | None = None) -> pd.DataFrame:
-    """The result of `Series.to_pandas`. Raises RecordingError and ExportError as that does."""
+    """The result of `aolink.notebook.NotebookSeries.to_pandas`. Raises RecordingError and ExportError as that does."""
     pandas = needed("pandas", "tables", "a data frame")
     names = series.named(estimators)
     known = columns(series, names)

@@ -24,7 +24,7 @@ def gaussian_below(
     Parameters
     ----------
     variance:
-        Variance of each spot, slope units squared, (...), or one for all.
+        Variance of each spot, slope units squared, (...) or of a shape that is broadcast to it.
     edges:
         Slope units, (edges,).
     positions:

@@ -5,10 +5,9 @@ from __future__ import annotations
 import hashlib
 import heapq
 import json
-from collections import deque
 from collections.abc import Iterator, Sequence
 from functools import cached_property, lru_cache
-from itertools import count, islice
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, overload
 
@@ -22,11 +21,13 @@ from aolink.estimation import Estimate, ExposureModel, exposure_model
 from aolink.exposure import Exposure
 from aolink.limits import load_array
 from aolink.recording import convert, schemas_pb2, topics
+from aolink.recording.estimate_pairs import EstimatePairs
 from aolink.recording.exposures import Companions, ExposureAssembly
 from aolink.recording.frame_index import FrameIndex, StepRun
 from aolink.recording.messages import END_OF_TIME, RawMessage, RecordedMessage, RecordedMessages, in_time
 from aolink.recording.remote import Url, only_paths
 from aolink.recording.scan import Loss, open_recording, read_summary
+from aolink.recording.side_files import check_is_side_of
 from aolink.recording.slices import RecordingSlice
 from aolink.recording.sound import what_is_wrong
 from aolink.rig import Rig, parse_rig
@@ -347,33 +348,11 @@ class Recording(RecordedMessages, Series):
         if stop is not None and stop <= start:
             return
         chunk, before = self._beginning(start)
-        numbers = count(before)
-        exposures: dict[int, Exposure] = {}
-        waiting: deque[schemas_pb2.Estimate] = deque()
-        ended, done = False, -1
-        """Whether all of the exposures have come, and the last one whose estimate has come."""
+        pairs = EstimatePairs(before, start, stop)
         for received, completed in self._beside_exposures(name, chunk):
-            if isinstance(received, schemas_pb2.Estimate):
-                waiting.append(received)
-            elif isinstance(received, schemas_pb2.Estimation) and received.skipped:
-                exposures.pop(received.frame_id, None)
-            for exposure, number in zip(completed, numbers, strict=False):
-                ended = stop is not None and number >= stop - 1
-                if start <= number and (stop is None or number < stop):
-                    exposures[exposure.frame_id] = exposure
-            # At the end of the recording, no further exposure will come; nor will one of the part before this.
-            first = next(iter(exposures), 0)
-            while waiting and (received is None or waiting[0].frame_id in exposures or waiting[0].frame_id < first):
-                message = waiting.popleft()
-                if message.frame_id not in exposures:
-                    continue
-                yield convert.estimate_from_message(message, self.model, exposures[message.frame_id])
-                # Estimates come in the order of their exposures: earlier exposures have had theirs.
-                for frame_id in list(exposures)[: list(exposures).index(message.frame_id)]:
-                    del exposures[frame_id]
-                done = message.frame_id
-            last = next(reversed(exposures), done)
-            if ended and (last == done or (waiting and waiting[0].frame_id > last)):
+            for message, exposure in pairs.take(received, completed):
+                yield convert.estimate_from_message(message, self.model, exposure)
+            if pairs.complete:
                 return
 
     def _beside_exposures(self, name: str, first_chunk: int) -> Iterator[tuple[Message | None, list[Exposure]]]:
@@ -419,31 +398,6 @@ class Recording(RecordedMessages, Series):
 def _parsed_rig(text: str) -> Rig:
     """The rig of a file. Thousands of recordings may have the same rig, whose exposure model is then made only once."""
     return parse_rig(text)
-
-
-def check_is_side_of(side: Recording, recording: Recording) -> None:
-    """Raise RecordingError where a file does not hold estimates of a recording and nothing else."""
-    if not side.side_of:
-        raise RecordingError(
-            f"{side.path} is a recording of its own and no side file of {recording.path}: `aolink estimate --side`"
-            " writes those"
-        )
-    if side.side_of != recording.digest:
-        name = side.metadata.get("estimated_from", "another recording")
-        raise RecordingError(
-            f"{side.path} does not belong to {recording.path}: its estimates are of another file, which was called"
-            f" {name}; give that one, or estimate again"
-        )
-
-
-def check_stands_alone(recording: Recording) -> None:
-    """Raise RecordingError for a side file, which shows nothing without its recording."""
-    if recording.side_of:
-        name = recording.metadata.get("estimated_from", "a recording")
-        raise RecordingError(
-            f"{recording.path} is a side file with the estimates of {name} alone: give {name}, and after it this file"
-            " where the command takes side files"
-        )
 
 
 def _restored(info: schemas_pb2.Restoration, pictures: dict[str, RawImage]) -> RestoredPictures:

@@ -18,7 +18,8 @@ from aolink.recording import schemas_pb2, topics
 from aolink.recording.editing import RecordingCopy, recorded_estimate
 from aolink.recording.exposures import ExposureAssembly
 from aolink.recording.messages import RawMessage
-from aolink.recording.reader import Recording, check_stands_alone
+from aolink.recording.reader import Recording
+from aolink.recording.side_files import check_stands_alone
 
 _AT_ONCE = 512
 """The most exposures that are estimated together."""

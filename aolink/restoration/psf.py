@@ -15,11 +15,11 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.special import erf
 
 from aolink.errors import RestorationError
 from aolink.numerics.arrays import FloatArray
 from aolink.numerics.covariance import psd_root
+from aolink.optics.kernel import pixel_masses
 from aolink.optics.sensor import Kernel
 
 # Light beyond this many standard deviations of the kernel is left out, as are taps below this share of the largest.
@@ -174,9 +174,9 @@ def motion_psf_by_root(
     # Covariance of the position of each step's light, (n_steps, axes, axes).
     spread = np.einsum("aim,bim->iab", error, error) + kernel.covariance[:axes, :axes] / pixel_scale**2
     together, points, weights = _correlated_part(spread)
-    width = np.sqrt(2 * (spread[:, range(axes), range(axes)].T - together**2))
+    variance = spread[:, range(axes), range(axes)].T - together**2
     places = (steps / pixel_scale)[:, :, None] + together[:, :, None] * points
-    mass, slope, origin = zip(*(_axis(p, w) for p, w in zip(places, width, strict=True)), strict=True)
+    mass, slope, origin = zip(*map(_pixels_of, places, variance), strict=True)
     if on_line:
         values = share @ mass[0][:, 0]
         modes = (error[0].T * share) @ slope[0][:, 0]
@@ -228,18 +228,15 @@ def _path_root(covariance: ArrayLike, size: int) -> FloatArray:
     return psd_root(matrix)
 
 
-def _axis(positions: FloatArray, width: FloatArray) -> tuple[FloatArray, FloatArray, int]:
+def _pixels_of(positions: FloatArray, variance: FloatArray) -> tuple[FloatArray, FloatArray, int]:
     """Masses in pixels and their derivatives by position, (n_steps, points, pixels), and the pixel of no displacement.
 
-    Positions (n_steps, points), widths (n_steps,). `aolink.optics.kernel.pixel_masses` has the same integrals, and
-    derivatives that differ in their last bits: these stand alone so that restored pictures stay as they are.
+    Positions (n_steps, points), variances (n_steps,).
     """
-    reach = _REACH * float(width.max()) / math.sqrt(2)
+    reach = _REACH * math.sqrt(float(variance.max()))
     low = min(0, math.floor(positions.min() - reach))
     high = max(0, math.ceil(positions.max() + reach))
-    u = (np.arange(low, high + 2) - 0.5 - positions[..., None]) / width[:, None, None]
-    mass = np.diff(erf(u) / 2, axis=2)
-    slope = -np.diff(np.exp(-u * u), axis=2) / (width[:, None, None] * math.sqrt(math.pi))
+    mass, slope = pixel_masses(variance[:, None], np.arange(low, high + 2) - 0.5, positions, 1)
     return mass, slope, -low
 
 

@@ -68,14 +68,14 @@ def show(recording: Recording, look: Look | None = None, *, progress: Callable[[
 
 
 def serve(
-    recording: Recording, look: Look | None = None, *, port: int | None = None,
-    on_ready: Callable[[str], None] | None = None, progress: Callable[[int], None] | None = None,
+    recording: Recording, look: Look | None = None, *, on_ready: Callable[[str], None] | None = None,
+    progress: Callable[[int], None] | None = None,
 ) -> None:  # fmt: skip
     """Serve a recording with the web viewer on this machine's loopback until interrupted, already while it is read.
 
     Parameters are those of `show` and of `serve_web`. Raises `ViewerError`.
     """
-    with serving((), port) as server:
+    with serving() as server:
         _feed(server, recording, look or Look(), progress, on_ready)
 
 

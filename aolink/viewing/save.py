@@ -18,7 +18,7 @@ from aolink.estimation.score import Scorer
 from aolink.exposure import Exposure
 from aolink.plotting.pupil import has_pupil
 from aolink.recording import topics
-from aolink.recording.reader import check_stands_alone
+from aolink.recording.side_files import check_stands_alone
 from aolink.rig import Rig
 from aolink.viewing import camera, devices, incidents, motion, scene
 from aolink.viewing.blueprint import PATH_WINDOW, Contents, blueprint

@@ -16,6 +16,7 @@ import aolink
 from aolink.errors import ExportError
 from aolink.exporting.arrays import arrays
 from aolink.exporting.files import WRITERS, export
+from aolink.notebook import NotebookRecording
 from aolink.recording import topics
 from aolink.recording.editing import RecordingCopy
 from aolink.recording.schemas_pb2 import ExposureInfo
@@ -40,7 +41,7 @@ def test_numpy_reads_every_array(series: Series, tmp_path: Path) -> None:
         }  # fmt: skip
 
 
-def test_xarray_reads_the_dataset(series: Series, tmp_path: Path) -> None:
+def test_xarray_reads_the_dataset(series: NotebookRecording, tmp_path: Path) -> None:
     needed("h5netcdf")
     import xarray
 
@@ -70,7 +71,7 @@ def test_python_reads_the_table(series: Series, tmp_path: Path) -> None:
     assert not [name for name in table[0] if name.startswith("o1_")]
 
 
-def test_pandas_reads_the_same_of_csv_and_parquet_as_a_notebook_has(series: Series, tmp_path: Path) -> None:
+def test_pandas_reads_the_same_of_csv_and_parquet_as_a_notebook_has(series: NotebookRecording, tmp_path: Path) -> None:
     pandas = needed("pandas")
     needed("pyarrow")
     expected = series.to_pandas()

@@ -16,7 +16,9 @@ from aolink.errors import DeviceError, RecordingError
 from aolink.estimation import Estimate
 from aolink.exposure import Exposure
 from aolink.jobs.demo import simulated_rig
+from aolink.recording import schemas_pb2 as pb
 from aolink.recording.editing import cut, merge
+from aolink.recording.estimate_pairs import EstimatePairs
 from aolink.recording.reader import Recording
 from aolink.rig import load_rig
 from aolink.session import record
@@ -194,3 +196,19 @@ def test_damage_is_said_in_the_table(recorded: Session, tmp_path: Path) -> None:
     page = aolink.read(path)._repr_html_()
     assert "<th>damage</th>" in page
     assert "<b>" not in page
+
+
+@pytest.mark.parametrize("skipped", [False, True])
+def test_nothing_is_waited_for_after_the_last_wanted_estimate(skipped: bool) -> None:
+    """The second exposure has an estimate, or the session says that there was no time for one."""
+    first, second = Recording(REFERENCES[0]).exposures(0, 2)
+    one, two = (pb.Estimate(frame_id=each.frame_id) for each in (first, second))
+    pairs = EstimatePairs(0, 0, 2)
+    assert list(pairs.take(one, [])) == []
+    assert list(pairs.take(pb.ExposureInfo(), [first])) == [(one, first)]
+    assert not pairs.complete
+    assert list(pairs.take(pb.ExposureInfo(), [second])) == []
+    assert not pairs.complete
+    last = pb.Estimation(frame_id=second.frame_id, skipped=True) if skipped else two
+    assert list(pairs.take(last, [])) == ([] if skipped else [(two, second)])
+    assert pairs.complete

@@ -70,6 +70,38 @@ def o3_step(effort: Effort) -> Row:
     )
 
 
+def update_forms(effort: Effort) -> list[Row]:
+    """Each form of the Kalman update beside Joseph's, with as many axes, states and measurements as it is for."""
+    from aolink.estimation.kalman.gaussian import Gaussian
+    from aolink.estimation.kalman.information_form import information_update
+    from aolink.estimation.kalman.update import blocked_update, joseph_update, small_update, two_state_update
+    from aolink.numerics import batched, entrywise
+
+    def row(form: str, axes: int, n: int, m: int, turns: int) -> Row:
+        rng = np.random.default_rng(1)
+        root, blocks = rng.standard_normal((axes, n, n)), np.tile(0.1 * np.eye(2), (axes, m // 2, 1, 1))
+        y, R = rng.standard_normal((axes, m)), np.tile(0.1 * np.eye(m), (axes, 1, 1))
+        H = batched.batch_last(rng.standard_normal((axes, m, n)))
+        prior = Gaussian(np.zeros((axes, n)), batched.batch_last(root @ batched.transpose(root)))
+        entries = entrywise.columns(y), entrywise.unpack(H) if n == 2 else [], batched.batch_last(R)
+        each: dict[str, Callable[[], Any]] = {
+            "o1's, entry by entry": lambda: small_update(prior, *entries, None),
+            "o3's, for two states": lambda: two_state_update(prior, *entries),
+            "in blocks": lambda: blocked_update(prior, y, H, blocks),
+            "in information form": lambda: information_update(prior, y, H, blocks, None),
+        }
+        ours, theirs = median_s(each[form], effort.of(turns, 3), lambda: joseph_update(prior, y, H, R))
+        figure = f"update {form}: {axes} x {n} states, {m} measured"
+        return Row(figure, f"{1e3 * ours:.2f} ms", f"Joseph {1e3 * theirs:.2f} ms", theirs / ours, 1.1)
+
+    return [
+        row("o1's, entry by entry", 1800, 2, 1, 300),
+        row("o3's, for two states", 1800, 2, 2, 300),
+        row("in blocks", 1, 48, 192, 60),
+        row("in information form", 1, 288, 400, 15),
+    ]
+
+
 def many_lenslets() -> Rig:
     """A sensor of 30 x 30 lenslets with windows of 16 x 16 pixels."""
     text = load_rig("sh-4x4").toml

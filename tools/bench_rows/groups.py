@@ -2,8 +2,9 @@
 
 ROWS = {
     "estimation": (
-        "o3_step", "frame_moments_and_o3", "frame_from_last_byte", "moments_of_many_axes", "profile_of_many_axes",
-        "mixture_of_many_axes", "profile_of_tip_tilt", "spots_under_turbulence", "membrane_in_real_time",
+        "o3_step", "update_forms", "frame_moments_and_o3", "frame_from_last_byte", "moments_of_many_axes",
+        "profile_of_many_axes", "mixture_of_many_axes", "profile_of_tip_tilt", "spots_under_turbulence",
+        "membrane_in_real_time",
     ),
     "optics": (
         "frame_synthesis", "diffraction_synthesis", "picture_synthesis", "coupled_exposure", "cost_against_lenslets",

@@ -35,17 +35,12 @@ class Line(NamedTuple):
     """Taylor coefficients of the light about points of a pixel, in pixels, (points, 4, reach)."""
     low: float
     """Edge at which the first pixel begins, slope units."""
-    high: float
-    pixel: float
-    """Width of a pixel, slope units."""
     per_unit: float
-    """Its inverse: multiplying is faster than dividing."""
+    """One over the width of a pixel: multiplying is faster than dividing."""
     read_noise: float
     """Variance of a pixel's density."""
     gain: float
     """Shot noise: increase of that variance with the density."""
-    kernel_variance: float
-    """Variance of the sensor's kernel, without the path's variance about the nodes, slope units squared."""
 
 
 @compiled

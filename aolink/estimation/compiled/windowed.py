@@ -42,10 +42,12 @@ class Lines(NamedTuple):
     """The exposure basis at the nodes, transposed, (n, nodes)."""
     weights: FloatArray
     """Each node's share of the exposure, (nodes,)."""
+    free: int
+    """Coefficients that come first and may have any prior, as the start state; the prior of the others is N(0, I)."""
     shared: FloatArray
     """`noise_spread` of the basis."""
     end_rows: FloatArray
-    """End states of the coefficients, (n_states, n)."""
+    """End states of the coefficients, (n_states, n); none where no closed loop is asked for."""
     low: float
     """Edge at which the first pixel begins, slope units."""
     high: float
@@ -92,16 +94,13 @@ def linearise(
     lines: Lines, prior_mean: FloatArray, prior_covariance: FloatArray, memory: FloatArray, path_reach: float,
     kernel_reach: float, last: bool, fits: Fits,
 ) -> None:  # fmt: skip
-    """Priors (rows, n) and (rows, n, n) updated with the sums, linearised about the previous pass.
-
-    The coefficients after the start state have the prior N(0, I).
-    """
+    """Priors (rows, n) and (rows, n, n) updated with the sums, linearised about the previous pass."""
     n, nodes = lines.basis.shape
-    sums, pixels, states = len(lines.orders), lines.density.shape[1], len(lines.end_rows)
+    sums, pixels = len(lines.orders), lines.density.shape[1]
     first = 1 if lines.ratios else 0
     m, width = sums - first, lines.shared.shape[1]
     path, variance = np.empty(nodes), np.empty(nodes)
-    left, right = np.zeros((states + m, width)), np.zeros((states + m, width))
+    left, right = np.zeros((lines.free + m, width)), np.zeros((lines.free + m, width))
     W, change, places = np.empty((sums, pixels)), np.empty((pixels + 1, sums)), np.empty(pixels + 1)
     g = np.zeros((3, padded(sums, SUMS), width))
     y, expected, slope = np.empty(sums), np.empty(sums), np.empty((sums, n))
@@ -197,15 +196,15 @@ def _update(
 
 
 @compiled
-def noise_spread(basis: FloatArray, states: int) -> FloatArray:
-    """Covariance of the path at the nodes from the coefficients after the start state, which all axes share.
+def noise_spread(basis: FloatArray, free: int) -> FloatArray:
+    """Covariance of the path at the nodes from the coefficients after the ``free`` ones, which all axes share.
 
     The lower half, (nodes, nodes), with zeros beyond the last column for whole vectors of the processor.
     """
     n, nodes = basis.shape
     out = np.zeros((nodes, padded(nodes, VECTOR)))
     for k in range(nodes):
-        for i in range(states, n):
+        for i in range(free, n):
             x = basis[i, k]
             for j in range(k + 1):
                 out[k, j] += x * basis[i, j]
@@ -219,25 +218,25 @@ def _spread(
 ) -> None:  # fmt: skip
     """Mean and variance of the path at the nodes, (nodes,).
 
-    Its covariance is ``shared`` + left' right, both (n_states + m, nodes).
+    Its covariance is ``shared`` + left' right, both (free + m, nodes).
     """
     _, n, m = known.shape
-    nodes, states = len(path), len(left) - m
+    nodes, free = len(path), len(left) - m
     for k in range(nodes):
         path[k], variance[k] = inputs[row, k], shared[k, k]
     for i in range(n):
         x = mean[row, i]
         for k in range(nodes):
             path[k] += x * basis[i, k]
-    for r in range(states):
+    for r in range(free):
         for k in range(nodes):
             left[r, k], right[r, k] = 0.0, basis[r, k]
-        for i in range(states):
+        for i in range(free):
             x = P[row, r, i]
             for k in range(nodes):
                 left[r, k] += x * basis[i, k]
     for a in range(m):
-        r = states + a
+        r = free + a
         for k in range(nodes):
             right[r, k] = 0.0
         for i in range(n):

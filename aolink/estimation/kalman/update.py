@@ -1,8 +1,7 @@
 """The update of a Kalman filter, in the forms in which it is computed. They agree to rounding.
 
-`aolink.estimation.kalman.path_moments` chooses between them by the sizes. Rows of tools/bench that need
-each: entry by entry `o3_step`, in blocks `spots_under_turbulence`, in information form
-(`aolink.estimation.kalman.information_form`) `membrane_in_real_time`.
+`aolink.estimation.kalman.path_moments` chooses between them by the sizes: entry by entry, in blocks, or in information
+form (`aolink.estimation.kalman.information_form`). The row `update_forms` of tools/bench times each beside Joseph's.
 """
 
 from __future__ import annotations

@@ -60,16 +60,10 @@ class WindowedMoments:
     def update(self, model: ExposureModel, response: InputResponse, prior: Gaussian, measured: Profile) -> Update:
         """Iterated statistical linearisation, from the prior to the posterior."""
         nodes = quadrature_paths(model, response, blocks(model.n_steps, MOST_NODES))
-        lines = self._lines(model, nodes, measured)
-        axes, m = len(prior.mean), self.n_measurements
-        mean, covariance = np.ascontiguousarray(prior.mean), np.ascontiguousarray(prior.covariance)
-        n_states = len(model.transition)
-        fits = Fits(
-            mean=mean.copy(), covariance=np.empty_like(covariance), known=np.zeros((axes, mean.shape[1], m)),
-            innovation=np.empty((axes, m)), innovation_covariance=np.empty((axes, m, m)), nis=np.empty(axes),
-            significance=np.empty(axes),
-            closed_loop=np.empty((axes, n_states, n_states)),
-        )  # fmt: skip
+        axes, n_states = len(prior.mean), len(model.transition)
+        lines = _lines(self.sensor, self.orders, self.basis, self.flux, nodes, measured, n_states, model.end_rows)
+        mean, covariance = _contiguous(prior.mean), _contiguous(prior.covariance)
+        fits = _no_fits(prior, self.n_measurements, n_states)
         rho = slowest(model.transition[None])
 
         def update(some: slice) -> None:
@@ -92,21 +86,51 @@ class WindowedMoments:
             nis = np.where(fits.significance < LEAST_FLUX, NOT_BELIEVED, nis)
         return Update(Gaussian(fits.mean, fits.covariance), fits.innovation, fits.innovation_covariance, nis)
 
-    def _lines(self, model: ExposureModel, nodes: QuadraturePaths, measured: Profile) -> Lines:
-        """The frames for compiled code."""
-        sensor, edges, pixel = self.sensor, self.sensor.edges, self.sensor.pixel_size
-        light = np.ones(len(measured.density)) if measured.light is None else measured.light
-        basis = _contiguous(nodes.basis[0].T)
-        return Lines(
-            density=_contiguous(measured.density), usable=np.ascontiguousarray(measured.mask),
-            light=_contiguous(light), inputs=_contiguous(nodes.inputs[:, 0]), basis=basis,
-            weights=_contiguous(nodes.weights), shared=noise_spread(basis, len(model.transition)),
-            end_rows=_contiguous(model.end_rows), low=float(edges[0]), high=float(edges[-1]), pixel=pixel,
-            read_noise=effective_noise_density(sensor) * pixel,
-            shot_noise=pixel / sensor.photoelectrons if sensor.photoelectrons else 0.0,
-            kernel_variance=float(sensor.kernel.variance), widening=float(nodes.widening),
-            orders=np.array(self.orders), functions=_BASES.index(self.basis), ratios=self.flux == "measured",
-        )  # fmt: skip
+
+def updated(
+    sensor: Sensor, nodes: QuadraturePaths, prior: Gaussian, measured: Profile, memory: FloatArray, passes: int
+) -> Gaussian:
+    """Priors of a path's coefficients, of any covariance, updated with the moments of orders 0 to 3.
+
+    Parameters
+    ----------
+    memory:
+        Factor of the covariance of what the linearisation leaves out, (axes,), the same in all passes.
+    """
+    orders, n = (0, 1, 2, 3), prior.mean.shape[1]
+    lines = _lines(sensor, orders, "monomial", "known", nodes, measured, n, np.empty((0, n)))
+    fits, mean, covariance = _no_fits(prior, len(orders), 0), _contiguous(prior.mean), _contiguous(prior.covariance)
+    for to_come in reversed(range(passes)):
+        linearise(lines, mean, covariance, memory, PATH_REACH, KERNEL_REACH, not to_come, fits)
+    return Gaussian(fits.mean, fits.covariance)
+
+
+def _no_fits(prior: Gaussian, m: int, n_states: int) -> Fits:
+    """The fits before the first pass, which is about the prior."""
+    axes, n = prior.mean.shape
+    return Fits(
+        mean=prior.mean.copy(order="C"), covariance=np.empty((axes, n, n)), known=np.zeros((axes, n, m)),
+        innovation=np.empty((axes, m)), innovation_covariance=np.empty((axes, m, m)), nis=np.empty(axes),
+        significance=np.empty(axes), closed_loop=np.empty((axes, n_states, n_states)),
+    )  # fmt: skip
+
+
+def _lines(
+    sensor: Sensor, orders: Sequence[int], basis: Basis, flux: Flux, nodes: QuadraturePaths, measured: Profile,
+    free: int, end_rows: FloatArray,
+) -> Lines:  # fmt: skip
+    """The frames for compiled code."""
+    edges, pixel, rows = sensor.edges, sensor.pixel_size, _contiguous(nodes.basis[0].T)
+    light = np.ones(len(measured.density)) if measured.light is None else measured.light
+    return Lines(
+        density=_contiguous(measured.density), usable=np.ascontiguousarray(measured.mask), light=_contiguous(light),
+        inputs=_contiguous(nodes.inputs[:, 0]), basis=rows, weights=_contiguous(nodes.weights), free=free,
+        shared=noise_spread(rows, free), end_rows=_contiguous(end_rows), low=float(edges[0]), high=float(edges[-1]),
+        pixel=pixel, read_noise=effective_noise_density(sensor) * pixel,
+        shot_noise=pixel / sensor.photoelectrons if sensor.photoelectrons else 0.0,
+        kernel_variance=float(sensor.kernel.variance), widening=float(nodes.widening), orders=np.array(orders),
+        functions=_BASES.index(basis), ratios=flux == "measured",
+    )  # fmt: skip
 
 
 def _contiguous(values: FloatArray) -> FloatArray:

@@ -296,14 +296,12 @@ class PixelView:
         """The frame of a line sensor for compiled code; None for spots on a plane."""
         if not self.on_line:
             return None
-        edges, nodes = self.optics.profile.edges, self.nodes
-        pixel, variance = self.optics.pixel_size, float(self.kernel[0, 0])
+        nodes, pixel = self.nodes, self.optics.pixel_size
         return Line(
             y=np.ascontiguousarray(self.y), usable=np.ascontiguousarray(self.mask),
             inputs=np.ascontiguousarray(nodes.inputs[:, 0]), basis=np.ascontiguousarray(nodes.basis[0].T),
-            weights=nodes.weights, table=_light_table(variance, pixel), low=float(edges[0]), high=float(edges[-1]),
-            pixel=pixel, per_unit=1 / pixel, read_noise=self.read_noise, gain=self.gain,
-            kernel_variance=self.sensor.kernel.variance,
+            weights=nodes.weights, table=_light_table(float(self.kernel[0, 0]), pixel),
+            low=float(self.optics.profile.edges[0]), per_unit=1 / pixel, read_noise=self.read_noise, gain=self.gain,
         )  # fmt: skip
 
     @property

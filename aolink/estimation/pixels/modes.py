@@ -18,12 +18,12 @@ import numpy as np
 from scipy import special
 
 from aolink.estimation.compiled import modes as compiled_modes
-from aolink.estimation.compiled import moments as compiled_moments
 from aolink.estimation.compiled.line import Line
+from aolink.estimation.frames.frame_data import Profile
 from aolink.estimation.kalman.filter import GATE_PROBABILITY
 from aolink.estimation.kalman.gaussian import Gaussian
 from aolink.estimation.kalman.update import joseph_update
-from aolink.estimation.moments.windowed import KERNEL_REACH, PATH_REACH
+from aolink.estimation.moments.lines import updated
 from aolink.estimation.pixels.filter import Innovation
 from aolink.estimation.pixels.gaussian_mixture import log_sum
 from aolink.estimation.pixels.levenberg_marquardt import (
@@ -184,13 +184,9 @@ def broad(view: PixelView, prior: Gaussian, memory: FloatArray | None = None) ->
     ``memory`` multiplies the covariance of what their linearisation leaves out, (axes,); one where None.
     """
     memory = np.ones(len(prior.mean)) if memory is None else memory
-    if (line := view.line) is not None:
-        after = Gaussian(np.empty_like(prior.mean), np.empty_like(prior.covariance))
-        compiled_moments.broad_of_lines(
-            line, np.ascontiguousarray(prior.mean), np.ascontiguousarray(prior.covariance), memory, _BROAD_PASSES,
-            _NO_NOISE, PATH_REACH, KERNEL_REACH, after.mean, after.covariance,
-        )  # fmt: skip
-        return after
+    if view.on_line:
+        assert isinstance(view.measured, Profile)
+        return updated(view.optics.profile, view.nodes, prior, view.measured, memory, _BROAD_PASSES)
     about = prior
     for _ in range(_BROAD_PASSES):
         y, noise, fit = view.moments(about)

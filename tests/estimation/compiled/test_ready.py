@@ -27,12 +27,12 @@ def test_one_process_compiles_for_all_others_once_for_each_version_of_the_source
 FIRST_SESSION = """
 import dataclasses, sys
 from aolink.estimation import make_estimator
-from aolink.estimation.compiled import joint, line, mixtures, modes, moments, small, windowed
+from aolink.estimation.compiled import joint, line, mixtures, modes, small, windowed
 from aolink.rig import load_rig
 from aolink.simulation.model import simulate
 
 def overloads():
-    loaded = small, line, modes, moments, mixtures, joint, windowed
+    loaded = small, line, modes, mixtures, joint, windowed
     each = [value for module in loaded for value in vars(module).values()]
     return sum(len(value.signatures) for value in each if hasattr(value, "signatures"))
 
