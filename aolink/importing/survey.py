@@ -157,7 +157,7 @@ def survey(film: Film, settings: Settings, objects: Objects, progress: Callable[
     cuts = np.array(windows) / brightness[::every, None, None, None]
     sd, sd_sd, amounts, ground, residual, model, beside = _fitted(cuts, np.array(centres), objects.sd)
     noise = pixel_noise(cuts.reshape(-1, *cuts.shape[2:]), np.concatenate(centres), sd)
-    place_sd = tracker_errors(path, range(0, film.count, every), amounts, sd, noise)
+    place_sd = tracker_errors(path, range(0, film.count, every), amounts, sd, noise, objects.sd)
     return Survey(
         places=path, last=np.array(last), together=near, sd=sd, sd_sd=sd_sd, light=amounts,
         brightness=brightness, ground=ground, residual=residual, model=model, place_sd=place_sd, beside=beside,
