@@ -6,6 +6,7 @@ objects were followed in the single frames, the true path.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Any
@@ -17,6 +18,7 @@ from aolink.assembly import Assembler
 from aolink.assembly import Frame as RigFrame
 from aolink.errors import ImportingError
 from aolink.exposure import Exposure, Exposures
+from aolink.importing.brightness import brightness_of, change_of
 from aolink.importing.film import Film
 from aolink.importing.frames import (
     Account,
@@ -30,11 +32,16 @@ from aolink.importing.frames import (
     rig_frame,
 )
 from aolink.numerics.arrays import FloatArray
+from aolink.optics.camera import pixel_noise_sd, to_density
 from aolink.rig import Rig
 from aolink.wire.messages_pb2 import Applied
 
 _FASTER = 0.75
 """Commands at a shorter distance than this part of a fast step are too many for the rig."""
+_AT_BORDER = 0.02
+"""Share of a spot's light in the border pixels of its window from which on some may be beyond it."""
+_FEWEST = 10
+"""Number of exposures from which on it can be seen that light fades."""
 
 
 def imported(film: Film, rig: Rig, settings: Settings, account: Account) -> Iterator[ImportedExposure]:
@@ -68,18 +75,57 @@ def imported(film: Film, rig: Rig, settings: Settings, account: Account) -> Iter
     scale = settings.scale or default_scale(film, rig)
     inputs = _Inputs(film, rig, settings, periods)
     account.notes += inputs.notes
-    for group in grouped(film, settings.frames_per_exposure, periods, light.of):
+    groups = grouped(film, settings.frames_per_exposure, periods, light.of)
+    shine = _brightness([_spot_light(offset + scale * group.mean, ~group.bad, rig) for group in groups])
+    if change := change_of(shine):
+        account.notes += (
+            f"the light of the spots {change} over the film, from {shine[0]:.2f} to {shine[-1]:.2f} of the rig file's:"
+            " exposures are scaled to the rig file's light",
+        )
+    black = rig.sensor.black_level
+    groups = grouped(film, settings.frames_per_exposure, periods, light.of)
+    for group, bright in zip(groups, shine.tolist(), strict=True):
         mean = group.mean
         if settings.scale is None and film.dtype.kind == "f" and mean.max() > 1.0:
             raise ImportingError(
                 f"{film.name} has floating-point values up to {mean.max():.6g}, where 1.0 would be full scale: say with"
                 " --scale how many counts a value of one is"
             )
-        pixels, mask = counts_of(offset + scale * mean, ~group.bad, rig, account)
+        counts = offset + scale * mean
+        if bright != 1.0:
+            counts = black + (counts - black) / bright
+        pixels, mask = counts_of(counts, ~group.bad, rig, account)
         account.frames += settings.frames_per_exposure
         account.exposures += 1
         frame = rig_frame(film, rig, settings, group.first_period // settings.frames_per_exposure, pixels, mask)
         yield ImportedExposure(frame=frame, inputs=inputs.until(frame.last_step + 1))
+
+
+def _spot_light(counts: FloatArray, usable: NDArray[np.bool_], rig: Rig) -> FloatArray:
+    """Light of each spot of an exposure over that which the rig file gives it, (spots,); zero where it is not known:
+    a pixel of its window cannot be used, or light is at the border of its window and may be beyond it."""
+    sensor, found = rig.sensor, np.zeros(rig.sensor.spots)
+    for spot in range(sensor.spots):
+        window = to_density(sensor, counts[sensor.window_of(spot)]) * sensor.pixel_size
+        border = np.ones(window.shape, dtype=np.bool_)
+        border[slice(1, -1) if len(window) > 1 else slice(None), 1:-1] = False  # a line has two ends only
+        noise = pixel_noise_sd(sensor) * sensor.pixel_size * math.sqrt(border.sum())
+        if usable[sensor.window_of(spot)].all() and window[border].sum() <= _AT_BORDER * window.sum() + 3 * noise:
+            found[spot] = window.sum() / sensor.light_of(spot * sensor.directions)
+    return found
+
+
+def _brightness(light: list[FloatArray]) -> FloatArray:
+    """Light of the spots in each exposure, over that of the rig file, (exposures,); one everywhere if it does not
+    change."""
+    found = np.array(light).reshape(len(light), -1)
+    known = found > 0
+    if np.count_nonzero(known.any(axis=1)) < _FEWEST:
+        return np.ones(len(found))
+    curve = brightness_of(found)
+    if change_of(curve) is None:
+        return curve
+    return curve * float(np.median((found / curve[:, None])[known]))
 
 
 def _of_slopes(

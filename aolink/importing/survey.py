@@ -11,7 +11,7 @@ from scipy import ndimage, optimize
 
 from aolink.errors import ImportingError
 from aolink.importing.accuracy import pixel_noise, tracker_errors
-from aolink.importing.brightness import brightness_of
+from aolink.importing.brightness import brightness_of, change_of
 from aolink.importing.film import Film
 from aolink.importing.frames import FilmLight, Settings
 from aolink.importing.tracker import FIRST_FRAMES, WEIGHT, Objects, Tracker, trackpy_locator
@@ -83,9 +83,7 @@ class Survey:
                 f"objects {a + 1} and {b + 1} come together in frames {frames}: they are left out there, and which is"
                 " which is not known afterwards"
             )
-        begin, end = self.brightness[[0, -1]]
-        if begin != end:
-            change = f"fades by {1 - end / begin:.0%}" if end < begin else f"grows by {end / begin - 1:.0%}"
+        if change := change_of(self.brightness):
             yield f"the light of the objects {change} over the film: exposures are scaled to the same light"
         steps = np.diff(self.places, axis=0)
         drift, count = np.nanmean(steps, axis=(0, 1)), max(int(np.isfinite(steps).all(axis=2).sum()), 1)
