@@ -32,14 +32,15 @@ from aolink.importing.frames import (
     rig_frame,
 )
 from aolink.numerics.arrays import FloatArray
-from aolink.optics.camera import pixel_noise_sd, to_density
+from aolink.optics.camera import to_density
+from aolink.optics.centroid import weighted_centroid
 from aolink.rig import Rig
 from aolink.wire.messages_pb2 import Applied
 
 _FASTER = 0.75
 """Commands at a shorter distance than this part of a fast step are too many for the rig."""
-_AT_BORDER = 0.02
-"""Share of a spot's light in the border pixels of its window from which on some may be beyond it."""
+_WEIGHT = 2.5
+"""Standard deviation of the weight under which a spot's light is measured, in those of the kernel."""
 _FEWEST = 10
 """Number of exposures from which on it can be seen that light fades."""
 
@@ -102,30 +103,38 @@ def imported(film: Film, rig: Rig, settings: Settings, account: Account) -> Iter
 
 
 def _spot_light(counts: FloatArray, usable: NDArray[np.bool_], rig: Rig) -> FloatArray:
-    """Light of each spot of an exposure over that which the rig file gives it, (spots,); zero where it is not known:
-    a pixel of its window cannot be used, or light is at the border of its window and may be beyond it."""
-    sensor, found = rig.sensor, np.zeros(rig.sensor.spots)
+    """Light of each spot of an exposure over that which the rig file gives it, (spots, 2): under a weight about the
+    spot, which changes with its blur, and in its whole window, which has more noise.
+
+    It is zero where it is not known: a pixel of the window cannot be used, or the spot is at its border.
+    """
+    sensor, found = rig.sensor, np.zeros((rig.sensor.spots, 2))
+    sd = _WEIGHT * math.sqrt(sensor.kernel.variance) / sensor.pixel_width
     for spot in range(sensor.spots):
-        window = to_density(sensor, counts[sensor.window_of(spot)]) * sensor.pixel_size
-        border = np.ones(window.shape, dtype=np.bool_)
-        border[slice(1, -1) if len(window) > 1 else slice(None), 1:-1] = False  # a line has two ends only
-        noise = pixel_noise_sd(sensor) * sensor.pixel_size * math.sqrt(border.sum())
-        if usable[sensor.window_of(spot)].all() and window[border].sum() <= _AT_BORDER * window.sum() + 3 * noise:
-            found[spot] = window.sum() / sensor.light_of(spot * sensor.directions)
+        at = sensor.window_of(spot)
+        window = to_density(sensor, counts[at]) * sensor.pixel_size / sensor.light_of(spot * sensor.directions)
+        ((x, y),) = weighted_centroid(window[None], sd)
+        rows, columns = window.shape
+        border = min(x, columns - 1 - x, *((y, rows - 1 - y) if rows > 1 else ()))
+        if usable[at].all() and border >= sd:  # False where it is NaN
+            weight = np.exp(-(((np.arange(rows)[:, None] - y) ** 2 + (np.arange(columns) - x) ** 2) / (2 * sd**2)))
+            found[spot] = np.sum(window * weight), window.sum()
     return found
 
 
 def _brightness(light: list[FloatArray]) -> FloatArray:
     """Light of the spots in each exposure, over that of the rig file, (exposures,); one everywhere if it does not
     change."""
-    found = np.array(light).reshape(len(light), -1)
-    known = found > 0
+    found = np.array(light).reshape(len(light), -1, 2)
+    known = (found > 0).all(axis=2)
     if np.count_nonzero(known.any(axis=1)) < _FEWEST:
         return np.ones(len(found))
-    curve = brightness_of(found)
+    found[~known] = np.nan
+    steadier = np.argmin(np.nanstd(found, axis=(0, 1)) / np.nanmean(found, axis=(0, 1)))
+    curve = brightness_of(np.nan_to_num(found[:, :, steadier]))
     if change_of(curve) is None:
         return curve
-    return curve * float(np.median((found / curve[:, None])[known]))
+    return np.asarray(curve * found[known, 1].sum() / (known * curve[:, None]).sum())
 
 
 def _of_slopes(
