@@ -31,7 +31,7 @@ from aolink.importing.frames import (
     grouped,
     rig_frame,
 )
-from aolink.numerics.arrays import FloatArray
+from aolink.numerics.arrays import BoolArray, FloatArray
 from aolink.optics.camera import to_density
 from aolink.optics.centroid import weighted_centroid
 from aolink.rig import Rig
@@ -78,7 +78,7 @@ def imported(film: Film, rig: Rig, settings: Settings, account: Account) -> Iter
     account.notes += inputs.notes
     groups = grouped(film, settings.frames_per_exposure, periods, light.of)
     shine = _brightness([_spot_light(offset + scale * group.mean, ~group.bad, rig) for group in groups])
-    if change := change_of(shine):
+    if len(shine) and (change := change_of(shine)):
         account.notes += (
             f"the light of the spots {change} over the film, from {shine[0]:.2f} to {shine[-1]:.2f} of the rig file's:"
             " exposures are scaled to the rig file's light",
@@ -125,10 +125,12 @@ def _spot_light(counts: FloatArray, usable: NDArray[np.bool_], rig: Rig) -> Floa
 def _brightness(light: list[FloatArray]) -> FloatArray:
     """Light of the spots in each exposure, over that of the rig file, (exposures,); one everywhere if it does not
     change."""
-    found = np.array(light).reshape(len(light), -1, 2)
-    known = (found > 0).all(axis=2)
-    if np.count_nonzero(known.any(axis=1)) < _FEWEST:
-        return np.ones(len(found))
+    if len(light) < _FEWEST:
+        return np.ones(len(light))
+    found = np.array(light)
+    known: BoolArray = np.asarray((found > 0).all(axis=2))
+    if np.count_nonzero(np.any(known, axis=1)) < _FEWEST:
+        return np.ones(len(light))
     found[~known] = np.nan
     steadier = np.argmin(np.nanstd(found, axis=(0, 1)) / np.nanmean(found, axis=(0, 1)))
     curve = brightness_of(np.nan_to_num(found[:, :, steadier]))

@@ -99,7 +99,7 @@ def test_a_film_of_the_rigs_own_camera_that_fades_is_scaled_to_its_light(
     assert errors[2] > 1.1 * errors[1]
 
 
-@pytest.mark.parametrize("name", ["sh-4x4", "section-vi-lively", "single-lenslet"])
+@pytest.mark.parametrize("name", ["sh-4x4", "section-vi-lively", "single-lenslet", "jitter"])
 @pytest.mark.parametrize("seed", range(3))
 def test_a_film_whose_light_is_constant_is_left_as_it_is(tmp_path: Path, name: str, seed: int) -> None:
     """Noise, motion, and another light than the rig file's are no change."""
