@@ -21,6 +21,14 @@ _LEAST_PART = 20
 """Least number of frames of such a part."""
 
 
+def change_of(brightness: FloatArray) -> str | None:
+    """The change of the light from the beginning to the end in words; None where there is none."""
+    begin, end = brightness[[0, -1]]
+    if begin == end:
+        return None
+    return f"fades by {1 - end / begin:.0%}" if end < begin else f"grows by {end / begin - 1:.0%}"
+
+
 def brightness_of(light: FloatArray) -> FloatArray:
     """The light that is common to all objects in each frame, over its mean, (frames,), from the light of each object,
     (frames, n), zero where it is not seen.

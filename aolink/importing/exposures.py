@@ -6,6 +6,7 @@ objects were followed in the single frames, the true path.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Any
@@ -17,6 +18,7 @@ from aolink.assembly import Assembler
 from aolink.assembly import Frame as RigFrame
 from aolink.errors import ImportingError
 from aolink.exposure import Exposure, Exposures
+from aolink.importing.brightness import brightness_of, change_of
 from aolink.importing.film import Film
 from aolink.importing.frames import (
     Account,
@@ -29,12 +31,18 @@ from aolink.importing.frames import (
     grouped,
     rig_frame,
 )
-from aolink.numerics.arrays import FloatArray
+from aolink.numerics.arrays import BoolArray, FloatArray
+from aolink.optics.camera import to_density
+from aolink.optics.centroid import weighted_centroid
 from aolink.rig import Rig
 from aolink.wire.messages_pb2 import Applied
 
 _FASTER = 0.75
 """Commands at a shorter distance than this part of a fast step are too many for the rig."""
+_WEIGHT = 2.5
+"""Standard deviation of the weight under which a spot's light is measured, in those of the kernel."""
+_FEWEST = 10
+"""Number of exposures from which on it can be seen that light fades."""
 
 
 def imported(film: Film, rig: Rig, settings: Settings, account: Account) -> Iterator[ImportedExposure]:
@@ -68,18 +76,67 @@ def imported(film: Film, rig: Rig, settings: Settings, account: Account) -> Iter
     scale = settings.scale or default_scale(film, rig)
     inputs = _Inputs(film, rig, settings, periods)
     account.notes += inputs.notes
-    for group in grouped(film, settings.frames_per_exposure, periods, light.of):
+    groups = grouped(film, settings.frames_per_exposure, periods, light.of)
+    shine = _brightness([_spot_light(offset + scale * group.mean, ~group.bad, rig) for group in groups])
+    if len(shine) and (change := change_of(shine)):
+        account.notes += (
+            f"the light of the spots {change} over the film, from {shine[0]:.2f} to {shine[-1]:.2f} of the rig file's:"
+            " exposures are scaled to the rig file's light",
+        )
+    black = rig.sensor.black_level
+    groups = grouped(film, settings.frames_per_exposure, periods, light.of)
+    for group, bright in zip(groups, shine.tolist(), strict=True):
         mean = group.mean
         if settings.scale is None and film.dtype.kind == "f" and mean.max() > 1.0:
             raise ImportingError(
                 f"{film.name} has floating-point values up to {mean.max():.6g}, where 1.0 would be full scale: say with"
                 " --scale how many counts a value of one is"
             )
-        pixels, mask = counts_of(offset + scale * mean, ~group.bad, rig, account)
+        counts = offset + scale * mean
+        if bright != 1.0:
+            counts = black + (counts - black) / bright
+        pixels, mask = counts_of(counts, ~group.bad, rig, account)
         account.frames += settings.frames_per_exposure
         account.exposures += 1
         frame = rig_frame(film, rig, settings, group.first_period // settings.frames_per_exposure, pixels, mask)
         yield ImportedExposure(frame=frame, inputs=inputs.until(frame.last_step + 1))
+
+
+def _spot_light(counts: FloatArray, usable: NDArray[np.bool_], rig: Rig) -> FloatArray:
+    """Light of each spot of an exposure over that which the rig file gives it, (spots, 2): under a weight about the
+    spot, which changes with its blur, and in its whole window, which has more noise.
+
+    It is zero where it is not known: a pixel of the window cannot be used, or the spot is at its border.
+    """
+    sensor, found = rig.sensor, np.zeros((rig.sensor.spots, 2))
+    sd = _WEIGHT * math.sqrt(sensor.kernel.variance) / sensor.pixel_width
+    for spot in range(sensor.spots):
+        at = sensor.window_of(spot)
+        window = to_density(sensor, counts[at]) * sensor.pixel_size / sensor.light_of(spot * sensor.directions)
+        ((x, y),) = weighted_centroid(window[None], sd)
+        rows, columns = window.shape
+        border = min(x, columns - 1 - x, *((y, rows - 1 - y) if rows > 1 else ()))
+        if usable[at].all() and border >= sd:  # False where it is NaN
+            weight = np.exp(-(((np.arange(rows)[:, None] - y) ** 2 + (np.arange(columns) - x) ** 2) / (2 * sd**2)))
+            found[spot] = np.sum(window * weight), window.sum()
+    return found
+
+
+def _brightness(light: list[FloatArray]) -> FloatArray:
+    """Light of the spots in each exposure, over that of the rig file, (exposures,); one everywhere if it does not
+    change."""
+    if len(light) < _FEWEST:
+        return np.ones(len(light))
+    found = np.array(light)
+    known: BoolArray = np.asarray((found > 0).all(axis=2))
+    if np.count_nonzero(np.any(known, axis=1)) < _FEWEST:
+        return np.ones(len(light))
+    found[~known] = np.nan
+    steadier = np.argmin(np.nanstd(found, axis=(0, 1)) / np.nanmean(found, axis=(0, 1)))
+    curve = brightness_of(np.nan_to_num(found[:, :, steadier]))
+    if change_of(curve) is None:
+        return curve
+    return np.asarray(curve * found[known, 1].sum() / (known * curve[:, None]).sum())
 
 
 def _of_slopes(

@@ -7,6 +7,7 @@ show are left out of it.
 
 from __future__ import annotations
 
+import cmath
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -200,7 +201,23 @@ def _innovations(
 ) -> tuple[float, FloatArray]:
     """The negative logarithm of the likelihood, and the innovations in their standard deviations, as ``places``."""
     left = np.full(places.shape, np.nan)
-    return _filter(places, *_parameters(free, values), left), left
+    a, turn, q, walk, drift, r = _parameters(free, values)
+    cross, less = vibration_mean(a, turn) if turn > 0 else (0.0, (1 - a * a) / 6)
+    error = r - walk / 6 - less * q / (1 - a * a)
+    return _filter(places, a, turn, q, walk, drift, error, cross, left), left
+
+
+def vibration_mean(a: float, turn: float) -> tuple[float, float]:
+    """Covariance of z's imaginary part with the mean over a frame, and what the mean's variance lacks, both over Var z.
+
+    With z(t) = exp(l t) z(0) and kicks, the covariance of means some frames k apart is the real part of S exp(l k) for
+    S = (exp(l) - 2 + exp(-l)) / l^2, but in the same frame that of 2 (exp(l) - 1 - l) / l^2. A filter whose Re z is the
+    mean has Re S for the variance of z, which so becomes one.
+    """
+    rate = complex(math.log(max(a, 1e-9)), turn)
+    apart = (2 * cmath.cosh(rate) - 2) / rate**2
+    less = 2 * (cmath.sinh(rate) - rate) / rate**2
+    return apart.imag / apart.real, -less.real / apart.real
 
 
 def _cost(places: FloatArray, free: tuple[int, ...], values: FloatArray | Sequence[float]) -> float:
@@ -252,7 +269,8 @@ def _correlation(left: FloatArray) -> float:
 
 @compiled_exactly
 def _filter(
-    places: FloatArray, a: float, turn: float, q: float, walk: float, drift: float, r: float, left: FloatArray
+    places: FloatArray, a: float, turn: float, q: float, walk: float, drift: float, error: float, cross: float,
+    left: FloatArray,
 ) -> float:  # fmt: skip
     """A Kalman filter of each series, (frames, series); fills in ``left``, innovations in their standard deviations.
 
@@ -260,14 +278,17 @@ def _filter(
     the variance that it settles at, and the offset is unknown before.
 
     A frame that is exposed throughout sees a random walk's mean in it. Its steps have the covariances of a walk's whose
-    places have an error of variance r - q / 6 (Berglund, Phys. Rev. E 82, 011917, 2010).
+    places have an ``error`` of variance r - q / 6 (Berglund, Phys. Rev. E 82, 011917, 2010). The means of a vibration
+    are those of a z whose parts have the covariance ``cross`` q / (1 - a^2).
     """
     frames, series = places.shape
-    error = r - (q + walk) / 6
     c, s = a * math.cos(turn), a * math.sin(turn)
     A = np.array([[c, -s, 0.0, 0.0], [s, c, 0.0, 0.0], [0.0, 0.0, 1.0, 1.0], [0.0, 0.0, 0.0, 1.0]])
-    noise = np.array([q, q, walk, 0.0])
     settled = q / (1 - a * a)
+    both = cross * settled
+    twice = 2 * turn
+    noise = np.array([q + a * a * both * math.sin(twice), q - a * a * both * math.sin(twice), walk, 0.0])
+    noise_both = both * (1 - a * a * math.cos(twice))
     total = 0.0
     x, P, AP, gain = np.empty(4), np.empty((4, 4)), np.empty((4, 4)), np.empty(4)
     before = np.empty(4)
@@ -283,7 +304,9 @@ def _filter(
                     x[2] = y
                     P[:] = 0.0
                     P[0, 0] = P[1, 1] = settled
+                    P[0, 1] = P[1, 0] = both
                     P[0, 2] = P[2, 0] = -settled
+                    P[1, 2] = P[2, 1] = -both
                     P[2, 2] = settled + error
                     P[3, 3] = drift
                 continue
@@ -302,6 +325,8 @@ def _filter(
                     for m in range(4):
                         P[i, j] += AP[i, m] * A[j, m]
                 P[i, i] += noise[i]
+            P[0, 1] += noise_both
+            P[1, 0] += noise_both
             if not seen:
                 continue
             S = P[0, 0] + 2 * P[0, 2] + P[2, 2] + error

@@ -11,7 +11,7 @@ from scipy import ndimage, optimize
 
 from aolink.errors import ImportingError
 from aolink.importing.accuracy import pixel_noise, tracker_errors
-from aolink.importing.brightness import brightness_of
+from aolink.importing.brightness import brightness_of, change_of
 from aolink.importing.film import Film
 from aolink.importing.frames import FilmLight, Settings
 from aolink.importing.tracker import FIRST_FRAMES, WEIGHT, Objects, Tracker, trackpy_locator
@@ -83,9 +83,7 @@ class Survey:
                 f"objects {a + 1} and {b + 1} come together in frames {frames}: they are left out there, and which is"
                 " which is not known afterwards"
             )
-        begin, end = self.brightness[[0, -1]]
-        if begin != end:
-            change = f"fades by {1 - end / begin:.0%}" if end < begin else f"grows by {end / begin - 1:.0%}"
+        if change := change_of(self.brightness):
             yield f"the light of the objects {change} over the film: exposures are scaled to the same light"
         steps = np.diff(self.places, axis=0)
         drift, count = np.nanmean(steps, axis=(0, 1)), max(int(np.isfinite(steps).all(axis=2).sum()), 1)
@@ -157,7 +155,7 @@ def survey(film: Film, settings: Settings, objects: Objects, progress: Callable[
     cuts = np.array(windows) / brightness[::every, None, None, None]
     sd, sd_sd, amounts, ground, residual, model, beside = _fitted(cuts, np.array(centres), objects.sd)
     noise = pixel_noise(cuts.reshape(-1, *cuts.shape[2:]), np.concatenate(centres), sd)
-    place_sd = tracker_errors(path, range(0, film.count, every), amounts, sd, noise)
+    place_sd = tracker_errors(path, range(0, film.count, every), amounts, sd, noise, objects.sd)
     return Survey(
         places=path, last=np.array(last), together=near, sd=sd, sd_sd=sd_sd, light=amounts,
         brightness=brightness, ground=ground, residual=residual, model=model, place_sd=place_sd, beside=beside,

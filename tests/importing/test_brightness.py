@@ -9,14 +9,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import aolink
 from aolink.estimation import run
+from aolink.exposure import Exposures
 from aolink.importing.brightness import brightness_of
 from aolink.importing.film import array_film
 from aolink.importing.first_rig import first_rig
 from aolink.importing.frames import Settings
 from aolink.importing.recording import import_film
 from aolink.recording.reader import Recording
-from aolink.rig import parse_rig
+from aolink.rig import Rig, load_rig, parse_rig
 from tests.kinds import truth_of
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
@@ -24,6 +26,23 @@ from paper_report.spot_films import random_walk, spot_film
 
 MIDDLES = ((24.0, 32.0), (70.0, 30.0))
 K, FRAMES = 8, 96
+
+
+def quiet(name: str) -> Rig:
+    """A rig whose camera has a tenth of the noise."""
+    rig = load_rig(name)
+    number = f"noise_density = {rig.sensor.noise_density / 100!r}"
+    text, found = re.subn(r"^noise_density = \S+", number, rig.toml, flags=re.MULTILINE)
+    assert found == 1
+    return parse_rig(text)
+
+
+def rate(rig: Rig) -> float:
+    return 1 / (rig.timing.frame_period_steps * rig.timing.fast_step_s)
+
+
+def starts(exposures: Exposures) -> list[int]:
+    return [each.first_step for each in exposures]
 
 
 @pytest.mark.parametrize("lost", [0.7, 0.0, -0.4])
@@ -46,6 +65,54 @@ def test_objects_that_change_each_in_its_own_way_have_no_common_light() -> None:
         light = np.exp(np.linspace(0, 1, 300)[:, None] * ends + 0.06 * rng.normal(size=(300, 6)))
         assert (brightness_of(light) == 1).all()
     assert (brightness_of(np.exp(0.1 * rng.normal(size=(10, 1)))) == 1).all(), "too short to tell"
+
+
+def spots(rig: Rig, change: float, seed: int = 3) -> tuple[Exposures, np.ndarray]:
+    """Exposures of the simulated camera, and their frames as if the spots' light had changed by such a share."""
+    simulated = aolink.simulate(rig, 120, seed=seed)
+    frames = np.array([each.pixels for each in simulated], dtype=np.float64)
+    light = (1 + change) ** (np.arange(len(frames)) / (len(frames) - 1))
+    black = rig.sensor.black_level
+    return simulated, np.rint(black + (frames - black) * light[:, None, None]).astype(np.uint16)
+
+
+@pytest.mark.parametrize(("name", "estimator"), [("sh-4x4", "moments"), ("section-vi-lively", "o1")])
+@pytest.mark.parametrize(("change", "said"), [(-0.4, "fades by (3[6-9]|4[0-4])%"), (0.5, "grows by (4[2-9]|5[0-8])%")])
+def test_a_film_of_the_rigs_own_camera_that_fades_is_scaled_to_its_light(
+    tmp_path: Path, name: str, estimator: str, change: float, said: str
+) -> None:
+    """Estimates are as near to the path as those of the film that does not change."""
+    rig = quiet(name)
+    simulated, frames = spots(rig, change)
+    inputs = np.concatenate([part for each in simulated for part in (each.lead_inputs, each.inputs)])
+    film = array_film(frames, "film", inputs=inputs)
+    (note,) = import_film(film, rig, Settings(rate_hz=rate(rig)), tmp_path / "a.mcap").notes
+    assert re.search(said, note)
+    found = aolink.estimate(Recording(tmp_path / "a.mcap"), estimator)
+    as_they_came = aolink.estimate(aolink.exposures(frames, rig, inputs, starts(simulated)), estimator)
+    true = np.array([truth_of(each).path for each in simulated])
+    errors = [
+        np.sqrt(np.mean((np.array([each.path for each in some]) - true)[5:] ** 2))
+        for some in (aolink.estimate(simulated, estimator), found, as_they_came)
+    ]
+    assert errors[1] < 1.1 * errors[0]
+    assert errors[2] > 1.1 * errors[1]
+
+
+@pytest.mark.parametrize("name", ["sh-4x4", "section-vi-lively", "single-lenslet", "jitter"])
+@pytest.mark.parametrize("seed", range(3))
+def test_a_film_whose_light_is_constant_is_left_as_it_is(tmp_path: Path, name: str, seed: int) -> None:
+    """Noise, motion, and another light than the rig file's are no change."""
+    rig = load_rig(name)
+    _, frames = spots(rig, 0.0, seed)
+    half = np.rint(rig.sensor.black_level + (frames - rig.sensor.black_level) / 2).astype(np.uint16)
+    for some in (frames, half):
+        account = import_film(
+            array_film(some, "film"), rig, Settings(rate_hz=rate(rig)), tmp_path / "a.mcap", overwrite=True
+        )
+        assert account.notes == ()
+        for each, frame in zip(Recording(tmp_path / "a.mcap").exposures(), some, strict=True):
+            assert (each.pixels == frame)[each.mask].all()
 
 
 @pytest.mark.long
