@@ -38,7 +38,8 @@ def in_correlation_steps(covariance: FloatArray) -> tuple[FloatArray, FloatArray
     """Covariances as standard deviations in single precision and multiples of `CORRELATION_STEP` between them.
 
     Rounding changes each correlation by half a step at most, and so an eigenvalue of n of them by n / 2 steps at most
-    (Gershgorin). Variances are larger by that share of themselves: what is positive semidefinite remains so.
+    (Gershgorin). Variances are larger by that share of themselves: what is positive semidefinite remains so. A variance
+    below zero is rounding, and becomes zero.
 
     Returns
     -------
@@ -47,7 +48,7 @@ def in_correlation_steps(covariance: FloatArray) -> tuple[FloatArray, FloatArray
     n = covariance.shape[-1]
     # One step more than those of n - 1 correlations, which is more than single precision's rounding.
     larger = np.einsum("...ii->...i", covariance) / (1 - (n + 1) * CORRELATION_STEP / 2)
-    sd = np.sqrt(larger).astype(np.float32).astype(np.float64)
+    sd = np.sqrt(np.maximum(larger, 0.0)).astype(np.float32).astype(np.float64)
     return sd, correlation_steps(covariance, sd)
 
 

@@ -166,7 +166,7 @@ def estimate_message(estimate: Estimate) -> pb.Estimate:
 
 def correlated(covariance: NDArray[np.float64]) -> bytes:
     """Matrices (axes, n, n) that were rounded by `as_recorded`, as schemas.proto says; empty where they were not."""
-    sd = np.sqrt(np.einsum("aii->ai", covariance)).astype(np.float32).astype(np.float64)
+    sd = np.sqrt(np.maximum(np.einsum("aii->ai", covariance), 0.0)).astype(np.float32).astype(np.float64)
     steps = correlation_steps(covariance, sd)
     if not np.array_equal(from_correlation_steps(sd, steps), covariance):
         return b""
