@@ -25,8 +25,8 @@ _SPACING = 0.06
 _DECAY = 0.4
 """Decay of the grid's resonances in a frame period, in nats."""
 _STARTS = 8
-_ROUNDS = 3
-"""How often, at most, the aliases of the highest maximum so far are tried again."""
+_ROUNDS = 5
+"""How often, at most, the aliases of a maximum are tried again."""
 _FINE = 0.01
 """Spacing of the scan for a sharp vibration, cycles per exposure."""
 _SHARP = 0.003
@@ -37,7 +37,7 @@ _MOST = 3000
 """Most points of a grid of several processes."""
 KEPT = 30.0
 """Local maxima that are lower than the highest by more than this, in nats, are forgotten: the pixels may prefer one
-that is lower by less (`aliases`)."""
+that is lower by less (`pixels`)."""
 _SAME = 0.02
 """Maxima whose parameters differ by less than this share are one."""
 _RIDGE = 0.5
@@ -231,12 +231,16 @@ def maxima(space: Space, seen: Sequence[Readings]) -> list[Maximum]:
     looked_at: list[Maximum] = []
     for _ in range(_ROUNDS):
         # A sharp vibration beside a drift is often found at an alias first; the true one is found only from exactly
-        # that maximum.
-        top = max(best, key=lambda each: each.log_likelihood)
-        if any(_near(space, top.x, other.x, 5e-3) for other in looked_at):
+        # that maximum. Once the highest one's aliases are known, those of the next family are tried.
+        ranked = sorted(best, key=lambda each: -each.log_likelihood)
+        fresh = [each for each in ranked if not any(_near(space, each.x, other.x, 5e-3) for other in looked_at)]
+        if fresh[:1] != ranked[:1]:
+            others = [x for at in looked_at for x in _aliases(space, at.x, seen[0])]
+            fresh = [each for each in fresh if not any(_near(space, each.x, x, 5e-3) for x in others)]
+        if not fresh:
             break
-        looked_at.append(top)
-        for start in _aliases(space, top.x, seen[0]):
+        looked_at.append(fresh[0])
+        for start in _aliases(space, fresh[0].x, seen[0]):
             _add(space, best, climb(space, start, of))
     for start in _sharp(space, max(best, key=lambda each: each.log_likelihood).x, seen[0], of):
         _add(space, best, climb(space, start, of))

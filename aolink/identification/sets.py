@@ -68,12 +68,22 @@ class Identified:
             (each.low <= value or each.open_low) and (value <= each.high or each.open_high) for each in self.pieces
         )
 
+    def at(self, value: float) -> Identified:
+        """The set with another best value, which the pixels prefer; its nearest piece is extended to hold it."""
+        distances = [max(each.low - value, value - each.high) for each in self.pieces]
+        nearest = distances.index(min(distances))
+        pieces = tuple(
+            replace(each, low=min(each.low, value), high=max(each.high, value), best=value) if k == nearest else each
+            for k, each in enumerate(self.pieces)
+        )
+        return replace(self, best=value, pieces=pieces)
+
 
 def identified(
     space: Space, found: Sequence[Maximum], seen: Sequence[Readings], tell: Callable[[int], None] | None = None
 ) -> tuple[Identified, ...]:
     """The sets of all parameters, from the local maxima, the best first: the highest, or the one that the pixels prefer
-    (`aliases`)."""
+    (`pixels`)."""
     of = [Likelihood(each, BLOCK) for each in seen]
     top = found[0]
     curvature = _curvature(space, top, of)

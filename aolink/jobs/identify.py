@@ -21,12 +21,14 @@ from aolink.identification import (
     Space,
     Tried,
     by_pixels,
+    candidates,
     chosen,
     identified,
     identified_text,
     kinds_of,
     maxima,
     readings,
+    refined,
     space_of,
     tried,
 )
@@ -166,23 +168,35 @@ def _of_output(
             highest_hz=wanted.highest_hz, plant=wanted.plant,
         )  # fmt: skip
 
-    candidates: list[Tried] = []
+    scored: list[Tried] = []
     if len(wanted.models) > 1:
         for number, name in enumerate(wanted.models):
             if tell:
                 tell(f"models, {output}", number, len(wanted.models))
-            candidates.append(tried(name, space, seen))
-        name = chosen(candidates).name
+            scored.append(tried(name, space, seen))
+        name = chosen(scored).name
     else:
         name = wanted.models[0] if wanted.models else ""
     of = space(kinds_of(name) if name else ())
     if tell:
         tell(f"fit, {output}", 0, len(of.names) + 1)
     everything = tops = maxima(of, seen)
+    x = tops[0].x
     if rig.plant.n_outputs == 1 and rig.plant.axes <= _BY_PIXELS and rig.plant.wandering is None:
-        tops = by_pixels(everything, lambda each: _with_model(rig, of, each), exposures)
+
+        def rig_of(x: FloatArray) -> Rig:
+            return _with_model(rig, of, x)
+
+        def on_pixels(done: int, of: int) -> None:
+            if tell:
+                tell(f"pixels, {output}", done, of)
+
+        left = by_pixels(candidates(of, everything, seen), rig_of, exposures, on_pixels)
+        tops = list(dict.fromkeys(each.maximum for each in left))
+        x = refined(of, left[0].x, rig_of, exposures, on_pixels)
     sets = identified(of, tops, seen, (lambda k: tell(f"fit, {output}", k + 1, len(of.names) + 1)) if tell else None)
-    x, plant = tops[0].x, of.fitted_plant(tops[0].x)
+    sets = tuple(each.at(value) for each, value in zip(sets, np.exp(x).tolist(), strict=True))
+    plant = of.fitted_plant(x)
     noise, wider = of.others(x)
     notes = _ruled_out(of, everything, tops)
     for each in sets:
@@ -191,7 +205,7 @@ def _of_output(
             notes.append(f"{each.name}: {rest} Hz explains the exposures nearly as well: an alias that remains")
     return IdentifiedModel(
         output=output, model=_without_plant(of, x), plant=plant, noise=noise, wider=wider, parameters=sets,
-        tried=tuple(candidates), log_likelihood=tops[0].log_likelihood,
+        tried=tuple(scored), log_likelihood=tops[0].log_likelihood,
         exposures=sum(int(each.usable.any(axis=0).sum()) for each in seen), notes=tuple(notes),
     )  # fmt: skip
 
@@ -202,10 +216,10 @@ def _without_plant(of: Space, x: FloatArray) -> ProcessSum:
     return replace(whole, processes=whole.processes[1 if of.plant else 0 :])
 
 
-def _with_model(rig: Rig, of: Space, at: Maximum) -> Rig:
-    """The rig with the model of a maximum, for a plant of one output."""
-    noise, wider = of.others(at.x)
-    models, plant = [_without_plant(of, at.x)], of.fitted_plant(at.x)
+def _with_model(rig: Rig, of: Space, x: FloatArray) -> Rig:
+    """The rig with the model of a vector of parameters, for a plant of one output."""
+    noise, wider = of.others(x)
+    models, plant = [_without_plant(of, x)], of.fitted_plant(x)
     return parse_rig(identified_text(rig.toml, rig, models, plant=plant, noise=noise, wider=wider))
 
 

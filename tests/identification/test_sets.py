@@ -5,7 +5,7 @@ import pytest
 
 import aolink
 from aolink.errors import IdentificationError
-from aolink.identification import chosen, identified, maxima, readings, space_of, tried
+from aolink.identification import Identified, Piece, chosen, identified, maxima, readings, space_of, tried
 from aolink.jobs.demo import simulated_rig
 from aolink.recording.reader import Recording
 from aolink.session import record
@@ -98,3 +98,16 @@ def test_a_plant_is_identified_from_a_session_that_plays_a_pseudo_random_sequenc
     best = of.fitted_plant(maxima(of, seen)[0].x)
     assert best["gain"] == pytest.approx(0.8, rel=0.05)
     assert best["correlation_s"] == pytest.approx(-1e-3 / np.log(0.995), rel=0.05)
+
+
+@pytest.mark.parametrize(
+    ("value", "ends"), [(2.5, (2.0, 3.0)), (3.4, (2.0, 3.4)), (1.2, (0.9, 1.2))], ids=["inside", "above", "other piece"]
+)
+def test_a_set_is_extended_to_hold_the_value_that_the_pixels_prefer(value, ends):
+    low = Piece(0.9, 1.1, 1.0, open_low=False, open_high=False)
+    high = Piece(2.0, 3.0, 2.2, open_low=False, open_high=True)
+    found = Identified("frequency_hz", 2.2, (low, high), 1.0).at(value)
+    assert found.best == value
+    assert found.holds(value)
+    moved = [each for each in found.pieces if each not in (low, high)]
+    assert [(each.low, each.high, each.best) for each in moved] == [(*ends, value)]

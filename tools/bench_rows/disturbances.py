@@ -129,14 +129,24 @@ def _autoregressive(slopes: FloatArray, order: int) -> FloatArray:
     return np.vstack([np.linalg.solve(normal, before.T @ after), np.eye(order - 1, order)])
 
 
-def likeliest(slopes: FloatArray) -> ProcessSum:
+def likeliest(slopes: FloatArray, start: ProcessSum | None = None) -> ProcessSum:
+    """The sum of processes with the highest likelihood (Whittle), searched from a start, whose kinds it keeps.
+
+    Without a start: two processes of second order.
+    """
     frequency, power = signal.periodogram(slopes, 1 / STEP_S, window="hann", detrend="constant")
     used = slice(2, int(np.searchsorted(frequency, _HIGHEST_HZ)))  # the taper mixes the first two with the mean
-    omega, power, sd = 2 * math.pi * frequency[used], power[used] / 2, slopes.std()
+    omega, power, sd = 2 * math.pi * frequency[used], power[used] / 2, float(slopes.std())
+    if start is None:
+        two = ((0.3, 0.03, 0.7 * sd), (0.05, 0.01, 0.7 * sd))
+        start = ProcessSum(tuple(Process("second-order", each) for each in two))
 
     def model(x: FloatArray) -> ProcessSum:
-        values = np.exp(x).reshape(2, 3)
-        return ProcessSum(tuple(Process("second-order", tuple(each)) for each in values.tolist()))
+        values, processes = np.exp(x).tolist(), []
+        for each in start.processes:
+            processes.append(Process(each.kind, tuple(values[: len(each.values)])))
+            values = values[len(each.values) :]
+        return ProcessSum(tuple(processes))
 
     def minus_log_likelihood(x: FloatArray) -> float:
         density = np.zeros_like(omega)
@@ -145,6 +155,13 @@ def likeliest(slopes: FloatArray) -> ProcessSum:
             density += (each.shares[:, None] * -2 * poles / (poles**2 + omega**2)).sum(axis=0).real
         return float(np.sum(np.log(density) + power / density))
 
-    start = np.log([0.3, 0.03, 0.7 * sd, 0.05, 0.01, 0.7 * sd])
-    limits = [(math.log(1e-3), math.log(10.0))] * 2 + [(math.log(1e-3 * sd), math.log(3 * sd))]
-    return model(optimize.minimize(minus_log_likelihood, start, method="L-BFGS-B", bounds=2 * limits).x)
+    limits = {
+        "correlation_s": (1e-3, 10.0), "second_correlation_s": (1e-3, 10.0), "sd": (1e-3 * sd, 3 * sd),
+        "frequency_hz": (frequency[1], _HIGHEST_HZ), "damping": (1e-4, 0.5),
+    }  # fmt: skip
+    bounds = [
+        (math.log(low), math.log(high))
+        for each in start.processes for low, high in (limits[name] for name in each.names)
+    ]  # fmt: skip
+    values = [value for each in start.processes for value in each.values]
+    return model(optimize.minimize(minus_log_likelihood, np.log(values), method="L-BFGS-B", bounds=bounds).x)

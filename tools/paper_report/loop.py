@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 from bench_rows.loop_worth import (
     FACTORS,
+    FROM_PATH,
     HEADLINE,
     LINE,
     TURBULENCE,
@@ -25,6 +26,7 @@ _COLUMNS = (
     "profile",
     "identified o1",
     "identified profile",
+    FROM_PATH,
     "true state",
 )
 
@@ -57,9 +59,10 @@ def loop_section(cells: Sequence[Measured]) -> list[Block]:
             f" integrator whose gain is the best for these seeds: mean over {seeds} seeds, in brackets the one-sided"
             " 95 % bound. o1, moments and profile serve lqg with the true model of the line, and of turbulence with one"
             " that is fitted to its true slopes before; identified means with a model from the blurred frames before"
-            " alone. ar_kalman and least_squares are pyRTC's predictors, fitted to the centroids of the same frames."
-            " true state is lqg given the disturbance itself up to the end of each exposure, by an autoregressive model"
-            " of order 64 of turbulence: what bounds all of them, as far as that model goes."
+            f" alone; {FROM_PATH} has a model of the same kinds that is fitted to the true slopes of these frames,"
+            " and so bounds identification. ar_kalman and least_squares are pyRTC's predictors, fitted to the centroids"
+            " of the same frames. true state is lqg given the disturbance itself up to the end of each exposure, by an"
+            " autoregressive model of order 64 of turbulence: what bounds all of them, as far as that model goes."
         ),
         Table(["disturbance", *_COLUMNS, "gain"], rows),
         Text("The goals, each to be kept by the bound:"),

@@ -1,0 +1,189 @@
+"""What all pixels say about a vibration: which of its aliases it is, how long it lasts, and its frequency.
+
+The likelihood of `likelihood` has two sums of each exposure. Its maxima at the aliases of a vibration can be nearly as
+high as that at its frequency, and where its damping is low, these sums hardly show how low. The shape of the blur tells
+more: where a spot turns, and how often. So the filter of `profile` goes through the exposures with each candidate's
+model, and the sum of its log-evidences, which is the log-likelihood of the pixels except for Laplace's approximation
+(`aolink.estimation.pixels.modes`), decides between candidates. One that is far behind is left out at once, so that most
+of them take few exposures.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from aolink.errors import EstimatorError
+from aolink.estimation import Estimator, make_estimator
+from aolink.exposure import Exposure
+from aolink.identification.readings import Readings
+from aolink.identification.search import Maximum, Space
+from aolink.numerics.arrays import FloatArray
+from aolink.rig import Rig
+
+_ESTIMATOR = "profile:tempered=0"
+"""Without tempered points: they cost ten times as much, and the evidence is not from them."""
+_RULED_OUT = 30.0
+"""Nats by which a candidate is behind where it is left out: the evidence is approximate."""
+_MOST = 10.0
+"""The most nats by which one exposure counts against a candidate: no single frame may decide."""
+_SETTLED = 4
+"""Exposures at the beginning that do not count: every filter first has to find its state."""
+_ENOUGH = 256
+"""Exposures after which candidates that are still alike are left as they are."""
+_DECAY = 1 / 8
+"""Decay time of the vibration of a candidate beside a maximum, in lengths of the recording."""
+_ALIKE = 3.0
+"""Such a candidate is not made where the maximum's own damping is within this factor."""
+_MOVES = 4
+"""The most steps along one parameter."""
+
+
+RigOf = Callable[[FloatArray], Rig]
+"""A function that gives the rig with the parameters of a `Space`."""
+Tell = Callable[[int, int], None]
+"""Called with how much is done, and how much there is."""
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """A model that the pixels may choose."""
+
+    x: FloatArray
+    """Its parameters, as those of its `Space`."""
+    maximum: Maximum
+    """The local maximum of the likelihood of readings that it is, or is beside."""
+
+
+def candidates(space: Space, found: Sequence[Maximum], seen: Sequence[Readings]) -> list[Candidate]:
+    """Each maximum, with vibrations that last an eighth of the recording where its own do not.
+
+    A candidate whose vibrations never change loses against any other alias with some damping as soon as the true
+    vibration has changed, although its frequency is right. So where a maximum's vibrations last for longer than the
+    recording, the other takes its place; where they last for less, both are candidates.
+    """
+    whole = max(each.slots * each.period_steps * each.step_s for each in seen)
+    out = []
+    for each in found:
+        x = each.x.copy()
+        lasting = False
+        for k in _frequencies(space):
+            damping = -math.log(2 * math.pi * _DECAY * whole) - x[k]
+            lasting |= x[k + 1] < damping + math.log(_DECAY)
+            if abs(damping - x[k + 1]) > math.log(_ALIKE):
+                x[k + 1] = np.clip(damping, *space.bounds[k + 1])
+        if not lasting:
+            out.append(Candidate(each.x, each))
+        if (x != each.x).any():
+            out.append(Candidate(x, each))
+    return out
+
+
+def _frequencies(space: Space) -> list[int]:
+    """Where the vibrations' frequencies are among the parameters; the damping of each comes next."""
+    return [k for k, name in enumerate(space.names) if name.endswith("frequency_hz")]
+
+
+def by_pixels(
+    found: Sequence[Candidate], rig_of: RigOf, exposures: Sequence[Exposure], tell: Tell = lambda done, of: None
+) -> list[Candidate]:  # fmt: skip
+    """The candidates that the pixels do not rule out, the one with the highest evidence first.
+
+    Where `profile` cannot work on the rig, or there is one candidate only, they are all returned in their order.
+
+    Parameters
+    ----------
+    found:
+        Candidates, in the order to keep where the pixels cannot decide.
+    rig_of:
+        A function that gives the rig with a candidate's parameters.
+    exposures:
+        The exposures of the recording, with pixels.
+    tell:
+        Called with the exposures that have been used, and how many there are.
+    """
+    if len(found) < 2:
+        return list(found)
+    try:
+        running = {k: make_estimator(rig_of(each.x), _ESTIMATOR) for k, each in enumerate(found)}
+    except EstimatorError:
+        return list(found)
+    total = np.zeros(len(found))
+    used = exposures[:_ENOUGH]
+    for number, exposure in enumerate(used):
+        tell(number, len(used))
+        each = np.array([_log_evidence(estimator, exposure) for estimator in running.values()])
+        if number < _SETTLED or not np.isfinite(each).any():
+            continue
+        at = list(running)
+        total[at] += np.maximum(np.nan_to_num(each, nan=-np.inf) - np.nanmax(each), -_MOST)
+        behind = [k for k in at if total[k] < total[at].max() - _RULED_OUT]
+        for k in behind:
+            del running[k]
+        if len(running) == 1:
+            break
+    return [found[k] for k in sorted(running, key=lambda k: -total[k])]
+
+
+def refined(
+    space: Space, x: FloatArray, rig_of: RigOf, exposures: Sequence[Exposure], tell: Tell = lambda done, of: None
+) -> FloatArray:  # fmt: skip
+    """Parameters in which damping and frequency of each vibration are where the pixels' evidence is highest.
+
+    One after the other is moved, by steps up to the highest of three evidences and then to the vertex of the parabola
+    through them. Where `profile` cannot work on the rig, they stay. The parameters are those of `candidates`, and the
+    others as in `by_pixels`; `tell` is called with the parameters that have been moved.
+    """
+    x = x.copy()
+
+    def evidence(x: FloatArray) -> FloatArray:
+        estimator = make_estimator(rig_of(x), _ESTIMATOR)
+        return np.array([_log_evidence(estimator, exposure) for exposure in exposures[:_ENOUGH]][_SETTLED:])
+
+    def beside(k: int, to: float) -> tuple[float, FloatArray]:
+        other = x.copy()
+        other[k] = np.clip(to, *space.bounds[k])
+        return float(other[k]), evidence(other)
+
+    moved = [at for k in _frequencies(space) for at in (k, k + 1)]
+    try:
+        here = evidence(x) if moved else np.zeros(0)
+    except EstimatorError:
+        return x
+    for number, k in enumerate(moved):
+        tell(number, len(moved))
+        # Half of a resonance's width, over its frequency, is its damping.
+        step = math.exp(x[k + 1]) if k in _frequencies(space) else math.log(2)
+        left, right = beside(k, x[k] - step), beside(k, x[k] + step)
+        for _ in range(_MOVES):
+            down, up = _gain(left[1], here), _gain(right[1], here)
+            if max(down, up) <= 0:
+                break
+            if up > down:
+                left, (x[k], here) = (float(x[k]), here), right
+                right = beside(k, x[k] + step)
+            else:
+                right, (x[k], here) = (float(x[k]), here), left
+                left = beside(k, x[k] - step)
+        down, up = _gain(left[1], here), _gain(right[1], here)
+        if max(down, up) <= 0 and down + up < 0:
+            at, there = beside(k, x[k] + step * (down - up) / (2 * (down + up)))
+            if _gain(there, here) > 0:
+                x[k], here = at, there
+    return x
+
+
+def _gain(of: FloatArray, base: FloatArray) -> float:
+    """Evidence of one model over that of another, nats, no exposure counting by more than its share."""
+    return float(np.clip(np.nan_to_num(of - base), -_MOST, _MOST).sum())
+
+
+def _log_evidence(estimator: Estimator, exposure: Exposure) -> float:
+    """Log-evidence of a frame, nats, the sum over axes; NaN where it shows none."""
+    estimator.step(exposure)
+    assert estimator.posterior is not None
+    evidence: FloatArray | None = estimator.posterior.log_evidence
+    return float("nan") if evidence is None else float(evidence.sum())
