@@ -24,7 +24,7 @@ from aolink.numerics.arrays import FloatArray
 from aolink.recording.reader import Recording
 from aolink.rig import Rig, parse_rig
 from paper_report.blocks import Block, Heading, Table, Text
-from paper_report.ensemble import Measured, mean, ratio
+from paper_report.ensemble import IntervalEstimate, mean, ratio
 from paper_report.numbers import Effort
 from paper_report.spheres import centroids
 from paper_report.spot_films import random_walk, resonance, spot_film
@@ -118,11 +118,11 @@ class MadeFilm:
     """Results for one kind of film."""
 
     kind: Kind
-    over_held: dict[str, Measured]
+    over_held: dict[str, IntervalEstimate]
     """RMSE of the path over that of the centroid, held, by estimator."""
-    over_interpolated: dict[str, Measured]
+    over_interpolated: dict[str, IntervalEstimate]
     """RMSE of the smoothed path over that of the centroid interpolated between the pictures."""
-    coverage: dict[str, Measured]
+    coverage: dict[str, IntervalEstimate]
     """Share of the true path inside the estimate's 95 % intervals."""
 
 
