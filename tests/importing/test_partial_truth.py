@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import aolink
-from aolink.batch import FilmSettings as Batch
+from aolink.batch import Settings as Batch
 from aolink.batch import estimate_file
 from aolink.estimation import run, score
 from aolink.exporting.files import export

@@ -18,7 +18,7 @@ from aolink.estimation import make_estimator, smooth
 from aolink.exposure import Exposure
 from aolink.importing.film import array_film
 from aolink.importing.first_rig import first_rig
-from aolink.importing.frames import Settings
+from aolink.importing.frames import FilmSettings
 from aolink.importing.recording import import_film
 from aolink.numerics.arrays import FloatArray
 from aolink.recording.reader import Recording
@@ -77,7 +77,7 @@ def made(kind: Kind, seed: int, exposures: int) -> tuple[Rig, list[Exposure], Fl
     shape = (_PITCH, _PITCH * _SPOTS)
     film = spot_film(rng, motion, middles, shape, light=light)
     places = tuple((float(x), float(y)) for x, y in film.places[0])
-    settings = Settings(rate_hz=100.0, subtract_median=True, track=_SPOTS, frames_per_exposure=K, places=places)
+    settings = FilmSettings(rate_hz=100.0, subtract_median=True, track=_SPOTS, frames_per_exposure=K, places=places)
     source = array_film(film.frames, "film")
     text = first_rig(source, settings, "film").text
     if kind.periods:

@@ -16,7 +16,7 @@ import numpy as np
 from aolink.estimation import ESTIMATOR_NAMES, make_estimator, smooth
 from aolink.exposure import Exposure
 from aolink.importing.first_rig import first_rig
-from aolink.importing.frames import Settings
+from aolink.importing.frames import FilmSettings
 from aolink.importing.readers import open_film
 from aolink.importing.recording import import_film
 from aolink.importing.survey import survey
@@ -51,7 +51,7 @@ def spheres(K: int) -> tuple[Rig, list[Exposure], BoolArray]:
 
     The last is (exposures, 12).
     """
-    settings = Settings(rate_hz=_RATE_HZ, invert=True, track=6, places=places(), frames_per_exposure=K)
+    settings = FilmSettings(rate_hz=_RATE_HZ, invert=True, track=6, places=places(), frames_per_exposure=K)
     film = open_film(FILE)
     rig = parse_rig(first_rig(film, settings, "spheres").text)
     with tempfile.TemporaryDirectory() as folder:
