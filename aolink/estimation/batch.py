@@ -34,11 +34,14 @@ class Batch:
         # One exposure of many axes is megabytes, and not copied.
         inputs = exposures[0].inputs[None] if len(exposures) == 1 else np.array([each.inputs for each in exposures])
         self.finite = [True] * len(exposures)
-        if not are_numbers(inputs):
-            self.finite, inputs = np.isfinite(inputs).all(axis=(1, 2)).tolist(), numbers(inputs)
         self.model = exposure_model(rig.plant, n_steps, offset)
-        self.responses = self.model.responses(inputs)
+        with np.errstate(invalid="ignore"):
+            self.responses = self.model.responses(inputs)
         """Responses of all axes of the first exposure, then of the second, (exposures * axes, ...)."""
+        # The response of the end state is no number where an input is none, and is a hundredth of their size.
+        if not are_numbers(self.responses.end) and not are_numbers(inputs):
+            self.finite = np.isfinite(inputs).all(axis=(1, 2)).tolist()
+            self.responses = self.model.responses(numbers(inputs))
 
     def model_of(self, k: int) -> ExposureModel:
         """The model of one exposure."""
