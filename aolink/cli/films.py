@@ -11,7 +11,7 @@ from aolink.cli.common import JsonOption, OutputOption, OverwriteOption, app, lo
 from aolink.errors import ImportingError
 
 if TYPE_CHECKING:
-    from aolink.importing.frames import Settings
+    from aolink.importing.frames import FilmSettings
 
 RateOption = Annotated[
     float | None, typer.Option("--rate", metavar="HZ", help="Frames a second, where the film does not state them.")
@@ -42,9 +42,9 @@ TopicOption = Annotated[
 
 def film_settings(
     rate: float | None, frames: int, track: int, at: list[str] | None, invert: bool, gamma: float, **more: object
-) -> "Settings":
+) -> "FilmSettings":
     """The options of a command as settings. Raises ImportingError for an invalid place."""
-    from aolink.importing.frames import Settings
+    from aolink.importing.frames import FilmSettings
 
     if rate is not None and rate <= 0:
         raise ImportingError(f"--rate {rate:g} must be above 0")
@@ -55,9 +55,9 @@ def film_settings(
         except ValueError:
             raise ImportingError(f"--at {text} is no place: give X,Y in pixels, such as --at 12.5,40") from None
         places.append((x, y))
-    return Settings(
+    return FilmSettings(
         rate_hz=rate, frames_per_exposure=frames, track=track or len(places), places=tuple(places), invert=invert,
-        gamma=gamma, **more,  # type: ignore[arg-type] # fields of Settings
+        gamma=gamma, **more,  # type: ignore[arg-type] # fields of FilmSettings
     )  # fmt: skip
 
 

@@ -40,7 +40,7 @@ from aolink.files import check_target, writing
 from aolink.signals import StopRequest
 
 if TYPE_CHECKING:
-    from aolink.importing.frames import Settings
+    from aolink.importing.frames import FilmSettings
     from aolink.rig import Rig
 
 
@@ -155,7 +155,7 @@ def rig(
     stop.raise_if_asked()
 
 
-def _write_first_rig(path: Path, source: Path, topic: str | None, settings: "Settings", overwrite: bool) -> None:
+def _write_first_rig(path: Path, source: Path, topic: str | None, settings: "FilmSettings", overwrite: bool) -> None:
     from aolink.importing.first_rig import first_rig
     from aolink.importing.readers import open_film
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from serial.tools import list_ports as serial_ports
 
-from aolink.devices.drivers import KINDS, NATIVE, Kind, calling, driver_names, load_driver
+from aolink.devices.drivers import KINDS, NATIVE, DeviceKind, calling, driver_names, load_driver
 from aolink.devices.gate import printable
 from aolink.devices.identity import identify, new_nonce
 from aolink.devices.interfaces import lacks_of
@@ -45,7 +45,7 @@ class FoundDevice:
 class DriverFound:
     """A driver, what its devices cannot do, and which of them are there."""
 
-    kind: Kind
+    kind: DeviceKind
     name: str
     lacks: list[str] = field(default_factory=list)
     devices: list[tuple[str, str]] = field(default_factory=list)
@@ -65,7 +65,7 @@ def find_drivers() -> list[DriverFound]:
     return [_find(kind, name) for kind in KINDS for name in driver_names(kind)]
 
 
-def _find(kind: Kind, name: str) -> DriverFound:
+def _find(kind: DeviceKind, name: str) -> DriverFound:
     if name == NATIVE:
         return DriverFound(kind=kind, name=name, search="`aolink devices PORT...` identifies the device at a port")
     try:

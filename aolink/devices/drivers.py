@@ -13,18 +13,18 @@ from aolink.extensions import installed, loaded
 from aolink.rig import Rig
 from aolink.rig.device_tables import DeviceTable
 
-Kind = Literal["camera", "mirror"]
-KINDS: tuple[Kind, ...] = get_args(Kind)
+DeviceKind = Literal["camera", "mirror"]
+KINDS: tuple[DeviceKind, ...] = get_args(DeviceKind)
 NATIVE = "native"
 """The driver of devices that speak aolink's packets; its only key is ``port``."""
 
 
-def driver_names(kind: Kind) -> list[str]:
+def driver_names(kind: DeviceKind) -> list[str]:
     """Names of the installed drivers; those of other packages may turn out to be broken when they are loaded."""
     return [NATIVE, *sorted(_others(kind))]
 
 
-def open_driver(kind: Kind, table: DeviceTable, rig: Rig) -> Any:
+def open_driver(kind: DeviceKind, table: DeviceTable, rig: Rig) -> Any:
     """Make the driver that a rig file names, with its own keys.
 
     Raises
@@ -39,7 +39,7 @@ def open_driver(kind: Kind, table: DeviceTable, rig: Rig) -> Any:
         return make(rig, **table.options)
 
 
-def check_driver(kind: Kind, table: DeviceTable, rig: Rig) -> Callable[..., Any]:
+def check_driver(kind: DeviceKind, table: DeviceTable, rig: Rig) -> Callable[..., Any]:
     """The class of the driver that a rig file names, whose keys fit; nothing is opened. Raises as `open_driver`."""
     make = load_driver(kind, table.driver)
     try:
@@ -73,7 +73,7 @@ class Failure:
             raise self.error
 
 
-def load_driver(kind: Kind, name: str) -> Callable[..., Any]:
+def load_driver(kind: DeviceKind, name: str) -> Callable[..., Any]:
     """The class of a driver. Raises DeviceError where there is none of this name, or it cannot be loaded."""
     point = _others(kind).get(name)
     if point is None:
@@ -84,5 +84,5 @@ def load_driver(kind: Kind, name: str) -> Callable[..., Any]:
     return loaded(point, f"{kind} driver", DeviceError)  # type: ignore[no-any-return]
 
 
-def _others(kind: Kind) -> dict[str, EntryPoint]:
+def _others(kind: DeviceKind) -> dict[str, EntryPoint]:
     return {name: point for name, point in installed(f"aolink.{kind}s").items() if name != NATIVE}

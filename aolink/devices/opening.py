@@ -12,7 +12,7 @@ from typing import Any
 
 from aolink.devices.adapted_camera import AdaptedCamera
 from aolink.devices.adapted_mirror import AdaptedMirror
-from aolink.devices.drivers import KINDS, NATIVE, Kind, calling, driver_names, open_driver
+from aolink.devices.drivers import KINDS, NATIVE, DeviceKind, calling, driver_names, open_driver
 from aolink.devices.gate import Gate
 from aolink.devices.host import Host
 from aolink.devices.identity import check_against_rig, check_kind, identify, new_nonce
@@ -102,7 +102,7 @@ def open_devices(
         yield Opened(host, camera, mirror, warnings)
 
 
-def _table(rig: Rig, kind: Kind, port: str | None) -> DeviceTable | None:
+def _table(rig: Rig, kind: DeviceKind, port: str | None) -> DeviceTable | None:
     """The driver of a device and its keys, from the port or the rig file; None where nothing names it."""
     return rig.devices.get(kind) if port is None else DeviceTable(driver=NATIVE, options={"port": port})
 
@@ -144,7 +144,7 @@ def _close_with(stack: ExitStack, close: Callable[[], None]) -> None:
 
 
 @contextmanager
-def _closing_what_fails(kind: Kind, close: Callable[[], None]) -> Iterator[None]:
+def _closing_what_fails(kind: DeviceKind, close: Callable[[], None]) -> Iterator[None]:
     """Close a driver that turns out to be unusable. Raises DeviceError for any exception of the driver."""
     try:
         with calling(kind, "when it was opened"):
@@ -170,7 +170,7 @@ def signed(rig: Rig, camera_port: str | None, mirror_port: str | None, key: str 
     )
 
 
-def _port_and_key(kind: Kind, table: DeviceTable, rig: Rig) -> tuple[str, bytes | None]:
+def _port_and_key(kind: DeviceKind, table: DeviceTable, rig: Rig) -> tuple[str, bytes | None]:
     others = dict(table.options)
     port, key = others.pop("port", None), others.pop("key", None)
     if not isinstance(port, str) or not isinstance(key, str | Path | None) or others or table.delay:
@@ -184,7 +184,7 @@ def _port_and_key(kind: Kind, table: DeviceTable, rig: Rig) -> tuple[str, bytes 
 
 
 def _open_native(
-    rig: Rig, host: Host, ports: dict[Kind, tuple[str, bytes | None]], stop: Callable[[], bool]
+    rig: Rig, host: Host, ports: dict[DeviceKind, tuple[str, bytes | None]], stop: Callable[[], bool]
 ) -> tuple[NativeCamera | None, NativeMirror | None, list[str]]:
     """The devices that speak packets, None for those that do not, and warnings about them."""
     if not ports:
@@ -233,7 +233,7 @@ def _allow_return(host: Host, stop: Callable[[], bool], within_s: float) -> None
         device.port.allow(partial(SerialPort, transport.url, stop=stop), within_s)
 
 
-def _check_whole(kind: Kind, table: DeviceTable, driver: Any, protocol: type) -> None:
+def _check_whole(kind: DeviceKind, table: DeviceTable, driver: Any, protocol: type) -> None:
     """Refuse a driver that lacks a member of ``protocol``. Raises DeviceError."""
     asked = [name for name in (*protocol.__annotations__, *vars(protocol)) if not name.startswith("_")]
     if lacking := [name for name in asked if not hasattr(driver, name)]:

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 
-from aolink.estimation.model.base import ExposureModel, InputResponse, numbers
+from aolink.estimation.model.base import ExposureModel, InputResponse, are_numbers, numbers
 from aolink.estimation.model.exposure_model import exposure_model
 from aolink.exposure import Exposure
 from aolink.rig import Rig
@@ -33,11 +33,15 @@ class Batch:
         ((n_steps, offset, _),) = kinds
         # One exposure of many axes is megabytes, and not copied.
         inputs = exposures[0].inputs[None] if len(exposures) == 1 else np.array([each.inputs for each in exposures])
-        known = np.isfinite(inputs)
-        self.finite = [True] * len(exposures) if known.all() else known.all(axis=(1, 2)).tolist()
+        self.finite = [True] * len(exposures)
         self.model = exposure_model(rig.plant, n_steps, offset)
-        self.responses = self.model.responses(numbers(inputs, known))
+        with np.errstate(invalid="ignore"):
+            self.responses = self.model.responses(inputs)
         """Responses of all axes of the first exposure, then of the second, (exposures * axes, ...)."""
+        # The response of the end state is no number where an input is none, and is a hundredth of their size.
+        if not are_numbers(self.responses.end) and not are_numbers(inputs):
+            self.finite = np.isfinite(inputs).all(axis=(1, 2)).tolist()
+            self.responses = self.model.responses(numbers(inputs))
 
     def model_of(self, k: int) -> ExposureModel:
         """The model of one exposure."""

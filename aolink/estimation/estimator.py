@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from aolink.estimation.alignment import Shifted, considered, matters, share_of_shift
 from aolink.estimation.batch import Batch
 from aolink.estimation.estimate import Estimate, Status, as_recorded
-from aolink.estimation.frames.measure import Measured, Measurements
+from aolink.estimation.frames.measure import MeasuredFrame, Measurements
 from aolink.estimation.kalman.filter import Filter, Posterior, Run
 from aolink.exposure import Exposure
 from aolink.rig import Rig
@@ -125,7 +125,7 @@ class Estimator:
                 nis=nis,
             )
 
-    def _stepped(self, batch: Batch, k: int, measured: Measured) -> Estimate:
+    def _stepped(self, batch: Batch, k: int, measured: MeasuredFrame) -> Estimate:
         """The estimate of exposure k, which may have gaps and flaws."""
         exposure, model = batch.exposures[k], batch.model_of(k)
         reasons = self._bridge(exposure, batch.finite[k])

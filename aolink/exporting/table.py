@@ -18,7 +18,7 @@ from aolink.series import Series
 if TYPE_CHECKING:
     import pandas as pd
 
-Kind = Literal["text", "integer", "number", "time", "numbers"]
+ColumnKind = Literal["text", "integer", "number", "time", "numbers"]
 ByAxis = Sequence[Any] | FloatArray
 
 
@@ -27,7 +27,7 @@ class Column:
     """A column of the table."""
 
     name: str
-    kind: Kind
+    kind: ColumnKind
     """The type of its values: a ``time`` is ns since 1970, ``numbers`` a list; unknown values are None."""
 
 
@@ -104,7 +104,7 @@ def rows(
             yield row
 
 
-_OF_EXPOSURE: dict[str, Kind] = {
+_OF_EXPOSURE: dict[str, ColumnKind] = {
     "frame_id": "integer", "first_step": "integer", "n_steps": "integer", "start_offset": "number",
     "clock_sigma_ns": "number", "device_start_ns": "integer", "device_end_ns": "integer", "host_start_ns": "integer",
     "host_receive_ns": "integer", "chunks_lost": "integer", "inputs_assumed": "integer",

@@ -16,7 +16,7 @@ from mcap.reader import make_reader
 
 from aolink.errors import ImportingError
 from aolink.extensions import needs_extra
-from aolink.importing.film import Film, Frame, grey
+from aolink.importing.film import Film, FilmFrame, grey
 from aolink.optics.pictures import image_pixels, opened_image
 
 _ENCODINGS = {
@@ -34,7 +34,7 @@ class _Stamped:
     time_ns: int
     """The picture's own time stamp, or 0 where it has none."""
     arrival_ns: int
-    picture: Frame
+    picture: FilmFrame
     """(rows, columns) or (rows, columns, 3 or 4)."""
     lossy: bool
 
@@ -103,7 +103,7 @@ def _chosen(types: dict[str, str], topic: str | None, path: Path) -> str:
 
 
 def _film(path: Path, topic: str, messages: Callable[[], Iterator[_Stamped]]) -> Film:
-    first: Frame | None = None
+    first: FilmFrame | None = None
     stamps, arrivals, lossy = [], [], False
     for each in messages():
         first = each.picture if first is None else first
@@ -128,7 +128,7 @@ def _film(path: Path, topic: str, messages: Callable[[], Iterator[_Stamped]]) ->
     )  # fmt: skip
 
 
-def raw_picture(data: bytes, encoding: str, height: int, width: int, step: int, big_endian: bool = False) -> Frame:
+def raw_picture(data: bytes, encoding: str, height: int, width: int, step: int, big_endian: bool = False) -> FilmFrame:
     """Pixels of a raw picture, (rows, columns) or (rows, columns, 3 or 4). Raises ImportingError."""
     encoding = encoding.lower()
     if encoding not in _ENCODINGS:
@@ -145,7 +145,7 @@ def raw_picture(data: bytes, encoding: str, height: int, width: int, step: int, 
     return np.asarray(pixels.astype(kind.newbyteorder("=")))
 
 
-def compressed_picture(data: bytes) -> tuple[Frame, bool]:
+def compressed_picture(data: bytes) -> tuple[FilmFrame, bool]:
     """Pixels of a JPEG or PNG, (rows, columns) or (rows, columns, 3 or 4), and whether it is lossy."""
     with opened_image(io.BytesIO(data), ImportingError) as image:
         return image_pixels(image), image.format != "PNG"

@@ -14,17 +14,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from aolink.assembly import Assembler
-from aolink.assembly import Frame as RigFrame
+from aolink.assembly import Assembler, Frame
 from aolink.errors import ImportingError
 from aolink.exposure import Exposure, Exposures
 from aolink.importing.brightness import brightness_of, change_of
 from aolink.importing.film import Film
 from aolink.importing.frames import (
-    Account,
+    FilmAccount,
     FilmLight,
+    FilmSettings,
     ImportedExposure,
-    Settings,
     counts_of,
     default_scale,
     frame_times,
@@ -45,7 +44,7 @@ _FEWEST = 10
 """Number of exposures from which on it can be seen that light fades."""
 
 
-def imported(film: Film, rig: Rig, settings: Settings, account: Account) -> Iterator[ImportedExposure]:
+def imported(film: Film, rig: Rig, settings: FilmSettings, account: FilmAccount) -> Iterator[ImportedExposure]:
     """The exposures of a film, one after the other; ``account`` is filled in on the way.
 
     Raises
@@ -140,7 +139,7 @@ def _brightness(light: list[FloatArray]) -> FloatArray:
 
 
 def _of_slopes(
-    film: Film, rig: Rig, settings: Settings, periods: NDArray[np.int64], account: Account
+    film: Film, rig: Rig, settings: FilmSettings, periods: NDArray[np.int64], account: FilmAccount
 ) -> Iterator[ImportedExposure]:
     """The exposures of a film without pictures: all of their pixels are missing."""
     if settings.track or settings.invert or settings.subtract_median or settings.gamma != 1.0:
@@ -166,7 +165,7 @@ def _of_slopes(
 class _Inputs:
     """The inputs that the mirror held; its parked input where the film has none."""
 
-    def __init__(self, film: Film, rig: Rig, settings: Settings, periods: NDArray[np.int64]) -> None:
+    def __init__(self, film: Film, rig: Rig, settings: FilmSettings, periods: NDArray[np.int64]) -> None:
         self._rows, self._park, self._next = film.inputs, rig.mirror.park, 0
         self.notes: tuple[str, ...] = ()
         """Notes for the user about steps whose inputs are not known."""
@@ -261,7 +260,7 @@ def exposures(
         until = start + rig.timing.exposure_steps
         applied = Applied(first_step=step, n_steps=until - step, u=held[step:until].ravel())
         step = until
-        frame = RigFrame(
+        frame = Frame(
             frame_id=k + 1, first_step=start, last_step=until - 1, pixels=values[k].astype(np.uint16), mask=mask,
             chunks_lost=0, frames_lost_before=0, device_start_ns=start * rig.timing.fast_step_ns,
             device_end_ns=until * rig.timing.fast_step_ns, host_first_byte_ns=0, host_receive_ns=0,

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from aolink.errors import ImportingError
 
-Frame = NDArray[np.generic]
+FilmFrame = NDArray[np.generic]
 
 _CONVERTERS = (10, 12, 14)
 """Bits of cameras whose pixels are stored in 16, at the lower end or at the upper one."""
@@ -37,7 +37,7 @@ class Film:
     """Type of the pixels, as they are stored."""
     count: int
     """Number of frames."""
-    frames: Callable[[], Iterator[Frame]]
+    frames: Callable[[], Iterator[FilmFrame]]
     """The frames from the first on, (rows, columns) each."""
     rate_hz: float | None = None
     """Frames a second, where the file has it."""
@@ -88,7 +88,7 @@ class Film:
         )
 
 
-def grey(picture: Frame, what: object) -> Frame:
+def grey(picture: FilmFrame, what: object) -> FilmFrame:
     """A picture (rows, columns) as it is, one with three or four channels as the mean of its colours.
 
     The mean is proportional to light where the colours are. A pixel saturated in one colour is saturated.

@@ -11,7 +11,7 @@ import numpy as np
 
 from aolink.errors import ImportingError
 from aolink.importing.film import Film
-from aolink.importing.frames import Settings, film_periods
+from aolink.importing.frames import FilmSettings, film_periods
 from aolink.importing.motion import Motion, fit_motion
 from aolink.importing.survey import Survey, reach, survey
 from aolink.importing.tracker import find_objects
@@ -35,7 +35,7 @@ class FirstRig(NamedTuple):
     """What in the film contradicts the rig file, or is left out of it; the text has these notes, too."""
 
 
-def first_rig(film: Film, settings: Settings, name: str, progress: Callable[[int], None] | None = None) -> FirstRig:
+def first_rig(film: Film, settings: FilmSettings, name: str, progress: Callable[[int], None] | None = None) -> FirstRig:
     """A rig file for the objects of a film, ``settings.track`` of them: for an import with these settings.
 
     The slope unit is half a window. The plant has a copy for each object and direction; its input is the shift of the
@@ -146,7 +146,7 @@ def _matrix(values: FloatArray) -> str:
 
 
 def _text(
-    film: Film, settings: Settings, name: str, known: Survey, motion: Motion, side: int, rate: float,
+    film: Film, settings: FilmSettings, name: str, known: Survey, motion: Motion, side: int, rate: float,
     notes: tuple[str, ...],
 ) -> str:  # fmt: skip
     unit = side / 2  # pixels

@@ -10,10 +10,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from aolink.assembly import Frame as RigFrame
+from aolink.assembly import Frame
 from aolink.errors import ImportingError
 from aolink.exposure import Truth
-from aolink.importing.film import Film, Frame
+from aolink.importing.film import Film, FilmFrame
 from aolink.numerics.arrays import FloatArray
 from aolink.rig import Rig
 
@@ -24,7 +24,7 @@ _IRREGULAR = 0.25
 
 
 @dataclass(frozen=True, kw_only=True)
-class Settings:
+class FilmSettings:
     """The options with which a film is read."""
 
     rate_hz: float | None = None
@@ -55,7 +55,7 @@ class Settings:
 class ImportedExposure:
     """The data that a session would have recorded for one exposure."""
 
-    frame: RigFrame
+    frame: Frame
     inputs: FloatArray
     """Inputs that the mirror held from the end of the exposure before this one to the end of this one, (steps,
     n_inputs)."""
@@ -64,7 +64,7 @@ class ImportedExposure:
 
 
 @dataclass(kw_only=True, eq=False)
-class Account:
+class FilmAccount:
     """Counts and notes for the user about how a film was read."""
 
     frames: int = 0
@@ -80,7 +80,7 @@ class Account:
 class FilmLight:
     """Pixel values as light: the gamma curve undone, background taken off, dark made bright."""
 
-    def __init__(self, film: Film, settings: Settings) -> None:
+    def __init__(self, film: Film, settings: FilmSettings) -> None:
         self._settings = settings
         kind = film.dtype.kind
         self.full_scale = float(np.iinfo(film.dtype.name).max) if kind in "iu" else 1.0
@@ -88,7 +88,7 @@ class FilmLight:
         # A saturated background does not harm a dark object.
         self._saturated = math.inf if settings.invert else film.saturates_at
 
-    def of(self, frame: Frame) -> tuple[FloatArray, NDArray[np.bool_]]:
+    def of(self, frame: FilmFrame) -> tuple[FloatArray, NDArray[np.bool_]]:
         """Light of a frame and where its pixels are saturated or no numbers, (rows, columns) each."""
         settings = self._settings
         values = frame.astype(np.float64)
@@ -102,7 +102,7 @@ class FilmLight:
         return (-values if settings.invert else values), bad
 
 
-def frame_times(film: Film, rig: Rig, settings: Settings) -> tuple[NDArray[np.int64], list[str]]:
+def frame_times(film: Film, rig: Rig, settings: FilmSettings) -> tuple[NDArray[np.int64], list[str]]:
     """Number of each frame in frame periods from the first on, (count,), and notes on what was assumed.
 
     Raises
@@ -186,7 +186,7 @@ def film_periods(film: Film) -> tuple[NDArray[np.int64], float | None]:
 
 
 def counts_of(
-    counts: FloatArray, usable: NDArray[np.bool_], rig: Rig, account: Account
+    counts: FloatArray, usable: NDArray[np.bool_], rig: Rig, account: FilmAccount
 ) -> tuple[NDArray[np.uint16], NDArray[np.bool_]]:
     """Whole counts and the mask of the pixels that can be used, (rows, columns) each; the other pixels are counted in
     ``account``."""
@@ -224,7 +224,10 @@ class Group:
 
 
 def grouped(
-    film: Film, count: int, periods: NDArray[np.int64], light: Callable[[Frame], tuple[FloatArray, NDArray[np.bool_]]]
+    film: Film,
+    count: int,
+    periods: NDArray[np.int64],
+    light: Callable[[FilmFrame], tuple[FloatArray, NDArray[np.bool_]]],
 ) -> Iterator[Group]:
     """Frames by exposures, each frame's ``light`` summed as it comes; a film that lost a frame goes on with the next
     whole exposure."""
@@ -246,15 +249,15 @@ def grouped(
 
 
 def rig_frame(
-    film: Film, rig: Rig, settings: Settings, period: int, pixels: NDArray[np.uint16], mask: NDArray[np.bool_]
-) -> RigFrame:  # fmt: skip
+    film: Film, rig: Rig, settings: FilmSettings, period: int, pixels: NDArray[np.uint16], mask: NDArray[np.bool_]
+) -> Frame:  # fmt: skip
     """The frame of an exposure that begins the given number of the rig's frame periods after the film."""
     timing = rig.timing
     first = period * timing.frame_period_steps
     began_ns = settings.start_ns if settings.start_ns is not None else film.start_ns or 0
     start_ns = began_ns + round(first * timing.fast_step_s * 1e9)
     end_ns = start_ns + timing.exposure_steps * timing.fast_step_ns
-    return RigFrame(
+    return Frame(
         frame_id=period + 1, first_step=first, last_step=first + timing.exposure_steps - 1, pixels=pixels, mask=mask,
         chunks_lost=0, frames_lost_before=0, device_start_ns=first * timing.fast_step_ns,
         device_end_ns=(first + timing.exposure_steps) * timing.fast_step_ns, host_first_byte_ns=end_ns,

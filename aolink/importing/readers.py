@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from aolink.errors import AolinkError, FrameError, ImportingError
 from aolink.extensions import needs_extra
-from aolink.importing.film import Film, Frame, array_film, grey
+from aolink.importing.film import Film, FilmFrame, array_film, grey
 from aolink.limits import load_archive, unpacked
 from aolink.optics.frame_file import parse_fits_array, read_fits
 from aolink.optics.pictures import image_pixels, opened_image, read_picture
@@ -90,7 +90,7 @@ def _first_line(error: Exception) -> str:
     return next(iter(str(error).strip().splitlines()), "") or type(error).__name__
 
 
-def _checked(film: Film, path: Path) -> Iterator[Frame]:
+def _checked(film: Film, path: Path) -> Iterator[FilmFrame]:
     """The frames of a film, checked against the size and the number that it announced."""
     count = 0
     with _one_error(path):
@@ -154,7 +154,7 @@ def _tiff(path: Path) -> Film:
     if len(size) != 3 or "S" in axes[:-1]:
         raise ImportingError(f"{path} holds {dtype} of shape {shape}, expected (frames, rows, columns)")
 
-    def pictures() -> Iterator[Frame]:
+    def pictures() -> Iterator[FilmFrame]:
         if compression in _PILLOW_TIFF:
             from PIL import ImageSequence
 
@@ -205,7 +205,7 @@ def _folder(path: Path) -> Film:
     first = _picture(files[0])
     rows, columns = grey(first, files[0]).shape
 
-    def frames() -> Iterator[Frame]:
+    def frames() -> Iterator[FilmFrame]:
         for file in files:
             picture = _picture(file)
             if picture.shape[:2] != first.shape[:2] or picture.dtype != first.dtype:
@@ -229,7 +229,7 @@ def _number_order(path: Path) -> tuple[list[tuple[str, int]], str]:
     return [(text, int(digits or 0)) for text, digits in parts], path.name
 
 
-def _picture(path: Path) -> Frame:
+def _picture(path: Path) -> FilmFrame:
     """A picture as it is stored, (rows, columns) or (rows, columns, 3 or 4)."""
     if path.suffix.lower() not in (".fits", ".fit"):
         return read_picture(path)
@@ -240,7 +240,7 @@ def _picture(path: Path) -> Frame:
     return _values(stored, scale, zero)
 
 
-def _described(picture: Frame) -> str:
+def _described(picture: FilmFrame) -> str:
     return f"{' x '.join(map(str, picture.shape[:2]))} pixels of {picture.dtype}"
 
 
@@ -302,7 +302,7 @@ def _video(path: Path) -> Film:
         import imageio.v3 as iio
         import imageio_ffmpeg  # noqa: F401 # imageio would say only that it found nothing that reads the file
 
-    def pictures() -> Iterator[Frame]:
+    def pictures() -> Iterator[FilmFrame]:
         with iio.imopen(path, "r") as file:
             yield from file.iter()
 

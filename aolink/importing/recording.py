@@ -14,7 +14,7 @@ from aolink.errors import ImportingError, RecordingError
 from aolink.files import check_target, open_unfinished, writing
 from aolink.importing.exposures import imported
 from aolink.importing.film import Film
-from aolink.importing.frames import Account, ImportedExposure, Settings
+from aolink.importing.frames import FilmAccount, FilmSettings, ImportedExposure
 from aolink.recording import convert, topics
 from aolink.recording.mcap_file import McapFile, WriteOptions, schema_of
 from aolink.recording.writer import begin_recording
@@ -27,9 +27,9 @@ _AT_ONCE = 65_536
 
 
 def import_film(
-    film: Film, rig: Rig, settings: Settings, path: Path, *, overwrite: bool = False,
+    film: Film, rig: Rig, settings: FilmSettings, path: Path, *, overwrite: bool = False,
     sources: Iterable[Path] = (), progress: Callable[[int], None] = lambda exposures: None,
-) -> Account:  # fmt: skip
+) -> FilmAccount:  # fmt: skip
     """Write the exposures of a film as a recording of a rig. The same film and settings give the same bytes.
 
     ``sources`` are files that it never replaces.
@@ -42,7 +42,7 @@ def import_film(
         ``path`` exists and not ``overwrite``, or cannot be written.
     """
     check_target(path, overwrite=overwrite, sources=sources, error=RecordingError)
-    account = Account()
+    account = FilmAccount()
     made = imported(film, rig, settings, account)
     first = next(made, None)  # errors of the whole film show before the file is made
     if first is None:

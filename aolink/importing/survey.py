@@ -13,7 +13,7 @@ from aolink.errors import ImportingError
 from aolink.importing.accuracy import pixel_noise, tracker_errors
 from aolink.importing.brightness import brightness_of, change_of
 from aolink.importing.film import Film
-from aolink.importing.frames import FilmLight, Settings
+from aolink.importing.frames import FilmLight, FilmSettings
 from aolink.importing.tracker import FIRST_FRAMES, WEIGHT, Objects, Tracker, trackpy_locator
 from aolink.numerics.arrays import BoolArray, FloatArray, IntArray
 from aolink.optics.kernel import pixel_masses
@@ -121,7 +121,9 @@ def _stretches(numbers: IntArray, each: int, count: int) -> str:
     )
 
 
-def survey(film: Film, settings: Settings, objects: Objects, progress: Callable[[int], None] | None = None) -> Survey:
+def survey(
+    film: Film, settings: FilmSettings, objects: Objects, progress: Callable[[int], None] | None = None
+) -> Survey:
     """Follow the objects through the whole film and fit their images in single frames.
 
     Raises

@@ -12,7 +12,7 @@ from scipy import ndimage, optimize
 
 from aolink.errors import FrameError, ImportingError
 from aolink.importing.film import Film
-from aolink.importing.frames import FilmLight, Settings
+from aolink.importing.frames import FilmLight, FilmSettings
 from aolink.numerics.arrays import BoolArray, FloatArray, IntArray
 from aolink.optics.centroid import weighted_centroid
 from aolink.optics.maxima import cut_windows, find_maxima, flatten, spot_sd
@@ -209,7 +209,7 @@ def trackpy_locator(sd: float) -> Callable[[FloatArray], FloatArray] | None:
     return locate
 
 
-def find_objects(film: Film, settings: Settings) -> Objects:
+def find_objects(film: Film, settings: FilmSettings) -> Objects:
     """The brightest objects of a film's first frames, as many as requested.
 
     Raises

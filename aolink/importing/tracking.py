@@ -17,7 +17,15 @@ from numpy.typing import NDArray
 from aolink.errors import ImportingError
 from aolink.exposure import Truth
 from aolink.importing.film import Film
-from aolink.importing.frames import Account, FilmLight, ImportedExposure, Settings, counts_of, grouped, rig_frame
+from aolink.importing.frames import (
+    FilmAccount,
+    FilmLight,
+    FilmSettings,
+    ImportedExposure,
+    counts_of,
+    grouped,
+    rig_frame,
+)
 from aolink.importing.survey import Survey, reach, spread_in, survey
 from aolink.importing.tracker import WEIGHT, find_objects
 from aolink.numerics.arrays import BoolArray, FloatArray
@@ -31,7 +39,7 @@ STRAY = 1 / 8
 
 
 def tracked(
-    film: Film, rig: Rig, settings: Settings, periods: NDArray[np.int64], account: Account
+    film: Film, rig: Rig, settings: FilmSettings, periods: NDArray[np.int64], account: FilmAccount
 ) -> Iterator[ImportedExposure]:
     """The exposures of a film's objects, each in a window of its own.
 

@@ -138,6 +138,8 @@ def _scaled(precision: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 def _cholesky_factor(a: FloatArray) -> FloatArray:
     """L with a = L L', zero above its diagonal, in Fortran's order."""
+    # LAPACK works by blocks, which hundreds of rows need. Compiled loops over matrices of a dozen rows, for which a
+    # call of LAPACK takes longer than the arithmetic, have `aolink.estimation.compiled.small` (its rows say so).
     L, flaw = scipy.linalg.lapack.dpotrf(a.T, lower=1, clean=1)
     if flaw:
         raise np.linalg.LinAlgError(f"not positive definite: the leading {flaw} rows have no root")

@@ -240,7 +240,7 @@ def differences_transposed(along: FloatingArray, down: FloatingArray) -> Floatin
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Plane:
+class PeriodicPlane:
     """A blur on a periodic plane, as large as the scene or slightly larger, with a size for which transforms are
     fast."""
 
@@ -257,7 +257,7 @@ class Plane:
     """Spectrum of L."""
 
     @classmethod
-    def of(cls, psf: Psf, shape: tuple[int, int]) -> Plane:
+    def of(cls, psf: Psf, shape: tuple[int, int]) -> PeriodicPlane:
         """The plane for a PSF on the plane, or along all rows alike, and a frame's rows and columns."""
         taps, frame = _on_plane(psf, shape)
         rows, columns = shape[0] + taps.shape[0] - 1, shape[1] + taps.shape[1] - 1
@@ -335,7 +335,7 @@ def plane_solver(
     psf: Psf, shape: tuple[int, int], kappa: float, seen: BoolArray | None = None, white: bool = False
 ) -> IterativeSolver:
     """The solver of a PSF on the plane (or along all rows alike), with the periodic solver as preconditioner."""
-    plane = Plane.of(psf, shape)
+    plane = PeriodicPlane.of(psf, shape)
     fraction = 1.0 if seen is None else float(seen.mean())
     # The frame's share of the scene.
     share = fraction * shape[0] * shape[1] / (plane.scene[0] * plane.scene[1])

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from aolink.numerics.arrays import FloatArray
 from aolink.restoration import spectrum
 from aolink.restoration.block_matching import block_matching
-from aolink.restoration.markov import Plane, make_solver, plane_solver
+from aolink.restoration.markov import PeriodicPlane, make_solver, plane_solver
 from aolink.restoration.method import Blurred, Restored
 from aolink.restoration.plug_and_play import Denoiser, plug_and_play
 from aolink.restoration.tv import plane_total_variation, total_variation
@@ -95,7 +95,7 @@ def _with_edges(picture: Blurred, weights: _Weights) -> tuple[FloatArray, tuple[
             images, weights.total, weights.difference,
         )  # fmt: skip
         return scene.astype(np.float64) + level, solver.frame
-    plane = Plane.of(psf, shape)
+    plane = PeriodicPlane.of(psf, shape)
     return plane_total_variation(plane, images, weights.total, weights.difference, picture.seen) + level, plane.frame
 
 

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aolink.numerics.arrays import BoolArray
-from aolink.restoration.markov import Plane, Solver, differences_transposed, inverse_spectrum, single_is_enough
+from aolink.restoration.markov import PeriodicPlane, Solver, differences_transposed, inverse_spectrum, single_is_enough
 
 FloatingArray = NDArray[np.floating[Any]]
 
@@ -131,7 +131,7 @@ def plane_weight(noise_variance: float, difference_weight: float) -> float:
 
 
 def plane_total_variation(
-    plane: Plane,
+    plane: PeriodicPlane,
     images: NDArray[np.float64],
     noise_variance: float,
     difference_weight: float,

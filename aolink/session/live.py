@@ -21,8 +21,8 @@ from aolink.session.report import LatencyBook
 Show = Callable[[Exposure, Sequence[Outcome]], None]
 """A function that gets each exposure, with the estimates that have come since the one before; it must not take time."""
 
-Control = Callable[[Exposure, Estimate | None, int], None]
-"""Lets the controller see an exposure, with the estimate that serves it; the last argument is the log time, ns."""
+TellController = Callable[[Exposure, Estimate | None, int], None]
+"""A function that gives the controller an exposure, the estimate that serves it, and the log time, ns."""
 
 
 class LiveExposures:
@@ -40,7 +40,7 @@ class LiveExposures:
         latencies: LatencyBook,
         estimating: Estimating,
         show: Show | None,
-        control: Control | None,
+        control: TellController | None,
         serves: str,
     ) -> None:
         self._rig, self._time, self._journal, self._latencies = rig, time, journal, latencies

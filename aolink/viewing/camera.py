@@ -27,7 +27,7 @@ from aolink.viewing.palette import MEASURED, MISSING, NOTHING, TRUTH
 from aolink.viewing.series import POINTS, Drawing
 from aolink.viewing.timebase import Timebase
 
-Paths = Mapping[str, Mapping[int, FloatArray]]
+PathsByFrame = Mapping[str, Mapping[int, FloatArray]]
 """Name (``truth`` or an estimator's) and frame id -> spot position at each fast step, slope units, (n_steps,)."""
 
 HISTORY = 32
@@ -133,8 +133,8 @@ def page_of(exposure: Exposure, first_frame: int) -> int:
 
 
 def log_page(
-    drawing: Drawing, sensor: Sensor, timebase: Timebase, exposures: Sequence[Exposure], paths: Paths, top: float, *,
-    until: int | None = None, at: Exposure | None = None,
+    drawing: Drawing, sensor: Sensor, timebase: Timebase, exposures: Sequence[Exposure], paths: PathsByFrame,
+    top: float, *, until: int | None = None, at: Exposure | None = None,
 ) -> None:  # fmt: skip
     """A page of exposures under each other with the paths through them: ``/camera/history``.
 

@@ -239,9 +239,10 @@ def test_open_loop_does_not_care(rig, exposures):
     assert make_estimator(rig, "open-loop").step(broken(exposures[0], "missing")).status == Status.PREDICTED
 
 
-def test_an_input_that_is_not_a_number_does_not_poison_the_filter(rig, exposures):
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_an_input_that_is_not_a_number_does_not_poison_the_filter(rig, exposures, value):
     inputs = exposures[1].inputs.copy()
-    inputs[5] = np.nan
+    inputs[5] = value
     series = [exposures[0], dataclasses.replace(exposures[1], inputs=inputs), exposures[2]]
     for name in NAMES:
         given = run(rig, series, [name])[name]

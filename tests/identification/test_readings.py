@@ -13,7 +13,7 @@ from aolink.identification import Process, ProcessSum, readings
 from aolink.identification.likelihood import Likelihood
 from aolink.importing.film import array_film
 from aolink.importing.first_rig import first_rig
-from aolink.importing.frames import Settings
+from aolink.importing.frames import FilmSettings
 from aolink.importing.recording import import_film
 from aolink.recording.reader import Recording
 from tests.kinds import truth_of
@@ -115,7 +115,7 @@ def test_copies_of_a_plant_may_have_kernels_of_their_own(tmp_path):
     films = [spot_film(random, motion, middle, (48, 48), sd=sd).frames for sd in (1.6, 2.0)]
     film = array_film(np.concatenate(films, axis=2), "film")
     places = tuple((float(x), float(y)) for x, y in (motion[0].mean(axis=0) + middle + [[0, 0], [48, 0]]))
-    settings = Settings(rate_hz=100.0, subtract_median=True, track=2, places=places)
+    settings = FilmSettings(rate_hz=100.0, subtract_median=True, track=2, places=places)
     rig = aolink.rig.parse_rig(first_rig(film, settings, "film").text)
 
     import_film(film, rig, settings, tmp_path / "film.mcap")

@@ -15,7 +15,7 @@ from aolink.exposure import Exposures
 from aolink.importing.brightness import brightness_of
 from aolink.importing.film import array_film
 from aolink.importing.first_rig import first_rig
-from aolink.importing.frames import Settings
+from aolink.importing.frames import FilmSettings
 from aolink.importing.recording import import_film
 from aolink.recording.reader import Recording
 from aolink.rig import Rig, load_rig, parse_rig
@@ -86,7 +86,7 @@ def test_a_film_of_the_rigs_own_camera_that_fades_is_scaled_to_its_light(
     simulated, frames = spots(rig, change)
     inputs = np.concatenate([part for each in simulated for part in (each.lead_inputs, each.inputs)])
     film = array_film(frames, "film", inputs=inputs)
-    (note,) = import_film(film, rig, Settings(rate_hz=rate(rig)), tmp_path / "a.mcap").notes
+    (note,) = import_film(film, rig, FilmSettings(rate_hz=rate(rig)), tmp_path / "a.mcap").notes
     assert re.search(said, note)
     found = aolink.estimate(Recording(tmp_path / "a.mcap"), estimator)
     as_they_came = aolink.estimate(aolink.exposures(frames, rig, inputs, starts(simulated)), estimator)
@@ -108,7 +108,7 @@ def test_a_film_whose_light_is_constant_is_left_as_it_is(tmp_path: Path, name: s
     half = np.rint(rig.sensor.black_level + (frames - rig.sensor.black_level) / 2).astype(np.uint16)
     for some in (frames, half):
         account = import_film(
-            array_film(some, "film"), rig, Settings(rate_hz=rate(rig)), tmp_path / "a.mcap", overwrite=True
+            array_film(some, "film"), rig, FilmSettings(rate_hz=rate(rig)), tmp_path / "a.mcap", overwrite=True
         )
         assert account.notes == ()
         for each, frame in zip(Recording(tmp_path / "a.mcap").exposures(), some, strict=True):
@@ -121,7 +121,7 @@ def test_exposures_of_a_film_that_fades_are_scaled_to_the_same_light(tmp_path: P
     rng = np.random.default_rng(3)
     still = spot_film(rng, random_walk(rng, FRAMES, 2, 0.45), np.array(MIDDLES), noise=0.0)
     noise = 20 * rng.normal(size=still.frames.shape)
-    settings = Settings(rate_hz=100.0, subtract_median=True, track=2, frames_per_exposure=K, places=MIDDLES)
+    settings = FilmSettings(rate_hz=100.0, subtract_median=True, track=2, frames_per_exposure=K, places=MIDDLES)
     found = {}
     for lost in (0.0, 0.3):
         left = (1 - lost) ** (np.arange(FRAMES) / (FRAMES - 1))

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 import aolink
 from aolink.errors import AolinkError, ImportingError, RecordingError
 from aolink.importing.film import array_film
-from aolink.importing.frames import Account, Settings
+from aolink.importing.frames import FilmAccount, FilmSettings
 from aolink.importing.readers import open_film
 from aolink.importing.recording import import_film
 from aolink.recording.reader import Recording
@@ -23,12 +23,12 @@ from tests.importing import others
 from tests.importing.others import numbers
 from tests.importing.rigs import small_rig
 
-PLAIN = Settings()
+PLAIN = FilmSettings()
 
 
 def made(
-    tmp_path: Path, frames: NDArray[Any], rig: Rig | None = None, settings: Settings = PLAIN, **known: Any
-) -> tuple[Recording, Account]:  # fmt: skip
+    tmp_path: Path, frames: NDArray[Any], rig: Rig | None = None, settings: FilmSettings = PLAIN, **known: Any
+) -> tuple[Recording, FilmAccount]:  # fmt: skip
     """The recording of a film in memory, and the account of how it was read."""
     rig = rig or small_rig()
     path = tmp_path / "film.mcap"
@@ -37,7 +37,7 @@ def made(
 
 
 def refused(
-    tmp_path: Path, frames: NDArray[Any], rig: Rig | None = None, settings: Settings = PLAIN, **known: Any
+    tmp_path: Path, frames: NDArray[Any], rig: Rig | None = None, settings: FilmSettings = PLAIN, **known: Any
 ) -> str:
     """The one line with which a film is refused; nothing is left of the recording."""
     with pytest.raises(ImportingError) as caught:
@@ -130,7 +130,7 @@ def test_exposures_have_the_times_of_the_rig_and_the_start_of_the_film(tmp_path)
 
 
 def test_what_is_given_of_times_goes_before_what_the_film_says(tmp_path):
-    settings = Settings(rate_hz=50, exposure_s=0.01, start_ns=7)
+    settings = FilmSettings(rate_hz=50, exposure_s=0.01, start_ns=7)
     recording, account = made(tmp_path, film(), None, settings, rate_hz=25.0, exposure_s=0.04, start_ns=5)
     assert next(iter(recording)).host_start_ns == 7
     assert any("film says 25 frames/s; 50 frames/s as given are taken" in note for note in account.notes)
@@ -147,7 +147,7 @@ def test_rates_and_times_that_contradict_each_other_are_refused(tmp_path):
     text = refused(tmp_path, film(), rate_hz=60.0, times_ns=times)
     assert "60 frames/s contradict its times, which say 50" in text
     assert "give --rate 50" in text
-    text = refused(tmp_path, film(), None, Settings(rate_hz=60), rate_hz=50.0)
+    text = refused(tmp_path, film(), None, FilmSettings(rate_hz=60), rate_hz=50.0)
     assert "60 frames/s, and the rig file single-lenslet wants a frame every 0.02 s, 50 frames/s" in text
     text = refused(tmp_path, film(), small_rig(10, 10), rate_hz=1000.0)
     assert "give --sum 10 as the rig file has it, change its [timing], or give the right --rate" in text
@@ -201,7 +201,7 @@ def test_the_mean_of_several_frames_is_one_exposure(K, tmp_path):
     frames = film(np.uint16, 7)
     inputs = np.arange(14.0).reshape(7, 2) / 1000
     recording, account = made(
-        tmp_path, frames, small_rig(K, K), Settings(frames_per_exposure=K, rate_hz=1000), inputs=inputs
+        tmp_path, frames, small_rig(K, K), FilmSettings(frames_per_exposure=K, rate_hz=1000), inputs=inputs
     )  # fmt: skip
     exposures = list(recording)
     assert (account.frames, account.exposures) == (7 // K * K, 7 // K)
@@ -215,15 +215,15 @@ def test_the_mean_of_several_frames_is_one_exposure(K, tmp_path):
 def test_a_frame_that_is_lost_costs_the_exposure_that_it_belongs_to(tmp_path):
     frames = film(np.uint16, 8)
     times = np.array([0, 1, 2, 3, 5, 6, 7, 8]) * 1_000_000
-    recording, _ = made(tmp_path, frames, small_rig(3, 3), Settings(frames_per_exposure=3), times_ns=times)
+    recording, _ = made(tmp_path, frames, small_rig(3, 3), FilmSettings(frames_per_exposure=3), times_ns=times)
     assert [each.frame_id for each in recording] == [1, 3]
     np.testing.assert_array_equal([each.pixels for each in recording][1], np.rint(frames[5:8].mean(axis=0)))
 
 
 def test_the_rig_file_must_have_as_many_steps_as_frames_are_summed(tmp_path):
-    text = refused(tmp_path, film(), small_rig(10, 20), Settings(frames_per_exposure=3, rate_hz=150))
+    text = refused(tmp_path, film(), small_rig(10, 20), FilmSettings(frames_per_exposure=3, rate_hz=150))
     assert "set timing.exposure_steps = 3 and frame_period_steps = 3" in text
-    text = refused(tmp_path, film(count=2), small_rig(3, 3), Settings(frames_per_exposure=3))
+    text = refused(tmp_path, film(count=2), small_rig(3, 3), FilmSettings(frames_per_exposure=3))
     assert "has 2 frames: not enough for an exposure of 3" in text
 
 
@@ -236,7 +236,7 @@ def test_pixels_at_the_end_of_their_range_are_masked_and_counted(tmp_path):
         np.testing.assert_array_equal(each.mask, frame < 255)
         np.testing.assert_array_equal(each.pixels, frame.astype(int) * 256)
     # One saturated frame spoils the mean.
-    recording, account = made(tmp_path, frames, small_rig(2, 2), Settings(frames_per_exposure=2))
+    recording, account = made(tmp_path, frames, small_rig(2, 2), FilmSettings(frames_per_exposure=2))
     np.testing.assert_array_equal([each.mask.all() for each in recording], [True, False, True])
 
 
@@ -271,7 +271,7 @@ def test_counts_beyond_the_range_of_the_rig_are_masked_and_counted(tmp_path):
 @pytest.mark.parametrize("gamma", [2.2, 0.5])
 def test_a_gamma_curve_is_undone(gamma, tmp_path):
     stored = np.arange(64, dtype=np.uint8).reshape(1, 8, 8) * 4
-    recording, _ = made(tmp_path, stored, None, Settings(gamma=gamma))
+    recording, _ = made(tmp_path, stored, None, FilmSettings(gamma=gamma))
     light = [[round(256 * 255 * (int(v) / 255) ** gamma) for v in row] for row in stored[0]]
     np.testing.assert_array_equal(next(iter(recording)).pixels, light)
 
@@ -280,7 +280,7 @@ def test_light_behind_a_gamma_curve_is_found_again(tmp_path):
     """A film stored by v = 255 L^(1/2.2): a quarter of the light is a quarter of the counts."""
     light = np.linspace(0.05, 0.95, 64).reshape(8, 8)
     frames = np.rint(255 * np.stack([light, light / 4]) ** (1 / 2.2)).astype(np.uint8)
-    recording, _ = made(tmp_path, frames, None, Settings(gamma=2.2))
+    recording, _ = made(tmp_path, frames, None, FilmSettings(gamma=2.2))
     bright, dim = (each.pixels / 65_280 for each in recording)
     # Half a level of the 8 bits that were stored.
     for found, true in ((bright, light), (dim, light / 4)):
@@ -301,7 +301,7 @@ def test_full_scale_becomes_full_scale(dtype, bit_depth, scale, tmp_path):
 
 def test_a_scale_that_is_given_is_taken(tmp_path):
     frames = film(np.uint8)
-    recording, _ = made(tmp_path, frames, None, Settings(scale=2.5))
+    recording, _ = made(tmp_path, frames, None, FilmSettings(scale=2.5))
     np.testing.assert_array_equal([each.pixels for each in recording], np.rint(frames * 2.5))
 
 
@@ -327,7 +327,7 @@ def test_the_ground_is_taken_off(invert, tmp_path):
     light[0, 3:5, 3:5] = 50
     frames = ground - light if invert else ground + light
     rig = small_rig()
-    recording, account = made(tmp_path, frames, rig, Settings(invert=invert, subtract_median=not invert))
+    recording, account = made(tmp_path, frames, rig, FilmSettings(invert=invert, subtract_median=not invert))
     np.testing.assert_array_equal(next(iter(recording)).pixels, rig.sensor.black_level + 256 * light[0].astype(int))
     assert account.clipped == 0
 
@@ -344,7 +344,7 @@ def test_colours_keep_the_scale_of_their_type(tmp_path):
 def test_light_that_may_not_be_linear_is_said_unless_gamma_is_given(tmp_path):
     _, account = made(tmp_path, film(np.uint8), nonlinear="a JPEG")
     assert any("light may not be linear: a JPEG; --gamma 2.2" in note for note in account.notes)
-    _, account = made(tmp_path, film(np.uint8), None, Settings(gamma=2.2), nonlinear="a JPEG")
+    _, account = made(tmp_path, film(np.uint8), None, FilmSettings(gamma=2.2), nonlinear="a JPEG")
     assert not any("linear" in note for note in account.notes)
 
 

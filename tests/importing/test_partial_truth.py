@@ -17,7 +17,7 @@ from aolink.exporting.files import export
 from aolink.exposure import Exposure
 from aolink.importing.film import array_film
 from aolink.importing.first_rig import first_rig
-from aolink.importing.frames import Settings
+from aolink.importing.frames import FilmSettings
 from aolink.importing.recording import import_film
 from aolink.jobs.unit import exposure_row
 from aolink.plotting import save_figure
@@ -41,7 +41,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> tuple[Rig, Path]:
     frames = spot_film(rng, random_walk(rng, K * EXPOSURES, 2, 0.3), middles).frames
     frames[GONE:, :, 48:] = np.rint(1000 + 20 * rng.normal(size=frames[GONE:, :, 48:].shape)).astype(np.uint16)
     places = ((24.0, 32.0), (70.0, 30.0))
-    settings = Settings(rate_hz=100.0, subtract_median=True, track=2, frames_per_exposure=K, places=places)
+    settings = FilmSettings(rate_hz=100.0, subtract_median=True, track=2, frames_per_exposure=K, places=places)
     film = array_film(frames, "film")
     rig = parse_rig(first_rig(film, settings, "film").text)
     path = tmp_path_factory.mktemp("film") / "film.mcap"

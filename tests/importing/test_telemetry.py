@@ -12,7 +12,7 @@ from aolink.errors import EstimatorError, ImportingError
 from aolink.estimation import run
 from aolink.exporting.files import export
 from aolink.exposure import Exposure, Exposures
-from aolink.importing.frames import Account, Settings
+from aolink.importing.frames import FilmAccount, FilmSettings
 from aolink.importing.readers import open_film
 from aolink.importing.recording import import_film
 from aolink.recording.reader import Recording
@@ -40,9 +40,9 @@ def centroids(rig: Rig, exposures: Exposures) -> np.ndarray:
     return seen.reshape(len(seen), -1, 2).swapaxes(1, 2)
 
 
-def imported(path: Path, rig: Rig, **settings: object) -> tuple[Recording, Account]:
+def imported(path: Path, rig: Rig, **settings: object) -> tuple[Recording, FilmAccount]:
     out = path.with_suffix(".mcap")
-    account = import_film(open_film(path), rig, Settings(**settings), out, overwrite=True)  # type: ignore[arg-type]
+    account = import_film(open_film(path), rig, FilmSettings(**settings), out, overwrite=True)  # type: ignore[arg-type]
     return Recording(out), account
 
 
@@ -163,7 +163,7 @@ def import_back(exposures: Exposures, rig: Rig, folder: Path) -> None:
         inputs=np.concatenate([np.concatenate([each.lead_inputs, each.inputs]) for each in exposures]),
         rate_hz=1 / (rig.timing.frame_period_steps * rig.timing.fast_step_s),
     )  # fmt: skip
-    import_film(open_film(folder / "a.npz"), rig, Settings(start_ns=int(START_S * 1e9)), folder / "a.mcap")
+    import_film(open_film(folder / "a.npz"), rig, FilmSettings(start_ns=int(START_S * 1e9)), folder / "a.mcap")
     export(Recording(folder / "a.mcap"), folder / "a.fits")
     recording, account = imported(folder / "a.fits", rig)
     check_inputs(list(recording.exposures()), list(exposures))

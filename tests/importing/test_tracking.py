@@ -15,7 +15,7 @@ from aolink.errors import ImportingError
 from aolink.estimation import run, smooth
 from aolink.importing.film import array_film
 from aolink.importing.first_rig import first_rig
-from aolink.importing.frames import FilmLight, Settings
+from aolink.importing.frames import FilmLight, FilmSettings
 from aolink.importing.motion import Motion, fit_motion, vibration_mean
 from aolink.importing.recording import import_film
 from aolink.importing.survey import survey
@@ -37,7 +37,7 @@ def walkers() -> SpotFilm:
     return spot_film(rng, random_walk(rng, 320, 2, 0.5), MIDDLES)
 
 
-SETTINGS = Settings(
+SETTINGS = FilmSettings(
     rate_hz=100.0, subtract_median=True, track=2, frames_per_exposure=K, places=tuple(map(tuple, MIDDLES.tolist()))
 )
 
@@ -297,15 +297,15 @@ def test_a_drift_is_found_beside_a_walk_and_a_bound_motion() -> None:
 def test_as_many_objects_as_asked_for(walkers: SpotFilm, asked: int, what: str | None) -> None:
     film = array_film(walkers.frames[:10], "walkers")
     if what is None:
-        assert len(find_objects(film, Settings(track=asked)).places) == asked
+        assert len(find_objects(film, FilmSettings(track=asked)).places) == asked
     else:
         with pytest.raises(ImportingError, match=what):
-            find_objects(film, Settings(track=asked))
+            find_objects(film, FilmSettings(track=asked))
 
 
 def test_a_film_without_light_has_no_objects() -> None:
     with pytest.raises(ImportingError, match="no objects can be found"):
-        find_objects(array_film(np.zeros((5, 64, 64), np.uint8), "dark"), Settings(track=1))
+        find_objects(array_film(np.zeros((5, 64, 64), np.uint8), "dark"), FilmSettings(track=1))
 
 
 @pytest.mark.parametrize("seed", range(4))

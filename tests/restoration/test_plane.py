@@ -15,7 +15,7 @@ from aolink.restoration.markov import (
     DenseSolver,
     IterativeSolver,
     LineSolver,
-    Plane,
+    PeriodicPlane,
     Solver,
     dense_solver,
     differences_transposed,
@@ -171,7 +171,7 @@ def test_on_the_plane_total_variation_is_what_exact_steps_find(masked: bool) -> 
     image = image + 0.02 * rng.standard_normal(image.shape)
     seen = rng.random(image.shape) > 0.1 if masked else None
     psf, s2, weight = Psf(values=CORNER, origin=(1, 1)), 0.02**2, 50.0
-    plane, w = Plane.of(psf, (image.shape[0], image.shape[1])), plane_weight(s2, weight)
+    plane, w = PeriodicPlane.of(psf, (image.shape[0], image.shape[1])), plane_weight(s2, weight)
     W = np.ones(image.shape) if seen is None else seen
     H = blur_matrix(image.shape, CORNER)
 
@@ -192,7 +192,7 @@ def test_on_the_plane_total_variation_is_what_exact_steps_find(masked: bool) -> 
 def test_the_weight_on_the_plane_does_not_depend_on_the_unit_of_light() -> None:
     image, _ = blurred(blocks(40, 50), CORNER, (1, 1))
     image = image + 0.01 * np.random.default_rng(8).standard_normal(image.shape)
-    plane = Plane.of(Psf(values=CORNER, origin=(1, 1)), (image.shape[0], image.shape[1]))
+    plane = PeriodicPlane.of(Psf(values=CORNER, origin=(1, 1)), (image.shape[0], image.shape[1]))
     one = plane_total_variation(plane, image[None], 1e-4, 60.0)
     thousand = plane_total_variation(plane, 1000 * image[None], 1e2, 60e-6)
     np.testing.assert_allclose(thousand, 1000 * one, atol=0.05)  # in single precision

@@ -142,7 +142,7 @@ def measure_errors(rig: Rig, exposures: Sequence[Exposure], names: Sequence[str]
 
 
 @dataclass(frozen=True)
-class Measured:
+class IntervalEstimate:
     """A number from runs, with its standard error and 95 % interval by bootstrap over the runs."""
 
     value: float
@@ -171,24 +171,24 @@ def _resampled(count: int) -> NDArray[np.intp]:
     return np.random.default_rng(count).integers(0, count, size=(_RESAMPLES, count))
 
 
-def _measured(value: float, samples: FloatArray) -> Measured:
+def _measured(value: float, samples: FloatArray) -> IntervalEstimate:
     low, high = np.quantile(samples, [0.025, 0.975])
-    return Measured(float(value), float(samples.std()), float(low), float(high))
+    return IntervalEstimate(float(value), float(samples.std()), float(low), float(high))
 
 
-def rms(squares: FloatArray) -> Measured:
+def rms(squares: FloatArray) -> IntervalEstimate:
     """Root of the mean of squared errors, (runs, exposures); NaN where one does not count."""
     each = np.nanmean(squares, axis=1)
     return _measured(np.sqrt(each.mean()), np.sqrt(each[_resampled(len(each))].mean(axis=1)))
 
 
-def mean(values: FloatArray) -> Measured:
+def mean(values: FloatArray) -> IntervalEstimate:
     """Mean of (runs, exposures)."""
     each = values.mean(axis=1)
     return _measured(each.mean(), each[_resampled(len(each))].mean(axis=1))
 
 
-def ratio(squares: FloatArray, reference: FloatArray) -> Measured:
+def ratio(squares: FloatArray, reference: FloatArray) -> IntervalEstimate:
     """Ratio of root mean squares, the runs resampled in pairs; both (runs, exposures), NaN where one does not count."""
     above, below = np.nanmean(squares, axis=1), np.nanmean(reference, axis=1)
     chosen = _resampled(len(above))
@@ -203,13 +203,13 @@ class Cell:
     offset: float
     noise_density: float
     process_noise: float
-    path: Measured
+    path: IntervalEstimate
     """o3/o1, ratio of the RMSE of the path."""
-    start: Measured
+    start: IntervalEstimate
     """The same ratio for the start state's norm."""
-    end: Measured
+    end: IntervalEstimate
     """The same ratio for the end state's norm."""
-    rmse: Mapping[str, Measured]
+    rmse: Mapping[str, IntervalEstimate]
     """RMSE of the path by estimator."""
 
 

@@ -24,7 +24,7 @@ from aolink.exposure import Exposure
 from aolink.numerics.arrays import FloatArray
 from aolink.optics.camera import to_density
 from aolink.rig import Rig
-from paper_report.ensemble import Cell, Measured, clean_exposures, errors, side_by_side, with_pixel_noise
+from paper_report.ensemble import Cell, IntervalEstimate, clean_exposures, errors, side_by_side, with_pixel_noise
 from paper_report.family import SWINGS, draw
 from paper_report.judge import LIMIT, Row
 from paper_report.limit import NAMES, SceneErrors
@@ -140,7 +140,9 @@ def _draw_centroids(ax: Axes, rig: Rig, series: Sequence[Exposure]) -> None:
     ax.plot(*np.array(points).T, ".", color="0.65", markersize=4, label="$y_1$ as measured", zorder=1)
 
 
-def figure_5(path: Path, chosen: Sequence[Scene], effort: Effort, levels: Sequence[dict[str, Measured]]) -> None:
+def figure_5(
+    path: Path, chosen: Sequence[Scene], effort: Effort, levels: Sequence[dict[str, IntervalEstimate]]
+) -> None:
     """State error norms from a wrong start, over the exposures; one run, and root mean squares of many."""
     count = effort.exposures + 10
     with _figure(path, effort.dpi, (7.2, 5.4), len(chosen), 1, sharex=True) as (_, axes):
@@ -174,7 +176,7 @@ def _draw_norms(ax: Axes, name: str, squares: FloatArray) -> None:
     ax.plot(j, thick, color=colour, linewidth=2, label=name, linestyle="-" if name == "o1" else (0, (4, 2)))
 
 
-def _mark_level(ax: Axes, count: int, level: Measured, name: str) -> None:
+def _mark_level(ax: Axes, count: int, level: IntervalEstimate, name: str) -> None:
     """The steady level in the right margin."""
     place = (15, 8 if name == "o1" else -8)
     arrow = {"arrowstyle": "-", "color": _colour(name), "linewidth": 1.2, "shrinkA": 0, "shrinkB": 0}
@@ -291,7 +293,7 @@ def figure_map(path: Path, cells: Sequence[Cell], dpi: int) -> None:
         bar.outline.set_visible(False)
 
 
-def _annotate(ax: Axes, grid: Sequence[Sequence[Measured]], decimals: int) -> None:
+def _annotate(ax: Axes, grid: Sequence[Sequence[IntervalEstimate]], decimals: int) -> None:
     """Ratio and half width of its interval; bold where the interval leaves 1 out."""
     for row, values in enumerate(grid):
         for column, value in enumerate(values):

@@ -19,7 +19,7 @@ from aolink.optics.sensor import SpotSensor
 from aolink.rig import Rig, load_rig
 from aolink.simulation.model import simulate
 from paper_report.blocks import Block, Heading, PageFigure, Table, Text
-from paper_report.ensemble import Measured, measure_errors, ratio, side_by_side, variant, with_pixel_noise
+from paper_report.ensemble import IntervalEstimate, measure_errors, ratio, side_by_side, variant, with_pixel_noise
 from paper_report.numbers import Effort
 from paper_report.shake import shaken
 
@@ -119,7 +119,7 @@ def limit_table(effort: Effort) -> list[Scene]:
     return table
 
 
-def against_o1(effort: Effort) -> list[tuple[str, dict[str, Measured]]]:
+def against_o1(effort: Effort) -> list[tuple[str, dict[str, IntervalEstimate]]]:
     """Ratio of the path's RMSE to o1's in each scene, in more runs than the sampler has time for."""
     table = []
     for name, rig, exposures in scenes(effort.o1_runs, effort.o1_exposures):
@@ -128,7 +128,7 @@ def against_o1(effort: Effort) -> list[tuple[str, dict[str, Measured]]]:
     return table
 
 
-def against_o1_section(table: Sequence[tuple[str, dict[str, Measured]]], effort: Effort) -> list[Block]:
+def against_o1_section(table: Sequence[tuple[str, dict[str, IntervalEstimate]]], effort: Effort) -> list[Block]:
     """The ratios, and the largest of them."""
     worst = {each: max(table, key=lambda row: row[1][each].high) for each in BETTER_THAN_O1}
     bounds = "; ".join(f"{each} {row[1][each].high:.3f} ({row[0]})" for each, row in worst.items())

@@ -18,13 +18,13 @@ from aolink.estimation import make_estimator, smooth
 from aolink.exposure import Exposure
 from aolink.importing.film import array_film
 from aolink.importing.first_rig import first_rig
-from aolink.importing.frames import Settings
+from aolink.importing.frames import FilmSettings
 from aolink.importing.recording import import_film
 from aolink.numerics.arrays import FloatArray
 from aolink.recording.reader import Recording
 from aolink.rig import Rig, parse_rig
 from paper_report.blocks import Block, Heading, Table, Text
-from paper_report.ensemble import Measured, mean, ratio
+from paper_report.ensemble import IntervalEstimate, mean, ratio
 from paper_report.numbers import Effort
 from paper_report.spheres import centroids
 from paper_report.spot_films import random_walk, resonance, spot_film
@@ -77,7 +77,7 @@ def made(kind: Kind, seed: int, exposures: int) -> tuple[Rig, list[Exposure], Fl
     shape = (_PITCH, _PITCH * _SPOTS)
     film = spot_film(rng, motion, middles, shape, light=light)
     places = tuple((float(x), float(y)) for x, y in film.places[0])
-    settings = Settings(rate_hz=100.0, subtract_median=True, track=_SPOTS, frames_per_exposure=K, places=places)
+    settings = FilmSettings(rate_hz=100.0, subtract_median=True, track=_SPOTS, frames_per_exposure=K, places=places)
     source = array_film(film.frames, "film")
     text = first_rig(source, settings, "film").text
     if kind.periods:
@@ -118,11 +118,11 @@ class MadeFilm:
     """Results for one kind of film."""
 
     kind: Kind
-    over_held: dict[str, Measured]
+    over_held: dict[str, IntervalEstimate]
     """RMSE of the path over that of the centroid, held, by estimator."""
-    over_interpolated: dict[str, Measured]
+    over_interpolated: dict[str, IntervalEstimate]
     """RMSE of the smoothed path over that of the centroid interpolated between the pictures."""
-    coverage: dict[str, Measured]
+    coverage: dict[str, IntervalEstimate]
     """Share of the true path inside the estimate's 95 % intervals."""
 
 

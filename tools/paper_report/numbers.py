@@ -19,7 +19,7 @@ from aolink.optics.kernel import exposure_density
 from aolink.plant.lifting import input_response, lift
 from aolink.plant.observability import observability
 from aolink.rig import Plant, Rig
-from paper_report.ensemble import Measured, ensemble, mean, measure_errors, ratio, rms, variant
+from paper_report.ensemble import IntervalEstimate, ensemble, mean, measure_errors, ratio, rms, variant
 from paper_report.judge import Plan, Size
 from paper_report.printed import FORMS, output_errors
 
@@ -97,9 +97,9 @@ def number(value: float, digits: int = 3) -> str:
 class MomentNoise:
     """Covariance of y_1 and y_2 over many frames of a spot at rest, with standard errors."""
 
-    y1: Measured
-    y2: Measured
-    cross: Measured
+    y1: IntervalEstimate
+    y2: IntervalEstimate
+    cross: IntervalEstimate
 
 
 def moment_noise(rig: Rig, frames: int, position: float = 0.2) -> MomentNoise:
@@ -112,7 +112,7 @@ def moment_noise(rig: Rig, frames: int, position: float = 0.2) -> MomentNoise:
     centred = measured.value - measured.value.mean(axis=0)
     products = centred[:, [0, 1, 0]] * centred[:, [0, 1, 1]]
     value, se = products.mean(axis=0), products.std(axis=0) / math.sqrt(frames)
-    return MomentNoise(*(Measured(v, s, v - 1.96 * s, v + 1.96 * s) for v, s in zip(value, se, strict=True)))
+    return MomentNoise(*(IntervalEstimate(v, s, v - 1.96 * s, v + 1.96 * s) for v, s in zip(value, se, strict=True)))
 
 
 def kernel_rows(rig: Rig) -> list[Row]:
@@ -156,7 +156,7 @@ def noise_rows(rig: Rig, frames: int) -> list[Row]:
     ]  # fmt: skip
 
 
-def lifted_noise(rig: Rig, runs: int, exposures: int, seed: int = 31) -> tuple[Measured, Measured]:
+def lifted_noise(rig: Rig, runs: int, exposures: int, seed: int = 31) -> tuple[IntervalEstimate, IntervalEstimate]:
     """Variances that one exposure's process noise adds to both states, from simulated states."""
     _, series = ensemble(variant(rig, offset=0.0), runs, exposures, seed)
     transition, _ = lift(rig.plant, rig.timing.exposure_steps)
@@ -200,10 +200,10 @@ class Norms:
     state_rms: float
     """Root mean square of the state itself about its mean, in closed form."""
     state_mean: float
-    rms: dict[str, Measured]
+    rms: dict[str, IntervalEstimate]
     """Root mean square of the norms by estimator."""
-    mean: dict[str, Measured]
-    gain: Measured
+    mean: dict[str, IntervalEstimate]
+    gain: IntervalEstimate
     """Ratio o3/o1 of the root mean squares."""
 
 
@@ -266,8 +266,8 @@ class ErrorRow:
     offset: float
     expected: float
     """RMSE of open loop, by the stationary covariance."""
-    rmse: dict[str, Measured]
-    gain: Measured
+    rmse: dict[str, IntervalEstimate]
+    gain: IntervalEstimate
     """Ratio o3/o1."""
 
 
@@ -292,12 +292,12 @@ class FormRow:
     """The cost of one printed form: RMSE of theta at the exposures' ends."""
 
     form: str
-    rmse: Measured
-    ratio: Measured
+    rmse: IntervalEstimate
+    ratio: IntervalEstimate
     """Ratio to the corrected form, paired."""
 
 
-def form_table(rig: Rig, effort: Effort) -> tuple[list[FormRow], Measured]:
+def form_table(rig: Rig, effort: Effort) -> tuple[list[FormRow], IntervalEstimate]:
     """RMSE of o3 under each printed form, and that of open loop."""
     many, series = ensemble(rig, effort.runs, effort.cycle_exposures, seed=61)
     found = {name: output_errors(many, series, form, effort.skip) for name, form in FORMS.items()}
@@ -306,7 +306,7 @@ def form_table(rig: Rig, effort: Effort) -> tuple[list[FormRow], Measured]:
     return rows, open_loop_output_error(many, series, effort.skip)
 
 
-def open_loop_output_error(rig: Rig, series: Sequence[Exposure], skip: int) -> Measured:
+def open_loop_output_error(rig: Rig, series: Sequence[Exposure], skip: int) -> IntervalEstimate:
     """RMSE of theta at the exposures' ends by prediction only."""
     difference = [
         (estimate.end_state - exposure.truth.end_state) @ rig.plant.C[0]
@@ -392,14 +392,14 @@ class Remark2:
     """The performance of o2 by the spot's offset: path RMSE over open loop's."""
 
     offsets: tuple[float, ...]
-    o2: list[Measured]
-    o1: list[Measured]
+    o2: list[IntervalEstimate]
+    o1: list[IntervalEstimate]
 
 
 def remark_2(lively: Rig, effort: Effort) -> Remark2:
     """o2 and o1 against open loop on the lively plant, centred and off centre."""
-    o2: list[Measured] = []
-    o1: list[Measured] = []
+    o2: list[IntervalEstimate] = []
+    o1: list[IntervalEstimate] = []
     for offset in effort.offsets:
         many, series = ensemble(variant(lively, offset=offset), effort.runs, effort.exposures, seed=71)
         found = measure_errors(many, series, ("open-loop", "o1", "o2"), effort.skip)
@@ -417,16 +417,16 @@ class Mechanism:
     noise_density: float
     equivalent: float
     """V / (1 + (4 offset²)(2/3)/(2/5))."""
-    o1: Measured
-    o3: Measured
-    o1_equivalent: Measured
+    o1: IntervalEstimate
+    o3: IntervalEstimate
+    o1_equivalent: IntervalEstimate
 
 
 def mechanism(lively: Rig, effort: Effort, offset: float = 0.5, noise_density: float = 0.1) -> Mechanism:
     """Check the mechanism of the map in the linear regime: y_2 acts as a second measurement of the position."""
     equivalent = noise_density / (1 + 4 * offset**2 * (2 / 3) / (2 / 5))
 
-    def path_rmse(at: float, density: float, name: str) -> Measured:
+    def path_rmse(at: float, density: float, name: str) -> IntervalEstimate:
         many, series = ensemble(
             variant(lively, offset=at, noise_density=density), effort.runs, effort.exposures, seed=81
         )

@@ -14,7 +14,7 @@ from aolink.plant.observability import observability
 from aolink.rig import Rig
 from paper_report import figures
 from paper_report.blocks import Block, Heading, PageFigure, Points, Table, Text
-from paper_report.ensemble import Cell, Measured
+from paper_report.ensemble import Cell, IntervalEstimate
 from paper_report.judge import Row as JudgedRow
 from paper_report.limit import Scene, against_o1_section, limit_section
 from paper_report.loop import loop_section
@@ -48,14 +48,14 @@ class Results:
     norms: list[Norms]
     """The first is the paper's own reading, the last the lively variant."""
     errors: list[ErrorRow]
-    forms: dict[str, tuple[list[FormRow], Measured]]
+    forms: dict[str, tuple[list[FormRow], IntervalEstimate]]
     """Errors by the rig's name: o3 under each printed form, and open loop."""
     remark_1: Remark1
     remark_2: Remark2
     mechanism: Mechanism
     shake: list[ShakeRow]
     limit: list[Scene]
-    over_o1: list[tuple[str, dict[str, Measured]]]
+    over_o1: list[tuple[str, dict[str, IntervalEstimate]]]
     film: list[Film]
     made: list[MadeFilm]
     family: list[JudgedRow]

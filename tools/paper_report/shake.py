@@ -16,7 +16,7 @@ from aolink.exposure import Exposure
 from aolink.numerics.arrays import FloatArray
 from aolink.rig import Rig
 from paper_report.blocks import Block, Heading, Table, Text
-from paper_report.ensemble import Measured, ensemble, errors, mean, ratio, rms, variant
+from paper_report.ensemble import IntervalEstimate, ensemble, errors, mean, ratio, rms, variant
 from paper_report.numbers import Effort
 
 DAMPING, SD = 0.005, 0.2
@@ -31,14 +31,14 @@ class ShakeRow:
 
     frequency_hz: float
     noise_density: float
-    o1: Measured
+    o1: IntervalEstimate
     """RMSE of the path."""
-    moments: Measured
-    ratio: Measured
+    moments: IntervalEstimate
+    ratio: IntervalEstimate
     """Ratio moments/o1, paired."""
-    nees: Measured
+    nees: IntervalEstimate
     """NEES of the end state by `moments`; 2 where its covariance is right."""
-    nees_open_loop: Measured
+    nees_open_loop: IntervalEstimate
     """The same by prediction alone, whose covariance is right: it shows the scatter about 2 with this number of
     runs."""
 

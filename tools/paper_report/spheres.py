@@ -16,7 +16,7 @@ import numpy as np
 from aolink.estimation import ESTIMATOR_NAMES, make_estimator, smooth
 from aolink.exposure import Exposure
 from aolink.importing.first_rig import first_rig
-from aolink.importing.frames import Settings
+from aolink.importing.frames import FilmSettings
 from aolink.importing.readers import open_film
 from aolink.importing.recording import import_film
 from aolink.importing.survey import survey
@@ -29,7 +29,7 @@ from aolink.optics.sensor import SpotSensor
 from aolink.recording.reader import Recording
 from aolink.rig import Rig, parse_rig
 from paper_report.blocks import Block, Heading, Table, Text
-from paper_report.ensemble import Measured, ratio, rms
+from paper_report.ensemble import IntervalEstimate, ratio, rms
 from paper_report.judge import BEYOND_95
 from paper_report.numbers import Effort
 
@@ -51,7 +51,7 @@ def spheres(K: int) -> tuple[Rig, list[Exposure], BoolArray]:
 
     The last is (exposures, 12).
     """
-    settings = Settings(rate_hz=_RATE_HZ, invert=True, track=6, places=places(), frames_per_exposure=K)
+    settings = FilmSettings(rate_hz=_RATE_HZ, invert=True, track=6, places=places(), frames_per_exposure=K)
     film = open_film(FILE)
     rig = parse_rig(first_rig(film, settings, "spheres").text)
     with tempfile.TemporaryDirectory() as folder:
@@ -98,21 +98,21 @@ class Film:
     """Results for exposures of this many frames of the film."""
 
     frames: int
-    path: dict[str, Measured]
+    path: dict[str, IntervalEstimate]
     """RMSE of the path, pixels, over the twelve axes."""
-    over_held: dict[str, Measured]
+    over_held: dict[str, IntervalEstimate]
     """RMSE of the path over that of the centroid, held."""
-    smoothed: dict[str, Measured]
-    over_interpolated: dict[str, Measured]
+    smoothed: dict[str, IntervalEstimate]
+    over_interpolated: dict[str, IntervalEstimate]
     """RMSE of the smoothed path over that of the interpolated centroid, which uses the future as well."""
     coverage: dict[str, float]
     """Share of the path inside the estimate's 95 % intervals, with the error of the truth included."""
     crowded: int
     """Exposures of one sphere that do not count, of ``scored``: other light is beside it."""
     scored: int
-    all_over_held: dict[str, Measured]
+    all_over_held: dict[str, IntervalEstimate]
     """As ``over_held``, with these exposures."""
-    all_over_interpolated: dict[str, Measured]
+    all_over_interpolated: dict[str, IntervalEstimate]
 
 
 def film(effort: Effort) -> list[Film]:
@@ -150,7 +150,7 @@ def _film_of(frames: int, effort: Effort) -> Film:
         """Those that count, of the axes that have any."""
         return np.where(which, errors, np.nan)[which.any(axis=1)]
 
-    def over(errors: dict[str, FloatArray], reference: FloatArray, which: BoolArray) -> dict[str, Measured]:
+    def over(errors: dict[str, FloatArray], reference: FloatArray, which: BoolArray) -> dict[str, IntervalEstimate]:
         return {name: ratio(of(each, which), of(reference, which)) for name, each in errors.items()}
 
     everywhere = np.ones_like(counts)

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from aolink.estimation.compiled.small import cholesky_solve, compiled, lower_solve, times
+from aolink.estimation.compiled.small import cholesky_solve, compiled, floored_cholesky_into, lower_solve, times
 from aolink.estimation.compiled.window_sums import (
     SUMS,
     VECTOR,
@@ -160,7 +160,7 @@ def _update(
             R[a, b] = noise[first + a, first + b] + memory * remainder[first + a, first + b]
             S[a, b] = total + R[a, b]
             own[a, b] = total + (noise[first + a, first + b] + remainder[first + a, first + b])
-    _root_into(S, root)
+    floored_cholesky_into(S, root)
     for i in range(n):
         for a in range(m):
             x[a] = HP[a, i]
@@ -184,7 +184,7 @@ def _update(
                 fits.closed_loop[row, i, j] = kept
         return
     _joseph(prior_covariance[row], K, H, R, fits.covariance[row])
-    _root_into(own, root)
+    floored_cholesky_into(own, root)
     for a in range(m):
         x[a] = fits.innovation[row, a] = new[a]
         for b in range(m):
@@ -271,22 +271,3 @@ def _joseph(P: FloatArray, K: FloatArray, H: FloatArray, R: FloatArray, out: Flo
             for a in range(m):
                 total += KR[i, a] * K[j, a]
             out[i, j] = out[j, i] = total
-
-
-@compiled
-def _root_into(a: FloatArray, root: FloatArray) -> None:
-    """Lower triangular root of a covariance: as `cholesky_into`, without its change to the diagonal."""
-    n = len(a)
-    for j in range(n):
-        total = a[j, j]
-        for k in range(j):
-            total -= root[j, k] * root[j, k]
-        # Sums that depend on each other leave nothing but rounding.
-        least = 1e-15 * a[j, j]
-        pivot = math.sqrt(total if total > least else least)
-        root[j, j] = pivot
-        for i in range(j + 1, n):
-            total = a[i, j]
-            for k in range(j):
-                total -= root[i, k] * root[j, k]
-            root[i, j] = total / pivot

@@ -19,7 +19,7 @@ from aolink.optics.camera import is_saturated, to_density
 from aolink.optics.sensor import BaseSensor, Sensor, SpotSensor
 from aolink.rig import Rig
 
-Measured = tuple[FrameData | None, str]
+MeasuredFrame = tuple[FrameData | None, str]
 """The measurements of an exposure, or None; and a remark about unusable parts, or an empty text."""
 
 
@@ -63,7 +63,7 @@ class Measurements:
             for row, k in enumerate(good.tolist()):
                 self.rows[whole[k]] = row
 
-    def __getitem__(self, k: int) -> Measured:
+    def __getitem__(self, k: int) -> MeasuredFrame:
         """The measurements of exposure k, or None; and a remark."""
         row = self.rows[k]
         if self.moments is None or row < 0:
@@ -92,7 +92,7 @@ def _moments_of_lines(sensor: Sensor, pixels: NDArray[np.uint16], needs: Needs) 
     return good, moments if isinstance(moments, Measurement) else None
 
 
-def measure(rig: Rig, exposure: Exposure, needs: Needs | None) -> Measured:
+def measure(rig: Rig, exposure: Exposure, needs: Needs | None) -> MeasuredFrame:
     """The measurements that an estimator needs of an exposure, or None; and a remark about unusable parts."""
     if needs is None:
         return None, ""
@@ -125,7 +125,7 @@ def measure(rig: Rig, exposure: Exposure, needs: Needs | None) -> Measured:
     return (None, moments) if isinstance(moments, str) else (moments, "")
 
 
-def _measured_slopes(rig: Rig, frame_id: int, slopes: FloatArray, needs: Needs) -> Measured:
+def _measured_slopes(rig: Rig, frame_id: int, slopes: FloatArray, needs: Needs) -> MeasuredFrame:
     """Slopes that came without pixels, with the noise that the rig's sensor has in a centroid.
 
     Raises EstimatorError for an estimator that needs more of a frame than its centroids.

@@ -18,6 +18,7 @@ it is (1/N) [sum_i g(theta_i) + f g(theta_N) - f g(theta_0)]. Start state, end s
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from copy import copy
@@ -28,7 +29,7 @@ from typing import Self
 import numpy as np
 
 from aolink.numerics import batched
-from aolink.numerics.arrays import BoolArray, FloatArray
+from aolink.numerics.arrays import FloatArray
 from aolink.plant.lifting import input_response, lift
 from aolink.rig import Plant
 
@@ -192,13 +193,19 @@ def over_steps(plant: Plant, inputs: FloatArray) -> tuple[FloatArray, FloatArray
     return *lift(plant, len(inputs)), kick
 
 
-def numbers(inputs: FloatArray, known: BoolArray | None = None) -> FloatArray:
-    """Inputs with zero for what is not a number: it must not poison every estimate that follows.
+def numbers(inputs: FloatArray) -> FloatArray:
+    """Inputs with zero for what is not a number: it must not poison every estimate that follows."""
+    return inputs if are_numbers(inputs) else np.where(np.isfinite(inputs), inputs, 0.0)
 
-    ``known`` says which are numbers, where that is found already.
+
+def are_numbers(inputs: FloatArray) -> bool:
+    """Whether no input is NaN or infinite: each extreme is NaN where one of them is.
+
+    Twice as fast as `numpy.isfinite` for the megabytes of a thousand axes, which need an array for its answers.
     """
-    known = np.isfinite(inputs) if known is None else known
-    return inputs if known.all() else np.where(known, inputs, 0.0)
+    return inputs.size == 0 or all(
+        math.isfinite(extreme.reduce(inputs, axis=None)) for extreme in (np.minimum, np.maximum)
+    )
 
 
 def by_axis(plant: Plant, inputs: FloatArray) -> FloatArray:
