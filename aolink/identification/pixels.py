@@ -83,10 +83,8 @@ def candidates(space: Space, found: Sequence[Maximum], seen: Sequence[Readings])
 
 
 def _frequencies(space: Space) -> list[int]:
-    """Where the frequencies of the disturbance's vibrations are among the parameters; the damping of each comes next."""
-    return [
-        k for k, name in enumerate(space.names) if name.endswith("frequency_hz") and not name.startswith("plant.")
-    ]
+    """Where the frequencies of the disturbance's vibrations are among the parameters; a damping follows each."""
+    return [k for k, name in enumerate(space.names) if name.endswith("frequency_hz") and not name.startswith("plant.")]
 
 
 def by_pixels(
