@@ -159,8 +159,8 @@ def _tiff(path: Path) -> Film:
     one_by_one = len(size) == 2 and len(kinds) > 1  # pictures that were appended
     if one_by_one and (other := next((kind for kind in kinds if kind != kinds[0]), None)):
         raise ImportingError(
-            f"{path} holds pictures of {dtype} of shape {shape} and of {other[1]} of shape {other[0]}: a film has frames"
-            " of one size and type"
+            f"{path} holds pictures of {dtype} of shape {shape} and of {other[1]} of shape {other[0]}: a film has"
+            " frames of one size and type"
         )
     size = (len(kinds), *size) if len(size) == 2 else size
     if len(size) != 3 or "S" in axes[:-1]:
@@ -298,8 +298,8 @@ def _fits(path: Path) -> Film:
         return _aot(path)
     if stored.ndim == 2 and (more := sum(each[1].shape == stored.shape for each in arrays)):
         raise ImportingError(
-            f"{path} holds {more + 1} arrays of shape {stored.shape}, and which of them are frames is not known: stack the"
-            " frames in one array (frames, rows, columns)"
+            f"{path} holds {more + 1} arrays of shape {stored.shape}, and which of them are frames is not known: stack"
+            " the frames in one array (frames, rows, columns)"
         )
     cube = stored[None] if stored.ndim == 2 else stored
     if cube.ndim != 3:
