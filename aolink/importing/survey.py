@@ -155,18 +155,30 @@ def survey(film: Film, settings: Settings, objects: Objects, progress: Callable[
             progress(k + 1)
     path, near = np.array(places), np.array(together)
     if np.isfinite(path).all(axis=2).sum() < 2 * FIRST_FRAMES:
-        raise ImportingError(f"{film.name}: no object can be followed from frame to frame: do they move too far?")
+        raise ImportingError(
+            f"{film.name}: no object can be followed from frame to frame: do they move too far, or are they at an edge?"
+        )
     brightness = brightness_of(np.array(shine))
-    cuts = np.array(windows) / brightness[::every, None, None, None]
-    sd, sd_sd, amounts, ground, residual, model, beside = _fitted(cuts, np.array(centres), objects.sd)
+    cuts = np.array(windows)
+    ground = _about(cuts)[:, None, None]  # it does not fade with the objects
+    cuts = ground + (cuts - ground) / brightness[::every, None, None, None]
+    sd, sd_sd, amounts, remaining, residual, model, beside = _fitted(cuts, np.array(centres), objects.sd)
     noise = pixel_noise(cuts.reshape(-1, *cuts.shape[2:]), np.concatenate(centres), sd)
     place_sd = tracker_errors(path, range(0, film.count, every), amounts, sd, noise, objects.sd)
     return Survey(
         places=path, last=np.array(last), together=near, sd=sd, sd_sd=sd_sd, light=amounts,
-        brightness=brightness, ground=ground, residual=residual, model=model, place_sd=place_sd,
+        brightness=brightness, ground=remaining, residual=residual, model=model, place_sd=place_sd,
         rest=_rest(float(np.nanmax(amounts)), sd, noise), beside=beside, stretch=every * _STRETCH,
         left_out=float(np.isnan(cuts).mean()),
     )  # fmt: skip
+
+
+def _about(windows: FloatArray) -> FloatArray:
+    """Median of the outermost pixels of each object's windows, (samples, n, side, side); zero where there are none."""
+    border = np.ones(windows.shape[2:], dtype=np.bool_)
+    border[1:-1, 1:-1] = False
+    each = [one[np.isfinite(one)] for one in windows[:, :, border].swapaxes(0, 1)]
+    return np.array([np.median(one) if one.size else 0.0 for one in each])
 
 
 def _rest(light: float, sd: float, noise: tuple[float, float]) -> float:
