@@ -69,6 +69,8 @@ def open_film(source: str | Path, topic: str | None = None) -> Film:
             film = _mcap(path, topic) if suffix == ".mcap" else _bag(path, topic)
         elif suffix in _VIDEOS:
             film = _video(path)
+        elif suffix == ".db3":
+            raise ImportingError(f"{path} is a part of a ROS 2 bag: give the bag's folder, which has metadata.yaml")
         else:
             known = ", ".join([*_READERS, ".mcap", ".bag", *_VIDEOS])
             raise ImportingError(f"{path} is no kind of film that is known: give {known} or a folder of pictures")
@@ -227,8 +229,12 @@ def _complaints(path: Path) -> Iterator[None]:
 
 
 def _folder(path: Path) -> Film:
-    found = (each for each in path.iterdir() if each.suffix.lower() in _PICTURES and not each.name.startswith("."))
+    found = (
+        each for each in path.iterdir() if each.suffix.lower() in _PICTURES and each.name[0] != "." and each.is_file()
+    )
     files = sorted(found, key=_number_order)
+    if not files and any(each.suffix in (".db3", ".mcap") for each in path.iterdir()):
+        raise ImportingError(f"{path} has no metadata.yaml, as a ROS 2 bag has: `ros2 bag reindex` makes one")
     if not files:
         raise ImportingError(f"{path} holds no pictures ({', '.join(_PICTURES)})")
     first = _picture(files[0])

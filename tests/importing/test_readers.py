@@ -233,6 +233,13 @@ def test_pictures_of_other_formats(tmp_path):
     check(open_film(folder), frames)
 
 
+def test_a_part_of_a_bag_is_refused_with_what_to_give(tmp_path):
+    bag = others.write_ros2(tmp_path / "a", {"/camera": others.ros_images(ROS2, numbers(np.uint8), "mono8")})
+    assert "give the bag's folder" in refused(next(bag.glob("*.db3")))
+    (bag / "metadata.yaml").unlink()
+    assert "has no metadata.yaml, as a ROS 2 bag has" in refused(bag)
+
+
 def test_hidden_files_are_no_pictures(tmp_path):
     frames = numbers(np.uint8, count=3)
     folder = others.write_pictures(tmp_path / "film", frames)
