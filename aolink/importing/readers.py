@@ -153,7 +153,7 @@ def _tiff(path: Path) -> Film:
     with _complaints(path), tifffile.TiffFile(path) as file:
         series = file.series[0]
         axes, shape, dtype = series.axes, series.shape, np.dtype(series.dtype)
-        known = _tiff_times(file.imagej_metadata or {}, file.ome_metadata or "")
+        rate_hz, exposure_s = _tiff_times(file.imagej_metadata or {}, file.ome_metadata or "")
         compression = int(file.pages.first.compression)
         kinds = [(each.shape, np.dtype(each.dtype)) for each in file.series]
     colours = axes.endswith("S")  # samples of a pixel
@@ -188,13 +188,13 @@ def _tiff(path: Path) -> Film:
     more = len(kinds) > 1 and not one_by_one
     return Film(
         name=path.name, shape=(size[1], size[2]), dtype=dtype, count=size[0],
-        frames=lambda: (grey(picture, path) for picture in pictures()), **known,
+        frames=lambda: (grey(picture, path) for picture in pictures()), rate_hz=rate_hz, exposure_s=exposure_s,
         nonlinear=_COMPRESSED if compression in _LOSSY_TIFF else "",
         notes=(f"{path.name} holds {len(kinds)} stacks: the first is taken",) if more else (),
     )  # fmt: skip
 
 
-def _tiff_times(imagej: dict[str, Any], ome: str) -> dict[str, float | None]:
+def _tiff_times(imagej: dict[str, Any], ome: str) -> tuple[float | None, float | None]:
     """Frame rate and exposure time by the headers of ImageJ and of OME-TIFF, where their unit is known."""
 
     def seconds(value: object, unit: str) -> float | None:
@@ -206,7 +206,7 @@ def _tiff_times(imagej: dict[str, Any], ome: str) -> dict[str, float | None]:
         return seconds(value[1], unit[1] if unit else "s") if value else None
 
     interval = seconds(imagej.get("finterval"), str(imagej.get("tunit", "sec"))) or of_ome("TimeIncrement")
-    return {"rate_hz": 1 / interval if interval else None, "exposure_s": of_ome("ExposureTime")}
+    return 1 / interval if interval else None, of_ome("ExposureTime")
 
 
 @contextmanager
