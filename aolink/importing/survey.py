@@ -64,8 +64,8 @@ class Survey:
     place_sd: FloatArray
     """Standard deviation of the error of each object's place in one frame, pixels, (n,); NaN where it is not seen."""
     rest: float
-    """Reach of the objects' light, in their standard deviations: what the brightest one has beyond is less than the
-    noise of its light in one frame."""
+    """Reach of the objects' light, in their standard deviations: what the brightest one has beyond is less than
+    twice the noise of its light in one frame."""
     beside: FloatArray
     """The brightest light beside each object as a share of its own, both through a Gaussian of the object's size, in
     each stretch of the film, (stretches, n); NaN where the object is not seen."""
@@ -188,7 +188,7 @@ def _rest(light: float, sd: float, noise: tuple[float, float]) -> float:
     variance = dark * math.pi * (_REST * sd) ** 2 + gain * light
     if not (variance > 0 and light > 0):
         return _REST
-    return min(max(_REST, math.sqrt(max(math.log(light**2 / variance), 0.0))), _FARTHEST)
+    return min(max(_REST, math.sqrt(max(math.log(light**2 / (4 * variance)), 0.0))), _FARTHEST)
 
 
 def _fitted(

@@ -224,14 +224,14 @@ def test_pixels_beyond_the_picture_are_no_darkness(tmp_path: Path) -> None:
 
 
 def test_a_bright_object_keeps_its_light() -> None:
-    """What an exposure lacks of it, because it is taken as light of others, is less than the noise of its light."""
+    """What an exposure lacks of it, taken as light of others, is less than twice the noise of its light."""
     rng = np.random.default_rng(6)
     noise = 3.0
     film = spot_film(rng, random_walk(rng, 80, 2, 0.3), MIDDLES, noise=noise)
     source = array_film(film.frames, "film")
     known = survey(source, SETTINGS, find_objects(source, SETTINGS))
     lacks = np.exp(-(known.rest**2) / 2)
-    assert lacks < noise * np.sqrt(np.pi * (known.rest * 1.8) ** 2) / 20_000
+    assert lacks < 2 * noise * np.sqrt(np.pi * (known.rest * 1.8) ** 2) / 20_000
     rig = parse_rig(first_rig(source, SETTINGS, "film").text)
     account = Account()
     frames = np.array([each.frame.pixels for each in imported(source, rig, SETTINGS, account)], dtype=float)
