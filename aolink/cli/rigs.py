@@ -18,6 +18,7 @@ from aolink.cli.common import (
     RigArgument,
     app,
     load_checked,
+    local_file,
     program,
     progress,
     stderr,
@@ -84,6 +85,7 @@ def rig(
         typer.Option(
             "--from",
             metavar="FILM",
+            parser=local_file,
             help="Write a first rig file for the objects of a film, RIG or FILM's name with .toml, and end.",
         ),
     ] = None,

@@ -28,6 +28,7 @@ from aolink.importing.frames import (
     default_scale,
     frame_times,
     grouped,
+    nonlinear_note,
     rig_frame,
 )
 from aolink.numerics.arrays import BoolArray, FloatArray
@@ -55,7 +56,7 @@ def imported(film: Film, rig: Rig, settings: FilmSettings, account: FilmAccount)
     periods, notes = frame_times(film, rig, settings)
     account.notes = (*film.notes, *notes, *(() if settings.invert else film.saturation_notes))
     if film.nonlinear and settings.gamma == 1.0:
-        account.notes += (f"light may not be linear: {film.nonlinear}; --gamma 2.2 undoes the usual curve",)
+        account.notes += (nonlinear_note(film),)
     if film.slopes:
         yield from _of_slopes(film, rig, settings, periods, account)
         return

@@ -11,7 +11,7 @@ import numpy as np
 
 from aolink.errors import ImportingError
 from aolink.importing.film import Film
-from aolink.importing.frames import FilmSettings, film_periods
+from aolink.importing.frames import Settings, film_rate, nonlinear_note
 from aolink.importing.motion import Motion, fit_motion
 from aolink.importing.survey import Survey, reach, survey
 from aolink.importing.tracker import find_objects
@@ -44,25 +44,26 @@ def first_rig(film: Film, settings: FilmSettings, name: str, progress: Callable[
     Raises
     ------
     ImportingError
-        There are fewer objects, or the frame rate is not known.
+        There are fewer objects, or the frame rate is not known or contradicts the film's times.
     """
     if film.slopes:
         raise ImportingError(f"{film.name} has slopes and no pictures: a first rig file is made from pictures")
     if not settings.track:
         raise ImportingError("a first rig file is about objects in the film: say how many with --track N")
-    objects = find_objects(film, settings)
-    known = survey(film, settings, objects, progress)
-    periods, timed = film_periods(film)
-    rate = settings.rate_hz or film.rate_hz or timed
+    periods, rate, said = film_rate(film, settings)
     if rate is None:
         raise ImportingError(f"it is not known how many frames a second {film.name} has: give --rate")
+    if film.nonlinear and settings.gamma == 1.0:
+        said.append(nonlinear_note(film))
+    objects = find_objects(film, settings)
+    known = survey(film, settings, objects, progress)
     places = np.full((int(periods[-1]) + 1, 2 * settings.track), np.nan)  # lost frames show nothing
     places[periods] = known.places.reshape(len(periods), -1)
     motion = fit_motion(places)
     K = settings.frames_per_exposure
     # The window moves before its object has strayed too far from the middle.
     side = max(_LEAST_WINDOW, 2 * math.ceil(reach(known, K) / (1 - 2 * STRAY)))
-    notes = (*(() if settings.invert else film.saturation_notes), *_notes(known, motion))
+    notes = (*said, *(() if settings.invert else film.saturation_notes), *_notes(known, motion))
     return FirstRig(_text(film, settings, name, known, motion, side, rate, notes), notes)
 
 

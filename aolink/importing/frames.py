@@ -111,19 +111,7 @@ def frame_times(film: Film, rig: Rig, settings: FilmSettings) -> tuple[NDArray[n
         Rate, times or exposure time contradict each other or the rig file; the message says what to change.
     """
     timing, K = rig.timing, settings.frames_per_exposure
-    notes = []
-    rate = film.rate_hz
-    if settings.rate_hz is not None:
-        if rate is not None and abs(rate / settings.rate_hz - 1) > _CLOSE:
-            notes.append(f"the film says {rate:g} frames/s; {settings.rate_hz:g} frames/s as given are taken")
-        rate = settings.rate_hz
-    periods, timed = film_periods(film)
-    if timed is not None and rate is not None and abs(rate / timed - 1) > _CLOSE:
-        raise ImportingError(
-            f"{film.name}: {rate:g} frames/s contradict its times, which say {timed:.6g}: give --rate {timed:.6g}, or a"
-            " file with the right times"
-        )
-    rate = timed or rate
+    periods, rate, notes = film_rate(film, settings)
     own = K / (timing.frame_period_steps * timing.fast_step_s)
     if rate is None:
         notes.append(f"the film does not state its frame rate: that of the rig file is assumed, {own:.6g} frames/s")
@@ -154,6 +142,33 @@ def frame_times(film: Film, rig: Rig, settings: FilmSettings) -> tuple[NDArray[n
                 " change timing.exposure_steps, or give the right --exposure"
             )
     return periods, notes
+
+
+def nonlinear_note(film: Film) -> str:
+    """A note for the user on a film that is `Film.nonlinear`, where no gamma curve is undone."""
+    return f"light may not be linear: {film.nonlinear}; --gamma 2.2 undoes the usual curve"
+
+
+def film_rate(film: Film, settings: Settings) -> tuple[NDArray[np.int64], float | None, list[str]]:
+    """`film_periods`, frames a second where they are known, and notes on what was taken.
+
+    Raises
+    ------
+    ImportingError
+        The rate and the times contradict each other, or the times are damaged.
+    """
+    rate, notes = film.rate_hz, []
+    if settings.rate_hz is not None:
+        if rate is not None and abs(rate / settings.rate_hz - 1) > _CLOSE:
+            notes.append(f"the film says {rate:g} frames/s; {settings.rate_hz:g} frames/s as given are taken")
+        rate = settings.rate_hz
+    periods, timed = film_periods(film)
+    if timed is not None and rate is not None and abs(rate / timed - 1) > _CLOSE:
+        raise ImportingError(
+            f"{film.name}: {rate:g} frames/s contradict its times, which say {timed:.6g}: give --rate {timed:.6g}, or a"
+            " file with the right times"
+        )
+    return periods, timed or rate, notes
 
 
 def film_periods(film: Film) -> tuple[NDArray[np.int64], float | None]:

@@ -121,7 +121,9 @@ def fit_motion(places: FloatArray) -> Motion:
     places = np.ascontiguousarray(places, dtype=np.float64)
     count = int(np.isfinite(places).sum())
     if count < 20 or len(places) < 10:
-        raise ImportingError(f"{count} places are too few to fit a motion to: 20 or more are needed")
+        raise ImportingError(
+            f"{count} places in {len(places)} frames are too few to fit a motion to: 20 in 10 frames or more are needed"
+        )
     steps = np.diff(places, axis=0)
     step = math.log(max(float(np.nanvar(steps)), 1e-12))
 

@@ -24,13 +24,18 @@ from aolink.errors import AolinkError, FrameError, ImportingError
 from aolink.extensions import needs_extra
 from aolink.importing.film import Film, FilmFrame, array_film, grey
 from aolink.limits import load_archive, unpacked
-from aolink.optics.frame_file import parse_fits_array, read_fits
+from aolink.optics.frame_file import fits_arrays, parse_fits_array, read_fits
 from aolink.optics.pictures import image_pixels, opened_image, read_picture
 
 _PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".npy", ".fits", ".fit", ".pgm")
 _VIDEOS = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg", ".gif", ".wmv")
 _LOSSY_TIFF = (6, 7)  # JPEG
 _PILLOW_TIFF = (5, *_LOSSY_TIFF)  # LZW and JPEG, which tifffile reads with a further package only
+_SECONDS = {
+    **dict.fromkeys(("s", "sec", "seconds"), 1.0), **dict.fromkeys(("ms", "msec"), 1e-3), "min": 60.0,
+    **dict.fromkeys(("us", "usec", "\N{MICRO SIGN}s", "\N{GREEK SMALL LETTER MU}s", r"\u00B5s"), 1e-6), "ns": 1e-9,
+}  # fmt: skip
+"""Units of time in the headers of TIFF files."""
 _COMPRESSED = "JPEG and video hold light after a gamma curve and lossy compression"
 
 
@@ -64,6 +69,8 @@ def open_film(source: str | Path, topic: str | None = None) -> Film:
             film = _mcap(path, topic) if suffix == ".mcap" else _bag(path, topic)
         elif suffix in _VIDEOS:
             film = _video(path)
+        elif suffix == ".db3":
+            raise ImportingError(f"{path} is a part of a ROS 2 bag: give the bag's folder, which has metadata.yaml")
         else:
             known = ", ".join([*_READERS, ".mcap", ".bag", *_VIDEOS])
             raise ImportingError(f"{path} is no kind of film that is known: give {known} or a folder of pictures")
@@ -146,11 +153,18 @@ def _tiff(path: Path) -> Film:
     with _complaints(path), tifffile.TiffFile(path) as file:
         series = file.series[0]
         axes, shape, dtype = series.axes, series.shape, np.dtype(series.dtype)
-        interval = (file.imagej_metadata or {}).get("finterval")
+        rate_hz, exposure_s = _tiff_times(file.imagej_metadata or {}, file.ome_metadata or "")
         compression = int(file.pages.first.compression)
+        kinds = [(each.shape, np.dtype(each.dtype)) for each in file.series]
     colours = axes.endswith("S")  # samples of a pixel
     size = shape[:-1] if colours else shape
-    size = (1, *size) if len(size) == 2 else size
+    one_by_one = len(size) == 2 and len(kinds) > 1  # pictures that were appended
+    if one_by_one and (other := next((kind for kind in kinds if kind != kinds[0]), None)):
+        raise ImportingError(
+            f"{path} holds pictures of {dtype} of shape {shape} and of {other[1]} of shape {other[0]}: a film has"
+            " frames of one size and type"
+        )
+    size = (len(kinds), *size) if len(size) == 2 else size
     if len(size) != 3 or "S" in axes[:-1]:
         raise ImportingError(f"{path} holds {dtype} of shape {shape}, expected (frames, rows, columns)")
 
@@ -162,7 +176,7 @@ def _tiff(path: Path) -> Film:
                 yield from map(image_pixels, ImageSequence.Iterator(image))
             return
         with tifffile.TiffFile(path) as file:
-            pages = file.series[0].pages
+            pages = [page for each in file.series for page in each.pages] if one_by_one else file.series[0].pages
             if len(pages) == size[0]:
                 for page in pages:
                     if page is None or math.prod(page.chunked) > len(page.dataoffsets):  # it would count them all
@@ -171,12 +185,28 @@ def _tiff(path: Path) -> Film:
             else:  # ImageJ keeps a large stack as one page
                 yield from file.series[0].asarray().reshape(size[0], *shape[-3 if colours else -2 :])
 
+    more = len(kinds) > 1 and not one_by_one
     return Film(
         name=path.name, shape=(size[1], size[2]), dtype=dtype, count=size[0],
-        frames=lambda: (grey(picture, path) for picture in pictures()),
-        rate_hz=1 / float(interval) if interval else None,
+        frames=lambda: (grey(picture, path) for picture in pictures()), rate_hz=rate_hz, exposure_s=exposure_s,
         nonlinear=_COMPRESSED if compression in _LOSSY_TIFF else "",
+        notes=(f"{path.name} holds {len(kinds)} stacks: the first is taken",) if more else (),
     )  # fmt: skip
+
+
+def _tiff_times(imagej: dict[str, Any], ome: str) -> tuple[float | None, float | None]:
+    """Frame rate and exposure time by the headers of ImageJ and of OME-TIFF, where their unit is known."""
+
+    def seconds(value: object, unit: str) -> float | None:
+        number = _float(str(value))
+        return number * _SECONDS[unit] if number and unit in _SECONDS else None
+
+    def of_ome(key: str) -> float | None:
+        value, unit = (re.search(rf'\b{each}="([^"]*)"', ome) for each in (key, f"{key}Unit"))
+        return seconds(value[1], unit[1] if unit else "s") if value else None
+
+    interval = seconds(imagej.get("finterval"), str(imagej.get("tunit", "sec"))) or of_ome("TimeIncrement")
+    return 1 / interval if interval else None, of_ome("ExposureTime")
 
 
 @contextmanager
@@ -199,7 +229,12 @@ def _complaints(path: Path) -> Iterator[None]:
 
 
 def _folder(path: Path) -> Film:
-    files = sorted((each for each in path.iterdir() if each.suffix.lower() in _PICTURES), key=_number_order)
+    found = (
+        each for each in path.iterdir() if each.suffix.lower() in _PICTURES and each.name[0] != "." and each.is_file()
+    )
+    files = sorted(found, key=_number_order)
+    if not files and any(each.suffix in (".db3", ".mcap") for each in path.iterdir()):
+        raise ImportingError(f"{path} has no metadata.yaml, as a ROS 2 bag has: `ros2 bag reindex` makes one")
     if not files:
         raise ImportingError(f"{path} holds no pictures ({', '.join(_PICTURES)})")
     first = _picture(files[0])
@@ -259,13 +294,19 @@ def _fits(path: Path) -> Film:
         # Mapped, not read: a cube may be larger than the memory.
         data = unpacked(file, ImportingError) if packed else mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
     try:
-        header, stored, scale, zero = parse_fits_array(data)  # type: ignore[arg-type] # a map is read as bytes are
+        arrays = fits_arrays(data)  # type: ignore[arg-type] # a map is read as bytes are
+        header, stored, scale, zero = next(arrays)
     except FrameError as error:
         if b"AOT-VERS" in data[: 100 * 2880]:
             return _aot(path)
         raise ImportingError(f"{path}: {error}") from None
     if "AOT-VERS" in header:
         return _aot(path)
+    if stored.ndim == 2 and (more := sum(each[1].shape == stored.shape for each in arrays)):
+        raise ImportingError(
+            f"{path} holds {more + 1} arrays of shape {stored.shape}, and which of them are frames is not known: stack"
+            " the frames in one array (frames, rows, columns)"
+        )
     cube = stored[None] if stored.ndim == 2 else stored
     if cube.ndim != 3:
         raise ImportingError(f"{path} holds an array of shape {stored.shape}, expected (frames, rows, columns)")

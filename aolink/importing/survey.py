@@ -28,8 +28,10 @@ _ALONE = 1 / 3
 _DRIFTS = 5.0
 """Standard deviations of the mean step from which on it is a drift."""
 _REST = 2.5
-"""Reach of an object's light, in standard deviations that include its walk in an exposure: light beyond belongs to
-other objects."""
+"""Least reach of an object's light, in standard deviations that include its walk in an exposure: light beyond belongs
+to other objects."""
+_FARTHEST = 4.0
+"""Largest reach; light of others is searched for so far from an object."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,6 +63,9 @@ class Survey:
     """The fits at the same places, as a share of the object's light, (samples,)."""
     place_sd: FloatArray
     """Standard deviation of the error of each object's place in one frame, pixels, (n,); NaN where it is not seen."""
+    rest: float
+    """Reach of the objects' light, in their standard deviations: what the brightest one has beyond is less than
+    twice the noise of its light in one frame."""
     beside: FloatArray
     """The brightest light beside each object as a share of its own, both through a Gaussian of the object's size, in
     each stretch of the film, (stretches, n); NaN where the object is not seen."""
@@ -133,7 +138,7 @@ def survey(
     """
     light = FilmLight(film, settings)
     tracker = Tracker(objects, trackpy_locator(objects.sd))
-    every, half = max(1, film.count // _SAMPLES), math.ceil(4 * objects.sd)
+    every, half = max(1, film.count // _SAMPLES), math.ceil(_FARTHEST * objects.sd)
     places, last, together, shine = [], [], [], []
     windows, centres = [], []
     for k, frame in enumerate(film.frames()):
@@ -152,17 +157,40 @@ def survey(
             progress(k + 1)
     path, near = np.array(places), np.array(together)
     if np.isfinite(path).all(axis=2).sum() < 2 * FIRST_FRAMES:
-        raise ImportingError(f"{film.name}: no object can be followed from frame to frame: do they move too far?")
+        raise ImportingError(
+            f"{film.name}: no object can be followed from frame to frame: do they move too far, or are they at an edge?"
+        )
     brightness = brightness_of(np.array(shine))
-    cuts = np.array(windows) / brightness[::every, None, None, None]
-    sd, sd_sd, amounts, ground, residual, model, beside = _fitted(cuts, np.array(centres), objects.sd)
+    cuts = np.array(windows)
+    ground = _about(cuts)[:, None, None]  # it does not fade with the objects
+    cuts = ground + (cuts - ground) / brightness[::every, None, None, None]
+    sd, sd_sd, amounts, remaining, residual, model, beside = _fitted(cuts, np.array(centres), objects.sd)
     noise = pixel_noise(cuts.reshape(-1, *cuts.shape[2:]), np.concatenate(centres), sd)
     place_sd = tracker_errors(path, range(0, film.count, every), amounts, sd, noise, objects.sd)
     return Survey(
         places=path, last=np.array(last), together=near, sd=sd, sd_sd=sd_sd, light=amounts,
-        brightness=brightness, ground=ground, residual=residual, model=model, place_sd=place_sd, beside=beside,
-        stretch=every * _STRETCH, left_out=float(np.isnan(cuts).mean()),
+        brightness=brightness, ground=remaining, residual=residual, model=model, place_sd=place_sd,
+        rest=_rest(float(np.nanmax(amounts)), sd, noise), beside=beside, stretch=every * _STRETCH,
+        left_out=float(np.isnan(cuts).mean()),
     )  # fmt: skip
+
+
+def _about(windows: FloatArray) -> FloatArray:
+    """Median of the outermost pixels of each object's windows, (samples, n, side, side); zero where there are none."""
+    border = np.ones(windows.shape[2:], dtype=np.bool_)
+    border[1:-1, 1:-1] = False
+    each = [one[np.isfinite(one)] for one in windows[:, :, border].swapaxes(0, 1)]
+    return np.array([np.median(one) if one.size else 0.0 for one in each])
+
+
+def _rest(light: float, sd: float, noise: tuple[float, float]) -> float:
+    """`Survey.rest` of an object, for the ``noise`` that `pixel_noise` gives: a Gaussian has the share
+    exp(-rest^2 / 2) of its light beyond."""
+    dark, gain = noise
+    variance = dark * math.pi * (_REST * sd) ** 2 + gain * light
+    if not (variance > 0 and light > 0):
+        return _REST
+    return min(max(_REST, math.sqrt(max(math.log(light**2 / (4 * variance)), 0.0))), _FARTHEST)
 
 
 def _fitted(
@@ -221,7 +249,7 @@ def _brightest_beside(window: FloatArray, sd: float) -> float:
 def reach(known: Survey, frames: int) -> float:
     """Largest distance of an object's light from the middle of its blur in an exposure of ``frames`` frames, pixels."""
     moved = max((_mean_square(known.places[lag:] - known.places[:-lag]) for lag in range(1, frames + 1)), default=0.0)
-    return _REST * math.sqrt(known.sd**2 + moved)
+    return known.rest * math.sqrt(known.sd**2 + moved)
 
 
 def spread_in(known: Survey, frames: int) -> float:

@@ -24,6 +24,8 @@ WEIGHT = 1.5
 _EDGE = 4.0
 """Least distance of an object from an edge of the picture and from other objects at first, in its standard
 deviations."""
+_CUT = 2.5
+"""Distance from an edge, in standard deviations, below which a centroid is off, because light beyond is missing."""
 _REACH = 3.0
 """How far an object may go from one frame to the next, in its standard deviations."""
 _FAR = 6.0
@@ -72,6 +74,7 @@ class Tracker:
 
     def follow(self, light: FloatArray) -> FloatArray:
         """Take the next frame; gives the positions of the objects, (n, 2), NaN where one is not seen."""
+        light = light - np.median(light)  # what cut windows have beyond the picture is then ground
         start = self.places.copy()
         for pair in np.argwhere(np.triu(self.together)):
             start[pair] = self._apart_again(light, pair)
@@ -84,6 +87,8 @@ class Tracker:
             place, shine = self._farther(light, int(k), found[seen])
             if shine > _LIKE * self._usual[k]:
                 found[k], brightness[k], seen[k] = place, shine, True
+        margin, size = _CUT * self._sd - 0.5, np.array(light.shape[::-1])
+        seen &= np.asarray(((found >= margin) & (found <= size - 1 - margin)).all(axis=1))
         self.together &= ~(seen[:, None] & seen)
         meets = self._within(_MEET, found)
         # A track that had lost its object comes upon the light of another one.
@@ -104,6 +109,10 @@ class Tracker:
         """
         half = math.ceil((_REACH + 2 * WEIGHT) * self._sd)
         windows, corners = cut_windows(light, np.where(np.isfinite(start), start, self.places), half)
+        # The ground about an object is no light of it, however the ground differs from place to place.
+        border = np.ones(windows.shape[1:], dtype=np.bool_)
+        border[1:-1, 1:-1] = False
+        windows -= np.median(windows[:, border], axis=1)[:, None, None]
         near = self._within(_BESIDE, start)
         crowded = np.asarray(near.any(axis=1))
         pixels = np.arange(2 * half + 1)

@@ -6,6 +6,7 @@ import math
 import os
 import stat
 import zlib
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -86,12 +87,23 @@ def parse_fits_array(data: bytes) -> tuple[dict[str, str], NDArray[Any], float, 
     FrameError
         The data are not a FITS file, or have no array.
     """
+    return next(fits_arrays(data))
+
+
+def fits_arrays(data: bytes) -> Iterator[tuple[dict[str, str], NDArray[Any], float, float]]:
+    """The arrays of a FITS file one after the other, each as `parse_fits_array` gives the first; at least one.
+
+    Raises
+    ------
+    FrameError
+        The data are not a FITS file, have no array, or are damaged.
+    """
     if not data[:9] == b"SIMPLE  =":
         raise FrameError("it is not a FITS file: it does not begin with SIMPLE")
-    values, start, compressed = dict[str, str](), 0, False
+    values, start, compressed, count = dict[str, str](), 0, False, 0
     while start < len(data):
         own, start = _header(data, start)
-        values |= own
+        values = values | own
         try:
             kind = np.dtype(_TYPES[int(own["BITPIX"])])
             shape = tuple(int(own[f"NAXIS{axis}"]) for axis in range(int(own["NAXIS"]), 0, -1))
@@ -99,17 +111,19 @@ def parse_fits_array(data: bytes) -> tuple[dict[str, str], NDArray[Any], float, 
             groups, heap = int(own.get("GCOUNT", "1")), int(own.get("PCOUNT", "0"))
         except (KeyError, ValueError) as error:
             raise FrameError(f"its header has no usable {error}") from None
-        count = math.prod(shape) if shape else 0
-        if count > 0 and own.get("XTENSION", "IMAGE") == "IMAGE":
-            if len(data) - start < count * kind.itemsize:
+        pixels = math.prod(shape) if shape else 0
+        if pixels > 0 and own.get("XTENSION", "IMAGE") == "IMAGE":
+            if len(data) - start < pixels * kind.itemsize:
                 raise FrameError(f"it is cut off: {' x '.join(map(str, shape))} pixels are announced")
-            return values, np.frombuffer(data, kind, count, start).reshape(shape), scale, zero
+            count += 1
+            yield values, np.frombuffer(data, kind, pixels, start).reshape(shape), scale, zero
         compressed |= "ZIMAGE" in own
-        size = kind.itemsize * groups * (heap + max(count, 0))
+        size = kind.itemsize * groups * (heap + max(pixels, 0))
         start += -(-max(size, 0) // _BLOCK) * _BLOCK
-    if compressed:
+    if compressed and not count:
         raise FrameError("its picture is compressed in tiles: unpack it first, with funpack for instance")
-    raise FrameError("it has no array of pixels, neither a primary one nor in an image extension")
+    if not count:
+        raise FrameError("it has no array of pixels, neither a primary one nor in an image extension")
 
 
 def _header(data: bytes, start: int) -> tuple[dict[str, str], int]:

@@ -17,6 +17,8 @@ from aolink.importing.film import array_film
 from aolink.importing.first_rig import first_rig
 from aolink.importing.frames import FilmSettings
 from aolink.importing.recording import import_film
+from aolink.importing.survey import survey
+from aolink.importing.tracker import find_objects
 from aolink.recording.reader import Recording
 from aolink.rig import Rig, load_rig, parse_rig
 from tests.kinds import truth_of
@@ -115,13 +117,29 @@ def test_a_film_whose_light_is_constant_is_left_as_it_is(tmp_path: Path, name: s
             assert (each.pixels == frame)[each.mask].all()
 
 
+@pytest.mark.parametrize("slope", [0.0, 3.0])
+def test_the_ground_does_not_hide_that_light_fades(slope: float) -> None:
+    """A ground of the same light under the tracker's weight as an object's, or one that is brighter to one side."""
+    rng = np.random.default_rng(3)
+    still = spot_film(rng, random_walk(rng, FRAMES, 2, 0.45), np.array(MIDDLES), noise=0.0).frames - 1000.0
+    left = 0.5 ** (np.arange(FRAMES) / (FRAMES - 1))
+    ground = 400 + slope * np.arange(still.shape[2]) + 10 * rng.normal(size=still.shape)
+    film = array_film(np.rint(still * left[:, None, None] + ground).astype(np.uint16), "film")
+    settings = Settings(rate_hz=100.0, track=2, frames_per_exposure=K, places=MIDDLES)
+    known = survey(film, settings, find_objects(film, settings))
+    assert known.brightness == pytest.approx(left / left.mean(), rel=0.02)
+    assert known.light == pytest.approx(np.full(2, 20_000 * left.mean()), rel=0.02)
+    assert (known.beside < 1 / 3).all()
+
+
 @pytest.mark.long
-def test_exposures_of_a_film_that_fades_are_scaled_to_the_same_light(tmp_path: Path) -> None:
+@pytest.mark.parametrize("background", [True, False])
+def test_exposures_of_a_film_that_fades_are_scaled_to_the_same_light(background: bool, tmp_path: Path) -> None:
     """By 30 %: exposures have the light and the errors of those of the same film that does not fade."""
     rng = np.random.default_rng(3)
     still = spot_film(rng, random_walk(rng, FRAMES, 2, 0.45), np.array(MIDDLES), noise=0.0)
     noise = 20 * rng.normal(size=still.frames.shape)
-    settings = FilmSettings(rate_hz=100.0, subtract_median=True, track=2, frames_per_exposure=K, places=MIDDLES)
+    settings = Settings(rate_hz=100.0, subtract_median=background, track=2, frames_per_exposure=K, places=MIDDLES)
     found = {}
     for lost in (0.0, 0.3):
         left = (1 - lost) ** (np.arange(FRAMES) / (FRAMES - 1))

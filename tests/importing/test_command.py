@@ -177,3 +177,26 @@ def test_a_first_rig_file_has_the_films_name_where_none_is_given(aolink, tmp_pat
     done = aolink("rig")
     assert done.returncode == 2
     assert "name a rig file" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("source", "options", "says"),
+    [
+        (timed, [], "50 frames/s contradict its times, which say 40"),
+        (timed, ["--rate", "20"], "20 frames/s contradict its times, which say 40"),
+        (good, [], "it is not known how many frames a second film.npy has: give --rate"),
+        (good, ["--rate", "50"], "film.npy: no objects can be found: a frame of 32 x 32"),
+    ],
+)
+def test_a_first_rig_file_is_refused_in_one_line(source, options, says, aolink, tmp_path):
+    refused = aolink("rig", "a.toml", "--from", source(tmp_path), "--track", "1", *options)
+    assert refused.returncode == 11
+    assert says in refused.stderr.replace("\n", " ")
+    assert refused.stderr.count("\n") == 1
+    assert not (tmp_path / "a.toml").exists()
+
+
+def test_a_first_rig_file_of_a_url_is_refused(aolink):
+    refused = aolink("rig", "a.toml", "--from", "s3://films/a.npz", "--track", "1")
+    assert refused.returncode == 2
+    assert "is a URL" in " ".join(refused.stderr.split())

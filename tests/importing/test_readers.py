@@ -133,6 +133,54 @@ def test_an_imagej_stack_says_its_rate(tmp_path):
     assert film.rate_hz == pytest.approx(25)
 
 
+@pytest.mark.parametrize(
+    ("interval", "unit"), [(40, "ms"), (0.04, "s"), (0.04, "sec"), (40_000, "usec"), (40_000, r"\u00B5s")]
+)
+def test_an_imagej_stack_says_its_rate_in_a_unit(interval, unit, tmp_path):
+    metadata = {"axes": "TYX", "finterval": interval, "tunit": unit}
+    tifffile.imwrite(tmp_path / "a.tif", numbers(np.uint16), imagej=True, metadata=metadata)
+    assert open_film(tmp_path / "a.tif").rate_hz == pytest.approx(25)
+
+
+def test_an_interval_in_an_unknown_unit_is_no_rate(tmp_path):
+    metadata = {"axes": "TYX", "finterval": 2, "tunit": "turns"}
+    tifffile.imwrite(tmp_path / "a.tif", numbers(np.uint16), imagej=True, metadata=metadata)
+    assert open_film(tmp_path / "a.tif").rate_hz is None
+
+
+@pytest.mark.parametrize(("interval", "unit"), [(40, "ms"), (0.04, None), (40_000, "\N{MICRO SIGN}s")])
+def test_an_ome_stack_says_its_rate_and_exposure(interval, unit, tmp_path):
+    frames = numbers(np.uint16)
+    plane = {"ExposureTime": [interval / 2] * len(frames)}
+    metadata = {"axes": "TYX", "TimeIncrement": interval, "Plane": plane}
+    if unit is not None:
+        metadata["TimeIncrementUnit"] = unit
+        plane["ExposureTimeUnit"] = [unit] * len(frames)
+    tifffile.imwrite(tmp_path / "a.ome.tif", frames, metadata=metadata)
+    film = open_film(tmp_path / "a.ome.tif")
+    check(film, frames)
+    assert film.rate_hz == pytest.approx(25)
+    assert film.exposure_s == pytest.approx(0.02)
+
+
+def test_pictures_that_were_appended_to_a_tiff_file_are_frames(tmp_path):
+    frames = numbers(np.uint16)
+    for frame in frames:
+        tifffile.imwrite(tmp_path / "a.tif", frame, append=True)
+    check(open_film(tmp_path / "a.tif"), frames)
+    tifffile.imwrite(tmp_path / "a.tif", frames[0, :5], append=True)
+    assert "pictures of uint16 of shape (6, 9) and of uint16 of shape (5, 9)" in refused(tmp_path / "a.tif")
+
+
+def test_of_several_stacks_in_a_tiff_file_the_first_is_taken_and_said(tmp_path):
+    frames = numbers(np.uint16)
+    for k in range(3):
+        tifffile.imwrite(tmp_path / "a.tif", frames + k, append=True, photometric="minisblack")
+    film = open_film(tmp_path / "a.tif")
+    check(film, frames)
+    assert film.notes == ("a.tif holds 3 stacks: the first is taken",)
+
+
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
 def test_a_tiff_stack_compressed_by_lzw(dtype, tmp_path):
     frames = numbers(dtype)
@@ -182,6 +230,20 @@ def test_pictures_of_other_formats(tmp_path):
     others.write_fits(folder / "2.fits", frames[1])
     tifffile.imwrite(folder / "3.tif", frames[2])
     (folder / "notes.txt").write_text("no picture")
+    check(open_film(folder), frames)
+
+
+def test_a_part_of_a_bag_is_refused_with_what_to_give(tmp_path):
+    bag = others.write_ros2(tmp_path / "a", {"/camera": others.ros_images(ROS2, numbers(np.uint8), "mono8")})
+    assert "give the bag's folder" in refused(next(bag.glob("*.db3")))
+    (bag / "metadata.yaml").unlink()
+    assert "has no metadata.yaml, as a ROS 2 bag has" in refused(bag)
+
+
+def test_hidden_files_are_no_pictures(tmp_path):
+    frames = numbers(np.uint8, count=3)
+    folder = others.write_pictures(tmp_path / "film", frames)
+    (folder / "._frame5.png").write_bytes(b"what macOS keeps about a file")
     check(open_film(folder), frames)
 
 
@@ -247,6 +309,9 @@ def test_fits_without_a_cube_is_refused(tmp_path):
     assert "no array of pixels" in refused(others.write_fits(tmp_path / "a.fits", None))  # type: ignore[arg-type]
     four = others.write_fits(tmp_path / "b.fits", np.zeros((2, 3, 4, 5)))
     assert "shape (2, 3, 4, 5), expected (frames, rows, columns)" in refused(four)
+    each = [fits.PrimaryHDU(), *(fits.ImageHDU(frame) for frame in numbers(np.int16))]
+    fits.HDUList(each).writeto(tmp_path / "c.fits")
+    assert "holds 7 arrays of shape (6, 9), and which of them are frames is not known" in refused(tmp_path / "c.fits")
 
 
 # imageio-ffmpeg leaves the ends of its pipes to the collection of garbage.
