@@ -11,7 +11,7 @@ import numpy as np
 
 from aolink.errors import ImportingError
 from aolink.importing.film import Film
-from aolink.importing.frames import Settings, film_rate, nonlinear_note
+from aolink.importing.frames import FilmSettings, film_rate, nonlinear_note
 from aolink.importing.motion import Motion, fit_motion
 from aolink.importing.survey import Survey, reach, survey
 from aolink.importing.tracker import find_objects

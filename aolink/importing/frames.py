@@ -149,7 +149,7 @@ def nonlinear_note(film: Film) -> str:
     return f"light may not be linear: {film.nonlinear}; --gamma 2.2 undoes the usual curve"
 
 
-def film_rate(film: Film, settings: Settings) -> tuple[NDArray[np.int64], float | None, list[str]]:
+def film_rate(film: Film, settings: FilmSettings) -> tuple[NDArray[np.int64], float | None, list[str]]:
     """`film_periods`, frames a second where they are known, and notes on what was taken.
 
     Raises

@@ -125,7 +125,7 @@ def test_the_ground_does_not_hide_that_light_fades(slope: float) -> None:
     left = 0.5 ** (np.arange(FRAMES) / (FRAMES - 1))
     ground = 400 + slope * np.arange(still.shape[2]) + 10 * rng.normal(size=still.shape)
     film = array_film(np.rint(still * left[:, None, None] + ground).astype(np.uint16), "film")
-    settings = Settings(rate_hz=100.0, track=2, frames_per_exposure=K, places=MIDDLES)
+    settings = FilmSettings(rate_hz=100.0, track=2, frames_per_exposure=K, places=MIDDLES)
     known = survey(film, settings, find_objects(film, settings))
     assert known.brightness == pytest.approx(left / left.mean(), rel=0.02)
     assert known.light == pytest.approx(np.full(2, 20_000 * left.mean()), rel=0.02)
@@ -139,7 +139,7 @@ def test_exposures_of_a_film_that_fades_are_scaled_to_the_same_light(background:
     rng = np.random.default_rng(3)
     still = spot_film(rng, random_walk(rng, FRAMES, 2, 0.45), np.array(MIDDLES), noise=0.0)
     noise = 20 * rng.normal(size=still.frames.shape)
-    settings = Settings(rate_hz=100.0, subtract_median=background, track=2, frames_per_exposure=K, places=MIDDLES)
+    settings = FilmSettings(rate_hz=100.0, subtract_median=background, track=2, frames_per_exposure=K, places=MIDDLES)
     found = {}
     for lost in (0.0, 0.3):
         left = (1 - lost) ** (np.arange(FRAMES) / (FRAMES - 1))

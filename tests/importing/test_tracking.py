@@ -17,7 +17,7 @@ from aolink.estimation import run, smooth
 from aolink.importing.exposures import imported
 from aolink.importing.film import array_film
 from aolink.importing.first_rig import first_rig
-from aolink.importing.frames import Account, FilmLight, Settings
+from aolink.importing.frames import FilmAccount, FilmLight, FilmSettings
 from aolink.importing.motion import Motion, fit_motion, vibration_mean
 from aolink.importing.recording import import_film
 from aolink.importing.survey import survey
@@ -233,7 +233,7 @@ def test_a_bright_object_keeps_its_light() -> None:
     lacks = np.exp(-(known.rest**2) / 2)
     assert lacks < 2 * noise * np.sqrt(np.pi * (known.rest * 1.8) ** 2) / 20_000
     rig = parse_rig(first_rig(source, SETTINGS, "film").text)
-    account = Account()
+    account = FilmAccount()
     frames = np.array([each.frame.pixels for each in imported(source, rig, SETTINGS, account)], dtype=float)
     counts = frames.reshape(len(frames), *rig.sensor.grid, -1, rig.sensor.profile.pixels) - rig.sensor.black_level
     assert account.exposures == 10
