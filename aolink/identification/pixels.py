@@ -38,7 +38,7 @@ _DECAY = 1 / 8
 """Decay time of the vibration of a candidate beside a maximum, in lengths of the recording."""
 _ALIKE = 3.0
 """Such a candidate is not made where the maximum's own damping is within this factor."""
-_MOVES = 4
+_MOVES = 6
 """The most steps along one parameter."""
 
 
@@ -133,9 +133,9 @@ def refined(
 ) -> FloatArray:  # fmt: skip
     """Parameters in which damping and frequency of each vibration are where the pixels' evidence is highest.
 
-    One after the other is moved, by steps up to the highest of three evidences and then to the vertex of the parabola
-    through them. Where `profile` cannot work on the rig, they stay. The parameters are those of `candidates`, and the
-    others as in `by_pixels`; `tell` is called with the parameters that have been moved.
+    Damping, frequency, and damping again are moved, by steps up to the highest of three evidences and then to the
+    vertex of the parabola through them. Where `profile` cannot work on the rig, they stay. The parameters are those of
+    `candidates`, and the others as in `by_pixels`; `tell` is called with the number of moves that are done.
     """
     x = x.copy()
 
@@ -148,7 +148,8 @@ def refined(
         other[k] = np.clip(to, *space.bounds[k])
         return float(other[k]), evidence(other)
 
-    moved = [at for k in _frequencies(space) for at in (k, k + 1)]
+    # With a damping that is far too high any frequency nearby will do.
+    moved = [at for k in _frequencies(space) for at in (k + 1, k, k + 1)]
     try:
         here = evidence(x) if moved else np.zeros(0)
     except EstimatorError:
