@@ -38,8 +38,12 @@ _DECAY = 1 / 8
 """Decay time of the vibration of a candidate beside a maximum, in lengths of the recording."""
 _ALIKE = 3.0
 """Such a candidate is not made where the maximum's own damping is within this factor."""
-_MOVES = 6
-"""The most steps along one parameter."""
+_AROUND = np.arange(-2.0, 3.0)
+"""Steps from a parameter at which the evidence is compared."""
+_MOVES = 3
+"""How often a parameter is moved at most: again where the best is at an end of these steps."""
+_MOST_NEAR = 2.0
+"""The most nats by which one exposure counts between models that differ by such steps."""
 
 
 RigOf = Callable[[FloatArray], Rig]
@@ -133,9 +137,9 @@ def refined(
 ) -> FloatArray:  # fmt: skip
     """Parameters in which damping and frequency of each vibration are where the pixels' evidence is highest.
 
-    Damping, frequency, and damping again are moved, by steps up to the highest of three evidences and then to the
-    vertex of the parabola through them. Where `profile` cannot work on the rig, they stay. The parameters are those of
-    `candidates`, and the others as in `by_pixels`; `tell` is called with the number of moves that are done.
+    First the damping, then the frequency is moved to the vertex of the parabola through five evidences. Where `profile`
+    cannot work on the rig, they stay. The parameters are those of `candidates`, and the others as in `by_pixels`;
+    `tell` is called with the number of parameters that are done.
     """
     x = x.copy()
 
@@ -143,43 +147,28 @@ def refined(
         estimator = make_estimator(rig_of(x), _ESTIMATOR)
         return np.array([_log_evidence(estimator, exposure) for exposure in exposures[:_ENOUGH]][_SETTLED:])
 
-    def beside(k: int, to: float) -> tuple[float, FloatArray]:
-        other = x.copy()
-        other[k] = np.clip(to, *space.bounds[k])
-        return float(other[k]), evidence(other)
-
-    # With a damping that is far too high any frequency nearby will do.
-    moved = [at for k in _frequencies(space) for at in (k + 1, k, k + 1)]
-    try:
-        here = evidence(x) if moved else np.zeros(0)
-    except EstimatorError:
-        return x
+    # With a damping that is far too high, any frequency nearby will do.
+    moved = [at for k in _frequencies(space) for at in (k + 1, k)]
     for number, k in enumerate(moved):
         tell(number, len(moved))
         # Half of a resonance's width, over its frequency, is its damping.
         step = math.exp(x[k + 1]) if k in _frequencies(space) else math.log(2)
-        left, right = beside(k, x[k] - step), beside(k, x[k] + step)
         for _ in range(_MOVES):
-            down, up = _gain(left[1], here), _gain(right[1], here)
-            if max(down, up) <= 0:
+            beside = np.tile(x, (len(_AROUND), 1))
+            beside[:, k] = np.clip(x[k] + step * _AROUND, *space.bounds[k])
+            try:
+                each = np.array([evidence(other) for other in beside])
+            except EstimatorError:
+                return x
+            # The evidence of an exposure jumps where the filter has lost a mode of the posterior.
+            gains = np.clip(np.nan_to_num(each - each[len(each) // 2]), -_MOST_NEAR, _MOST_NEAR).sum(axis=1)
+            square, slope, _ = np.polyfit(_AROUND, gains, 2)
+            vertex = -slope / (2 * square) if square < 0 else _AROUND[gains.argmax()]
+            to = float(np.clip(vertex, _AROUND[0], _AROUND[-1]))
+            x[k] = np.clip(x[k] + step * to, *space.bounds[k])
+            if abs(to) < _AROUND[-1]:
                 break
-            if up > down:
-                left, (x[k], here) = (float(x[k]), here), right
-                right = beside(k, x[k] + step)
-            else:
-                right, (x[k], here) = (float(x[k]), here), left
-                left = beside(k, x[k] - step)
-        down, up = _gain(left[1], here), _gain(right[1], here)
-        if max(down, up) <= 0 and down + up < 0:
-            at, there = beside(k, x[k] + step * (down - up) / (2 * (down + up)))
-            if _gain(there, here) > 0:
-                x[k], here = at, there
     return x
-
-
-def _gain(of: FloatArray, base: FloatArray) -> float:
-    """Evidence of one model over that of another, nats, no exposure counting by more than its share."""
-    return float(np.clip(np.nan_to_num(of - base), -_MOST, _MOST).sum())
 
 
 def _log_evidence(estimator: Estimator, exposure: Exposure) -> float:
