@@ -14,8 +14,8 @@ from rich.console import Console
 import aolink
 from aolink.batch import Settings as Batch
 from aolink.batch import estimate_file
-from aolink.estimation import run, score
 from aolink.cli.tables.scores import scores
+from aolink.estimation import run, score
 from aolink.exporting.files import export
 from aolink.exposure import Exposure
 from aolink.importing.film import array_film
@@ -94,10 +94,12 @@ def test_it_is_shown_drawn_and_exported(recorded: tuple[Rig, Path], exposures: l
     assert (np.isfinite(errors) == known).all()
 
 
-def test_a_table_of_scores_has_no_number_for_states_that_no_film_shows(exposures: list[Exposure], recorded) -> None:
+def test_a_table_of_scores_has_no_number_for_states_that_no_film_shows(
+    exposures: list[Exposure], recorded: tuple[Rig, Path]
+) -> None:
     rig, _ = recorded
-    capture = Console(width=200, file=io.StringIO())
-    capture.print(scores({"o1": score(exposures, run(rig, exposures, ["o1"])["o1"])}))
-    (row,) = [line.split() for line in capture.file.getvalue().splitlines() if line.strip().startswith("o1")]
+    text = io.StringIO()
+    Console(width=200, file=text).print(scores({"o1": score(exposures, run(rig, exposures, ["o1"])["o1"])}))
+    row = next(line.split() for line in text.getvalue().splitlines() if line.startswith("o1 "))
     assert row[1:3] == ["-", "-"]
     assert float(row[3]) > 0
