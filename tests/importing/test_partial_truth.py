@@ -100,6 +100,6 @@ def test_a_table_of_scores_has_no_number_for_states_that_no_film_shows(
     rig, _ = recorded
     text = io.StringIO()
     Console(width=200, file=text).print(scores({"o1": score(exposures, run(rig, exposures, ["o1"])["o1"])}))
-    row = next(line.split() for line in text.getvalue().splitlines() if line.startswith("o1 "))
+    (row,) = [words for line in text.getvalue().splitlines() if (words := line.split())[:1] == ["o1"]]
     assert row[1:3] == ["-", "-"]
     assert float(row[3]) > 0
