@@ -214,6 +214,6 @@ def _opened(exposures: Exposures | Series | str | Path) -> tuple[Rig, Iterable[E
     if isinstance(exposures, Series):
         return exposures.rig, exposures.exposures()
     raise EstimatorError(
-        "exposures must know their rig, as those of aolink.simulate, aolink.exposures and aolink.read do, or be the path"
-        f" of a recording, found {type(exposures).__name__}: give aolink.exposures(frames, rig) for arrays"
+        "exposures must know their rig, as those of aolink.simulate, aolink.exposures and aolink.read do, or be the"
+        f" path of a recording, found {type(exposures).__name__}: give aolink.exposures(frames, rig) for arrays"
     )

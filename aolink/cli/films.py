@@ -134,7 +134,7 @@ def import_(
     for note in account.notes:
         stdout.print(f"note: {note}", markup=False)
     for count, what in (
-        (account.saturated, "saturated in the film, no numbers, or shared by two objects"),
+        (account.saturated, "saturated in the film, hot or dead, no numbers, or shared by two objects"),
         (account.clipped, "beyond the range of the rig's camera"),
     ):
         if count:

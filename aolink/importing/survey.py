@@ -34,6 +34,10 @@ _FARTHEST = 4.0
 """Largest reach; light of others is searched for so far from an object."""
 
 
+_SHOWN = 3
+"""Hot and dead pixels of which a note has the places."""
+
+
 @dataclass(frozen=True, eq=False)
 class Survey:
     """The measurements of a film's objects in the single frames."""
@@ -72,8 +76,10 @@ class Survey:
     stretch: int
     """Frames of a stretch."""
     left_out: float
-    """Share of the pixels about the objects that are saturated or no numbers: kernel, light and noise are fitted
-    without them."""
+    """Share of the pixels about the objects that are saturated, hot or dead, or no numbers: kernel, light and noise are
+    fitted without them."""
+    defects: BoolArray | None
+    """Which pixels of the picture are hot or dead, (rows, columns); None: none is known."""
 
     def alone(self, first: int, end: int) -> BoolArray:
         """Which objects have no other light beside them in the frames from ``first`` to before ``end``, (n,)."""
@@ -81,7 +87,13 @@ class Survey:
         return np.asarray(~(some >= _ALONE).any(axis=0) & ~self.together[first:end].any(axis=(0, 1)))
 
     def notes(self) -> Iterator[str]:
-        """A note on each pair of objects that came together, and on each object that has other light beside it."""
+        """A note on hot and dead pixels, on each pair of objects that came together, and on each object that has other
+        light beside it."""
+        if self.defects is not None:
+            rows, columns = np.nonzero(self.defects)
+            some = ", ".join(f"{x},{y}" for x, y in zip(columns[:_SHOWN], rows[:_SHOWN], strict=True))
+            what = "hot or dead pixel is" if len(rows) == 1 else "hot or dead pixels are"
+            yield f"{len(rows)} {what} left out, at {some}{' and others' if len(rows) > _SHOWN else ''}"
         for a, b in np.argwhere(np.triu(self.together.any(axis=0))):
             frames = _stretches(np.flatnonzero(self.together[:, a, b]), 1, len(self.together))
             yield (
@@ -136,7 +148,7 @@ def survey(
     ImportingError
         None of the objects can be followed.
     """
-    light = FilmLight(film, settings)
+    light = FilmLight(film, settings, objects.defects)
     tracker = Tracker(objects, trackpy_locator(objects.sd))
     every, half = max(1, film.count // _SAMPLES), math.ceil(_FARTHEST * objects.sd)
     places, last, together, shine = [], [], [], []
@@ -171,7 +183,7 @@ def survey(
         places=path, last=np.array(last), together=near, sd=sd, sd_sd=sd_sd, light=amounts,
         brightness=brightness, ground=remaining, residual=residual, model=model, place_sd=place_sd,
         rest=_rest(float(np.nanmax(amounts)), sd, noise), beside=beside, stretch=every * _STRETCH,
-        left_out=float(np.isnan(cuts).mean()),
+        left_out=float(np.isnan(cuts).mean()), defects=objects.defects,
     )  # fmt: skip
 
 
