@@ -6,6 +6,7 @@ import math
 from itertools import islice
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import ndimage
 
 from aolink.errors import FrameError
@@ -22,6 +23,8 @@ _SIGNIFICANCE = 8.0
 """Standard deviations of the median picture's noise by which a hot or dead pixel exceeds what light explains."""
 _SHARPEST = 0.6
 """Width of the sharpest light that is no defect, in that of the objects."""
+_NEARLY = 0.9
+"""Share of the frames in which such a pixel differs from its neighbours at least."""
 _STEPS = 2.0
 """Steps of the camera's numbers by which such a pixel differs at least."""
 
@@ -47,21 +50,47 @@ def find_defects(film: Film, light: FilmLight, sd: float) -> BoolArray:
     except FrameError:  # too small, or the same everywhere
         return np.zeros(film.shape, dtype=np.bool_)
     flat = median - ground
-    noise = spread(flat - ndimage.median_filter(flat, 3))
-    least = max(_SIGNIFICANCE * noise, _STEPS * light.step)
+    least = max(_SIGNIFICANCE * _noise(flat), _STEPS * light.step)
     factor = _peak_over_neighbour(_SHARPEST * sd)
-    return _stands_out(flat, factor, least) | _stands_out(-flat, factor, least)
+    found = np.zeros(film.shape, dtype=np.bool_)
+    for sign in (1.0, -1.0):
+        peaks, holes = _stands_out(sign * flat, factor, least)
+        for candidates, way in ((peaks, sign), (holes, -sign)):
+            found[candidates] |= _always(shown if way > 0 else -shown, candidates)
+    return found
 
 
-def _stands_out(flat: FloatArray, factor: float, least: float) -> BoolArray:
-    """Where a pixel is too bright for its neighbours, or a hole in light, (rows, columns)."""
+def _noise(flat: FloatArray) -> float:
+    """Standard deviation of the differences to the median of the neighbours, without the largest tenth of them.
+
+    Numbers of few bits need the mean as well: their median is often zero.
+    """
+    rest = flat - ndimage.median_filter(flat, 3)
+    size = np.abs(rest)
+    return max(spread(rest), float(np.sqrt(np.mean(np.minimum(size, np.quantile(size, 0.9)) ** 2))))
+
+
+def _always(shown: NDArray[np.float32], candidates: BoolArray) -> BoolArray:
+    """Which candidates are brighter than the median of their neighbours in nearly all frames, (candidates,).
+
+    The median over time of an object that moves may have steps from pixel to pixel that no frame has.
+    """
+    rows, columns = np.nonzero(candidates)
+    padded = np.pad(shown, ((0, 0), (1, 1), (1, 1)), mode="reflect")
+    around = [padded[:, rows + i, columns + j] for i in range(3) for j in range(3) if (i, j) != (1, 1)]
+    brighter = shown[:, rows, columns] > np.median(around, axis=0)
+    return np.asarray(brighter.mean(axis=0) >= _NEARLY)
+
+
+def _stands_out(flat: FloatArray, factor: float, least: float) -> tuple[BoolArray, BoolArray]:
+    """Where a pixel is too bright for its neighbours, and where it is a hole in light, (rows, columns) each."""
     ring = np.ones((3, 3), dtype=np.bool_)
     ring[1, 1] = False
     brighter = ndimage.rank_filter(flat, -2, footprint=ring, mode="mirror")
     darker = ndimage.rank_filter(flat, 1, footprint=ring, mode="mirror")
     peak = flat > factor * np.maximum(brighter, 0.0) + least
     hole = darker > factor * np.maximum(flat, 0.0) + least
-    return np.asarray(peak | hole)
+    return np.asarray(peak), np.asarray(hole)
 
 
 def _peak_over_neighbour(sd: float) -> float:
