@@ -6,12 +6,11 @@ import math
 from itertools import islice
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 
 from aolink.errors import FrameError
 from aolink.importing.film import Film
-from aolink.importing.frames import FilmLight
+from aolink.importing.frames import FilmLight, mended
 from aolink.numerics.arrays import BoolArray, FloatArray
 from aolink.optics.maxima import flatten, spread
 
@@ -52,11 +51,9 @@ def find_defects(film: Film, light: FilmLight, sd: float) -> BoolArray:
     flat = median - ground
     least = max(_SIGNIFICANCE * _noise(flat), _STEPS * light.step)
     factor = _peak_over_neighbour(_SHARPEST * sd)
-    found = np.zeros(film.shape, dtype=np.bool_)
-    for sign in (1.0, -1.0):
-        peaks, holes = _stands_out(sign * flat, factor, least)
-        for candidates, way in ((peaks, sign), (holes, -sign)):
-            found[candidates] |= _always(shown if way > 0 else -shown, candidates)
+    (bright, holes), (dark, bumps) = (_stands_out(sign * flat, factor, least) for sign in (1.0, -1.0))
+    found = bright | bumps | dark | holes
+    found[found] = _always(shown - ground, found, np.where(bright | bumps, 1.0, -1.0)[found], factor)
     return found
 
 
@@ -70,16 +67,17 @@ def _noise(flat: FloatArray) -> float:
     return max(spread(rest), float(np.sqrt(np.mean(np.minimum(size, np.quantile(size, 0.9)) ** 2))))
 
 
-def _always(shown: NDArray[np.float32], candidates: BoolArray) -> BoolArray:
-    """Which candidates are brighter than the median of their neighbours in nearly all frames, (candidates,).
+def _always(shown: FloatArray, candidates: BoolArray, sign: FloatArray, factor: float) -> BoolArray:
+    """Which candidates differ in nearly all frames, (frames, rows, columns), from what the pixels about them explain,
+    (candidates,); ``sign`` is 1 where they are brighter.
 
     The median over time of an object that moves may have steps from pixel to pixel that no frame has.
     """
-    rows, columns = np.nonzero(candidates)
-    padded = np.pad(shown, ((0, 0), (1, 1), (1, 1)), mode="reflect")
-    around = [padded[:, rows + i, columns + j] for i in range(3) for j in range(3) if (i, j) != (1, 1)]
-    brighter = shown[:, rows, columns] > np.median(around, axis=0)
-    return np.asarray(brighter.mean(axis=0) >= _NEARLY)
+    # What the interpolation leaves of a Gaussian's middle pixel, for one unit of what it gives there.
+    left = (1 - 1 / factor) ** 2
+    around = np.array([mended(frame, candidates)[candidates] for frame in shown])
+    differs = sign * (shown[:, candidates] - around) > left / (1 - left) * np.abs(around)
+    return np.asarray(differs.mean(axis=0) >= _NEARLY)
 
 
 def _stands_out(flat: FloatArray, factor: float, least: float) -> tuple[BoolArray, BoolArray]:

@@ -106,11 +106,11 @@ class FilmLight:
         if settings.subtract_median or settings.invert:
             values -= np.median(values)
         if self._defects is not None and self._defects.any():
-            values, bad = _mended(values, self._defects), bad | self._defects
+            values, bad = mended(values, self._defects), bad | self._defects
         return (-values if settings.invert else values), bad
 
 
-def _mended(values: FloatArray, defects: BoolArray) -> FloatArray:
+def mended(values: FloatArray, defects: BoolArray) -> FloatArray:
     """A picture whose ``defects`` are interpolated from the pixels about them, (rows, columns).
 
     The weights of the neighbours are those of a product of parabolas along x and y; where another defect is among
@@ -122,9 +122,9 @@ def _mended(values: FloatArray, defects: BoolArray) -> FloatArray:
     beside = around[0, 1] + around[2, 1] + around[1, 0] + around[1, 2]
     across = around[0, 0] + around[0, 2] + around[2, 0] + around[2, 2]
     middle = np.nanmedian(around.reshape(9, -1), axis=0)
-    mended = values.copy()
-    mended[defects] = np.where(np.isfinite(beside + across), beside / 2 - across / 4, middle)
-    return mended
+    whole = values.copy()
+    whole[defects] = np.where(np.isfinite(beside + across), beside / 2 - across / 4, middle)
+    return whole
 
 
 def frame_times(film: Film, rig: Rig, settings: FilmSettings) -> tuple[NDArray[np.int64], list[str]]:
