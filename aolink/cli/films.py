@@ -139,5 +139,7 @@ def import_(
     ):
         if count:
             share = count / account.pixels
-            stdout.print(f"warning: {count} pixels ({share:.2%}) are {what}: they are masked", markup=False)
+            subject, they = ("pixel", "it is") if count == 1 else ("pixels", "they are")
+            verb = "is" if count == 1 else "are"
+            stdout.print(f"warning: {count} {subject} ({share:.2%}) {verb} {what}: {they} masked", markup=False)
     stdout.print(f"{output}: {account.exposures} exposures of {account.frames} frames", markup=False)

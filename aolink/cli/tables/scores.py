@@ -45,7 +45,8 @@ def scores(by_name: Mapping[str, Score]) -> Table:
         table.add_row(name, *(column(each) for column in columns.values()))
     lines = unused_lines(by_name)
     if bounds := _bounds(by_name):
-        norm = "RMSE of states: norm over the states. " if counted else ""
+        of_states = any(math.isfinite(each.start_rmse) for each in by_name.values())
+        norm = "RMSE of states: norm over the states. " if of_states else ""
         lines = [f"{norm}! outside the 95 % bounds of a consistent filter:", bounds, *lines]
     table.caption = escape("\n".join(lines))
     return table
