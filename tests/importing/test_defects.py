@@ -47,7 +47,7 @@ def dark(frames: NDArray[np.uint16]) -> NDArray[np.uint16]:
 
 
 def few_bits(frames: NDArray[np.uint16]) -> NDArray[np.uint8]:
-    return (frames / frames.max() * 250).round().astype(np.uint8)
+    return np.asarray((frames / frames.max() * 250).round(), dtype=np.uint8)
 
 
 @pytest.mark.parametrize("sd", [0.8, 1.8, 3.0])
