@@ -6,6 +6,7 @@ import math
 from itertools import islice
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import ndimage
 
 from aolink.errors import FrameError
@@ -16,7 +17,7 @@ from aolink.optics.maxima import flatten, spread
 
 _SAMPLES, _FEWEST = 49, 9
 """Number of frames of whose pixels the median is taken, and the least."""
-_MOST_NUMBERS = 50_000_000
+_MOST_NUMBERS = 20_000_000
 """Numbers that are held for this, at most."""
 _SIGNIFICANCE = 8.0
 """Standard deviations of the median picture's noise by which a hot or dead pixel exceeds what light explains."""
@@ -53,7 +54,8 @@ def find_defects(film: Film, light: FilmLight, sd: float) -> BoolArray:
     factor = _peak_over_neighbour(_SHARPEST * sd)
     (bright, holes), (dark, bumps) = (_stands_out(sign * flat, factor, least) for sign in (1.0, -1.0))
     found = bright | bumps | dark | holes
-    found[found] = _always(shown - ground, found, np.where(bright | bumps, 1.0, -1.0)[found], factor)
+    if found.any():
+        found[found] = _always(shown, ground[found], found, np.where(bright | bumps, 1.0, -1.0)[found], factor)
     return found
 
 
@@ -67,16 +69,20 @@ def _noise(flat: FloatArray) -> float:
     return max(spread(rest), float(np.sqrt(np.mean(np.minimum(size, np.quantile(size, 0.9)) ** 2))))
 
 
-def _always(shown: FloatArray, candidates: BoolArray, sign: FloatArray, factor: float) -> BoolArray:
+def _always(
+    shown: NDArray[np.float32], ground: FloatArray, candidates: BoolArray, sign: FloatArray, factor: float
+) -> BoolArray:
     """Which candidates differ in nearly all frames, (frames, rows, columns), from what the pixels about them explain,
-    (candidates,); ``sign`` is 1 where they are brighter.
+    (candidates,).
+
+    ``ground`` is the background there, ``sign`` is 1 where they are brighter and -1 where they are darker.
 
     The median over time of an object that moves may have steps from pixel to pixel that no frame has.
     """
     # What the interpolation leaves of a Gaussian's middle pixel, for one unit of what it gives there.
     left = (1 - 1 / factor) ** 2
-    around = np.array([mended(frame, candidates)[candidates] for frame in shown])
-    differs = sign * (shown[:, candidates] - around) > left / (1 - left) * np.abs(around)
+    around = np.array([mended(frame.astype(np.float64), candidates)[candidates] for frame in shown])
+    differs = sign * (shown[:, candidates] - around) > left / (1 - left) * np.abs(around - ground)
     return np.asarray(differs.mean(axis=0) >= _NEARLY)
 
 

@@ -119,6 +119,8 @@ def mended(values: FloatArray, defects: BoolArray) -> FloatArray:
     known = np.pad(np.where(defects, np.nan, values), 1, mode="reflect")
     rows, columns = np.nonzero(defects)
     around = np.array([[known[rows + i, columns + j] for j in range(3)] for i in range(3)])
+    if (lost := np.isnan(around).all(axis=(0, 1))).any():
+        around[1, 1, lost] = np.median(values)
     beside = around[0, 1] + around[2, 1] + around[1, 0] + around[1, 2]
     across = around[0, 0] + around[0, 2] + around[2, 0] + around[2, 2]
     middle = np.nanmedian(around.reshape(9, -1), axis=0)
