@@ -9,7 +9,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from aolink.estimation import Estimate
-    from aolink.exposure import Exposures
+    from aolink.exposure import Exposure, Exposures
     from aolink.notebook import NotebookRecording
     from aolink.rig import Rig, load_rig
     from aolink.series import Series
@@ -157,17 +157,14 @@ def estimate(exposures: Exposures | Series | str | Path, estimator: str) -> list
     Raises
     ------
     EstimatorError
-        There is no such estimator or option, or it cannot work on this rig.
+        There is no such estimator or option, it cannot work on this rig, or ``exposures`` are none of these.
     RecordingError
         ``exposures`` is a path, and no recording can be read from it.
     """
     from aolink.estimation import Driver
-    from aolink.exposure import Exposures
 
-    if isinstance(exposures, str | Path):
-        exposures = read(exposures)
-    series = exposures if isinstance(exposures, Exposures) else exposures.exposures()
-    driver = Driver(exposures.rig, [estimator])
+    rig, series = _opened(exposures)
+    driver = Driver(rig, [estimator])
     return [result for _, (result,) in driver.steps(series)]
 
 
@@ -194,14 +191,29 @@ def smooth(
     Raises
     ------
     EstimatorError
-        The estimates are not those of the exposures, or the lag is negative.
+        The estimates are not those of the exposures, the lag is negative, or ``exposures`` are none of these.
     RecordingError
         ``exposures`` is a path, and no recording can be read from it.
     """
     from aolink.estimation import smooth as smooth_estimates
+
+    rig, series = _opened(exposures)
+    return smooth_estimates(rig.plant, list(series), estimates, lag)
+
+
+def _opened(exposures: Exposures | Series | str | Path) -> tuple[Rig, Iterable[Exposure]]:
+    """The rig of exposures, and the exposures one after the other."""
+    from aolink.errors import EstimatorError
     from aolink.exposure import Exposures
+    from aolink.series import Series
 
     if isinstance(exposures, str | Path):
         exposures = read(exposures)
-    series = exposures if isinstance(exposures, Exposures) else list(exposures.exposures())
-    return smooth_estimates(exposures.rig.plant, series, estimates, lag)
+    if isinstance(exposures, Exposures):
+        return exposures.rig, exposures
+    if isinstance(exposures, Series):
+        return exposures.rig, exposures.exposures()
+    raise EstimatorError(
+        "exposures must know their rig, as those of aolink.simulate, aolink.exposures and aolink.read do, or be the"
+        f" path of a recording, found {type(exposures).__name__}: give aolink.exposures(frames, rig) for arrays"
+    )

@@ -134,10 +134,12 @@ def import_(
     for note in account.notes:
         stdout.print(f"note: {note}", markup=False)
     for count, what in (
-        (account.saturated, "saturated in the film, no numbers, or shared by two objects"),
+        (account.saturated, "saturated in the film, hot or dead, no numbers, or shared by two objects"),
         (account.clipped, "beyond the range of the rig's camera"),
     ):
         if count:
             share = count / account.pixels
-            stdout.print(f"warning: {count} pixels ({share:.2%}) are {what}: they are masked", markup=False)
+            subject, they = ("pixel", "it is") if count == 1 else ("pixels", "they are")
+            verb = "is" if count == 1 else "are"
+            stdout.print(f"warning: {count} {subject} ({share:.2%}) {verb} {what}: {they} masked", markup=False)
     stdout.print(f"{output}: {account.exposures} exposures of {account.frames} frames", markup=False)

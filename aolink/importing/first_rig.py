@@ -72,8 +72,8 @@ def _notes(known: Survey, motion: Motion) -> Iterator[str]:
     yield from known.notes()
     if known.left_out:
         yield (
-            f"{known.left_out:.2%} of the pixels about the objects are saturated or no numbers: kernel, light and noise"
-            " are fitted without them"
+            f"{100 * known.left_out:.2g} % of the pixels about the objects are saturated, hot or dead, or no numbers:"
+            " kernel, light and noise are fitted without them"
         )
     if motion.unexplained:
         yield (

@@ -14,7 +14,7 @@ from aolink.assembly import Frame
 from aolink.errors import ImportingError
 from aolink.exposure import Truth
 from aolink.importing.film import Film, FilmFrame
-from aolink.numerics.arrays import FloatArray
+from aolink.numerics.arrays import BoolArray, FloatArray
 from aolink.rig import Rig
 
 _CLOSE = 0.01
@@ -70,7 +70,8 @@ class FilmAccount:
     frames: int = 0
     exposures: int = 0
     saturated: int = 0
-    """Pixels that are masked: at the end of their range in the film, no numbers, or with the light of two objects."""
+    """Pixels that are masked: at the end of their range in the film, hot or dead, no numbers, or with the light of two
+    objects."""
     clipped: int = 0
     """Pixels whose counts do not fit into the rig's range, which are masked as well."""
     pixels: int = 0
@@ -80,16 +81,21 @@ class FilmAccount:
 class FilmLight:
     """Pixel values as light: the gamma curve undone, background taken off, dark made bright."""
 
-    def __init__(self, film: Film, settings: FilmSettings) -> None:
-        self._settings = settings
+    def __init__(self, film: Film, settings: FilmSettings, defects: BoolArray | None = None) -> None:
+        self._settings, self._defects = settings, defects
         kind = film.dtype.kind
         self.full_scale = float(np.iinfo(film.dtype.name).max) if kind in "iu" else 1.0
         """The largest value that a pixel can hold."""
+        self.step = settings.gamma if kind in "iub" else 0.0
+        """Largest step of light from one value to the next; zero where it is not known."""
         # A saturated background does not harm a dark object.
         self._saturated = math.inf if settings.invert else film.saturates_at
 
     def of(self, frame: FilmFrame) -> tuple[FloatArray, NDArray[np.bool_]]:
-        """Light of a frame and where its pixels are saturated or no numbers, (rows, columns) each."""
+        """Light of a frame and where its pixels are saturated, hot or dead, or no numbers, (rows, columns) each.
+
+        Hot and dead pixels are replaced by the light about them.
+        """
         settings = self._settings
         values = frame.astype(np.float64)
         bad = (values >= self._saturated) | ~np.isfinite(values)
@@ -99,7 +105,28 @@ class FilmLight:
             values = self.full_scale * np.maximum(values / self.full_scale, 0.0) ** settings.gamma
         if settings.subtract_median or settings.invert:
             values -= np.median(values)
+        if self._defects is not None and self._defects.any():
+            values, bad = mended(values, self._defects), bad | self._defects
         return (-values if settings.invert else values), bad
+
+
+def mended(values: FloatArray, defects: BoolArray) -> FloatArray:
+    """A picture whose ``defects`` are interpolated from the pixels about them, (rows, columns).
+
+    The weights of the neighbours are those of a product of parabolas along x and y; where another defect is among
+    them, their median is taken.
+    """
+    known = np.pad(np.where(defects, np.nan, values), 1, mode="reflect")
+    rows, columns = np.nonzero(defects)
+    around = np.array([[known[rows + i, columns + j] for j in range(3)] for i in range(3)])
+    if (lost := np.isnan(around).all(axis=(0, 1))).any():
+        around[1, 1, lost] = np.median(values)
+    beside = around[0, 1] + around[2, 1] + around[1, 0] + around[1, 2]
+    across = around[0, 0] + around[0, 2] + around[2, 0] + around[2, 2]
+    middle = np.nanmedian(around.reshape(9, -1), axis=0)
+    whole = values.copy()
+    whole[defects] = np.where(np.isfinite(beside + across), beside / 2 - across / 4, middle)
+    return whole
 
 
 def frame_times(film: Film, rig: Rig, settings: FilmSettings) -> tuple[NDArray[np.int64], list[str]]:

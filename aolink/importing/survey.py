@@ -14,6 +14,7 @@ from aolink.importing.accuracy import pixel_noise, tracker_errors
 from aolink.importing.brightness import brightness_of, change_of
 from aolink.importing.film import Film
 from aolink.importing.frames import FilmLight, FilmSettings
+from aolink.importing.shapes import axis_ratios, motion_within
 from aolink.importing.tracker import FIRST_FRAMES, WEIGHT, Objects, Tracker, trackpy_locator
 from aolink.numerics.arrays import BoolArray, FloatArray, IntArray
 from aolink.optics.kernel import pixel_masses
@@ -25,6 +26,8 @@ _STRETCH = 10
 """Number of successive sampled frames that are averaged to find light beside an object."""
 _ALONE = 1 / 3
 """Light beside an object that is less bright than this share of it does not matter."""
+_LONG = 1.3
+"""Length of an object over its width from which on it is not round."""
 _DRIFTS = 5.0
 """Standard deviations of the mean step from which on it is a drift."""
 _REST = 2.5
@@ -32,6 +35,10 @@ _REST = 2.5
 to other objects."""
 _FARTHEST = 4.0
 """Largest reach; light of others is searched for so far from an object."""
+
+
+_SHOWN = 3
+"""Hot and dead pixels of which a note has the places."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,9 +78,13 @@ class Survey:
     each stretch of the film, (stretches, n); NaN where the object is not seen."""
     stretch: int
     """Frames of a stretch."""
+    length: FloatArray
+    """Length of each object's light over its width, (n,), where no other light is beside it (`axis_ratios`)."""
     left_out: float
-    """Share of the pixels about the objects that are saturated or no numbers: kernel, light and noise are fitted
-    without them."""
+    """Share of the pixels about the objects that are saturated, hot or dead, or no numbers: kernel, light and noise are
+    fitted without them."""
+    defects: BoolArray | None
+    """Which pixels of the picture are hot or dead, (rows, columns); None: none is known."""
 
     def alone(self, first: int, end: int) -> BoolArray:
         """Which objects have no other light beside them in the frames from ``first`` to before ``end``, (n,)."""
@@ -81,7 +92,13 @@ class Survey:
         return np.asarray(~(some >= _ALONE).any(axis=0) & ~self.together[first:end].any(axis=(0, 1)))
 
     def notes(self) -> Iterator[str]:
-        """A note on each pair of objects that came together, and on each object that has other light beside it."""
+        """A note on hot and dead pixels, on each pair of objects that came together, and on each object that is not
+        round or has other light beside it."""
+        if self.defects is not None:
+            rows, columns = np.nonzero(self.defects)
+            some = ", ".join(f"{x},{y}" for x, y in zip(columns[:_SHOWN], rows[:_SHOWN], strict=True))
+            what = "hot or dead pixel is" if len(rows) == 1 else "hot or dead pixels are"
+            yield f"{len(rows)} {what} left out, at {some}{' and others' if len(rows) > _SHOWN else ''}"
         for a, b in np.argwhere(np.triu(self.together.any(axis=0))):
             frames = _stretches(np.flatnonzero(self.together[:, a, b]), 1, len(self.together))
             yield (
@@ -104,6 +121,13 @@ class Survey:
                 yield (
                     f"object {number} is not seen in frames {frames}: its true path is not known in exposures with one"
                     " of them, and its window is left out where it is never seen"
+                )
+        for number, (length, (x, y)) in enumerate(zip(self.length, self.last[0], strict=True), 1):
+            if length >= _LONG:
+                yield (
+                    f"object {number} (at {x:.0f},{y:.0f}) is {length:.1f} times as long as it is wide, or two objects"
+                    " that stay together; the rig file's kernel is round: its estimates may be wrong by more than they"
+                    " say"
                 )
         for k, beside in enumerate(self.beside.T):
             stretches = np.flatnonzero(beside >= _ALONE)
@@ -136,7 +160,7 @@ def survey(
     ImportingError
         None of the objects can be followed.
     """
-    light = FilmLight(film, settings)
+    light = FilmLight(film, settings, objects.defects)
     tracker = Tracker(objects, trackpy_locator(objects.sd))
     every, half = max(1, film.count // _SAMPLES), math.ceil(_FARTHEST * objects.sd)
     places, last, together, shine = [], [], [], []
@@ -165,14 +189,22 @@ def survey(
     ground = _about(cuts)[:, None, None]  # it does not fade with the objects
     cuts = ground + (cuts - ground) / brightness[::every, None, None, None]
     sd, sd_sd, amounts, remaining, residual, model, beside = _fitted(cuts, np.array(centres), objects.sd)
+    lone = _lone(np.array(last)[::every], sd) & ~(np.repeat(beside, _STRETCH, axis=0)[: len(cuts)] >= _ALONE)
+    length = axis_ratios(cuts, np.array(centres), sd, lone, motion_within(path)[::every])
     noise = pixel_noise(cuts.reshape(-1, *cuts.shape[2:]), np.concatenate(centres), sd)
     place_sd = tracker_errors(path, range(0, film.count, every), amounts, sd, noise, objects.sd)
     return Survey(
         places=path, last=np.array(last), together=near, sd=sd, sd_sd=sd_sd, light=amounts,
         brightness=brightness, ground=remaining, residual=residual, model=model, place_sd=place_sd,
-        rest=_rest(float(np.nanmax(amounts)), sd, noise), beside=beside, stretch=every * _STRETCH,
-        left_out=float(np.isnan(cuts).mean()),
+        rest=_rest(float(np.nanmax(amounts)), sd, noise), beside=beside, stretch=every * _STRETCH, length=length,
+        left_out=float(np.isnan(cuts).mean()), defects=objects.defects,
     )  # fmt: skip
+
+
+def _lone(places: FloatArray, sd: float) -> BoolArray:
+    """Which objects have no other followed object near them, (samples, n); places are (samples, n, 2)."""
+    distance = np.linalg.norm(places[:, :, None] - places[:, None], axis=3)
+    return np.asarray(((distance > 2 * _FARTHEST * sd) | np.eye(places.shape[1], dtype=np.bool_)).all(axis=2))
 
 
 def _about(windows: FloatArray) -> FloatArray:

@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import ndimage, optimize
 
 from aolink.errors import FrameError, ImportingError
+from aolink.importing.defects import find_defects
 from aolink.importing.film import Film
 from aolink.importing.frames import FilmLight, FilmSettings
 from aolink.numerics.arrays import BoolArray, FloatArray, IntArray
@@ -51,6 +52,8 @@ class Objects:
     """Positions (x, y), pixels, zero in the middle of the first pixel, (n, 2)."""
     sd: float
     """Standard deviation of an object's light in one direction, pixels."""
+    defects: BoolArray | None = None
+    """Which pixels of the camera are hot or dead, (rows, columns); None: it is not known of any."""
 
 
 class Tracker:
@@ -228,7 +231,17 @@ def find_objects(film: Film, settings: FilmSettings) -> Objects:
     """
     if settings.places and len(settings.places) != settings.track:
         raise ImportingError(f"{len(settings.places)} places are given for --track {settings.track}: give one for each")
-    light, frames = FilmLight(film, settings), []
+    light = FilmLight(film, settings)
+    objects = _found(film, settings, light)
+    if not (wrong := find_defects(film, light, objects.sd)).any():
+        return objects
+    # A hot pixel may have been taken for an object, or have narrowed one.
+    objects = _found(film, settings, FilmLight(film, settings, wrong))
+    return replace(objects, defects=wrong | find_defects(film, light, objects.sd))
+
+
+def _found(film: Film, settings: FilmSettings, light: FilmLight) -> Objects:
+    frames = list[FloatArray]()
     for frame in film.frames():
         frames.append(light.of(frame)[0])
         if len(frames) == FIRST_FRAMES:

@@ -59,7 +59,7 @@ def tracked(
     account.notes += tuple(known.notes())
     windows = _Windows(rig, sensor, known)
     far, spread = windows.reach, spread_in(known, settings.frames_per_exposure)
-    light, step, area = FilmLight(film, settings), 0, sensor.pixel_size
+    light, step, area = FilmLight(film, settings, known.defects), 0, sensor.pixel_size
     for group in grouped(film, settings.frames_per_exposure, periods, light.of):
         blurs = _blurs(group.mean, known.last[max(group.first_frame - 1, 0)], known.sd, far, spread)
         values, usable, own = windows.cut(group.mean, ~group.bad, blurs)

@@ -53,7 +53,8 @@ def test_notes_and_warnings_are_printed(aolink, rig, tmp_path):
     made = aolink("import", source, "-o", "a.mcap", "--rig", rig)
     assert made.stdout.splitlines() == [
         "note: the film does not state its frame rate: that of the rig file is assumed, 50 frames/s",
-        "warning: 4 pixels (0.89%) are saturated in the film, no numbers, or shared by two objects: they are masked",
+        "warning: 4 pixels (0.89%) are saturated in the film, hot or dead, no numbers, or shared by two objects: they"
+        " are masked",
         "a.mcap: 7 exposures of 7 frames",
     ]
     made = aolink("import", source, "-o", "b.mcap", "--rig", rig, "--scale", "300", "--json")

@@ -12,7 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 import aolink
-from aolink.errors import AolinkError, ImportingError, RecordingError
+from aolink.errors import AolinkError, EstimatorError, ImportingError, RecordingError
 from aolink.importing.film import array_film
 from aolink.importing.frames import FilmAccount, FilmSettings
 from aolink.importing.readers import open_film
@@ -117,6 +117,13 @@ def test_a_film_of_a_simulation_gives_its_estimates_through_a_recording(tmp_path
 def test_arrays_in_memory_that_do_not_fit_are_refused(arguments, says):
     with pytest.raises(ImportingError, match=re.escape(says)):
         aolink.exposures(**{"frames": np.zeros((4, 8, 8)), "rig": small_rig(), **arguments})
+
+
+@pytest.mark.parametrize("wrong", [[], ["film.mcap"], [np.zeros((16, 16))], np.zeros((2, 16, 16)), None])
+def test_what_has_no_rig_is_refused_with_what_to_do(wrong):
+    for wanted in (lambda: aolink.estimate(wrong, "o3"), lambda: aolink.smooth(wrong, [])):
+        with pytest.raises(EstimatorError, match=r"know their rig.*aolink\.exposures\(frames, rig\)"):
+            wanted()
 
 
 def test_exposures_have_the_times_of_the_rig_and_the_start_of_the_film(tmp_path):

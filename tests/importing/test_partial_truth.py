@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import csv
+import io
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+from rich.console import Console
 
 import aolink
 from aolink.batch import Settings as Batch
 from aolink.batch import estimate_file
+from aolink.cli.tables.scores import scores
 from aolink.estimation import run, score
 from aolink.exporting.files import export
 from aolink.exposure import Exposure
@@ -89,3 +92,14 @@ def test_it_is_shown_drawn_and_exported(recorded: tuple[Rig, Path], exposures: l
     errors = np.array([[float(row["o1_path_error_rms"] or "nan")] for row in rows]).reshape(EXPOSURES, 4)
     known = np.array([truth_of(each).known for each in exposures])
     assert (np.isfinite(errors) == known).all()
+
+
+def test_a_table_of_scores_has_no_number_for_states_that_no_film_shows(
+    exposures: list[Exposure], recorded: tuple[Rig, Path]
+) -> None:
+    rig, _ = recorded
+    text = io.StringIO()
+    Console(width=200, file=text).print(scores({"o1": score(exposures, run(rig, exposures, ["o1"])["o1"])}))
+    (row,) = [words for line in text.getvalue().splitlines() if (words := line.split())[:1] == ["o1"]]
+    assert row[1:3] == ["-", "-"]
+    assert float(row[3]) > 0

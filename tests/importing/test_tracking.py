@@ -487,3 +487,18 @@ def test_a_rig_whose_inputs_do_not_shift_its_spots_keeps_its_windows(walkers: Sp
     rig = parse_rig(text)
     import_film(array_film(walkers.frames, "film"), rig, SETTINGS, tmp_path / "a.mcap")
     assert not any(each.inputs.any() for each in Recording(tmp_path / "a.mcap").exposures())
+
+
+@pytest.mark.parametrize(("length", "turns", "said"), [(1.0, 0.0, 0), (1.5, 0.0, 2), (1.5, 0.05, 2)])
+def test_an_object_that_is_longer_than_wide_is_said(length: float, turns: float, said: int) -> None:
+    """Gaussians 1.5 times as long as wide, as sums of round ones along a line; some of them turn."""
+    rng = np.random.default_rng(9)
+    along = np.array([-1.5, -0.8, -0.4, 0.0, 0.4, 0.8, 1.5])
+    along *= 1.8 * np.sqrt(length**2 - 1) / along.std()
+    angle = rng.uniform(0, np.pi, 2) + np.cumsum(turns * rng.normal(size=(160, 2)), axis=0)
+    offsets = along[:, None, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)[:, None]
+    motion = random_walk(rng, 160, 2, 0.3)[:, ::4, None] + offsets[:, None]
+    film = array_film(spot_film(rng, motion.reshape(160, -1, 2, 2), MIDDLES).frames, "film")
+    known = survey(film, SETTINGS, find_objects(film, SETTINGS))
+    assert known.length == pytest.approx([length, length], abs=0.06)
+    assert sum("times as long as it is wide" in note for note in known.notes()) == said

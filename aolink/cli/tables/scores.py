@@ -30,9 +30,9 @@ def scores(by_name: Mapping[str, Score]) -> Table:
     columns: dict[str, Callable[[Score], str]] = {"NIS": lambda each: _consistency(each.nis)}
     if counted:
         columns = {
-            "RMSE start": lambda each: f"{each.start_rmse:.4f}",
-            "RMSE end": lambda each: f"{each.end_rmse:.4f}",
-            "RMSE path": lambda each: f"{each.path_rmse:.4f}",
+            "RMSE start": lambda each: _rmse(each.start_rmse),
+            "RMSE end": lambda each: _rmse(each.end_rmse),
+            "RMSE path": lambda each: _rmse(each.path_rmse),
             **columns,
             "NEES start": lambda each: _consistency(each.start_nees),
             "NEES end": lambda each: _consistency(each.end_nees),
@@ -45,7 +45,8 @@ def scores(by_name: Mapping[str, Score]) -> Table:
         table.add_row(name, *(column(each) for column in columns.values()))
     lines = unused_lines(by_name)
     if bounds := _bounds(by_name):
-        norm = "RMSE of states: norm over the states. " if counted else ""
+        of_states = any(math.isfinite(each.start_rmse) for each in by_name.values())
+        norm = "RMSE of states: norm over the states. " if of_states else ""
         lines = [f"{norm}! outside the 95 % bounds of a consistent filter:", bounds, *lines]
     table.caption = escape("\n".join(lines))
     return table
@@ -61,6 +62,10 @@ def unused_lines(by_name: Mapping[str, Score]) -> list[str]:
         if more > 0:
             lines.append(f"{name}: and {more} other reasons, which --json has")
     return lines
+
+
+def _rmse(value: float) -> str:
+    return "-" if math.isnan(value) else f"{value:.4f}"
 
 
 def _consistency(value: Consistency) -> str:

@@ -1,0 +1,103 @@
+"""Pixels of a film's camera that are hot or dead: through the whole film they are far from all light about them."""
+
+from __future__ import annotations
+
+import math
+from itertools import islice
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from aolink.errors import FrameError
+from aolink.importing.film import Film
+from aolink.importing.frames import FilmLight, mended
+from aolink.numerics.arrays import BoolArray, FloatArray
+from aolink.optics.maxima import flatten, spread
+
+_SAMPLES, _FEWEST = 49, 9
+"""Number of frames of whose pixels the median is taken, and the least."""
+_MOST_NUMBERS = 20_000_000
+"""Numbers that are held for this, at most."""
+_SIGNIFICANCE = 8.0
+"""Standard deviations of the median picture's noise by which a hot or dead pixel exceeds what light explains."""
+_SHARPEST = 0.6
+"""Width of the sharpest light that is no defect, in that of the objects."""
+_NEARLY = 0.9
+"""Share of the frames in which such a pixel differs from its neighbours at least."""
+_STEPS = 2.0
+"""Steps of the camera's numbers by which such a pixel differs at least."""
+
+
+def find_defects(film: Film, light: FilmLight, sd: float) -> BoolArray:
+    """Which pixels are hot or dead, (rows, columns), in a film of objects of standard deviation ``sd``, pixels.
+
+    In the median of frames from the whole film such a pixel is brighter than its second brightest neighbour (or darker
+    than its second darkest one) by a larger factor than light about as sharp as the objects can be. So neither objects
+    that stay in their place nor the border of one are taken for defects, and two defects beside each other are found.
+    A film of fewer than nine frames has none.
+    """
+    count = min(_SAMPLES, film.count, max(_FEWEST, _MOST_NUMBERS // math.prod(film.shape)))
+    if count < _FEWEST:
+        return np.zeros(film.shape, dtype=np.bool_)
+    chosen = np.unique(np.linspace(0, film.count - 1, count).round().astype(np.int64)).tolist()
+    wanted = set(chosen)
+    frames = islice(film.frames(), chosen[-1] + 1)
+    shown = np.array([light.of(frame)[0].astype(np.float32) for k, frame in enumerate(frames) if k in wanted])
+    median = np.median(shown, axis=0).astype(np.float64)
+    try:
+        _, ground = flatten(median)
+    except FrameError:  # too small, or the same everywhere
+        return np.zeros(film.shape, dtype=np.bool_)
+    flat = median - ground
+    least = max(_SIGNIFICANCE * _noise(flat), _STEPS * light.step)
+    factor = _peak_over_neighbour(_SHARPEST * sd)
+    (bright, holes), (dark, bumps) = (_stands_out(sign * flat, factor, least) for sign in (1.0, -1.0))
+    found = bright | bumps | dark | holes
+    if found.any():
+        found[found] = _always(shown, ground[found], found, np.where(bright | bumps, 1.0, -1.0)[found], factor)
+    return found
+
+
+def _noise(flat: FloatArray) -> float:
+    """Standard deviation of the differences to the median of the neighbours, without the largest tenth of them.
+
+    Numbers of few bits need the mean as well: their median is often zero.
+    """
+    rest = flat - ndimage.median_filter(flat, 3)
+    size = np.abs(rest)
+    return max(spread(rest), float(np.sqrt(np.mean(np.minimum(size, np.quantile(size, 0.9)) ** 2))))
+
+
+def _always(
+    shown: NDArray[np.float32], ground: FloatArray, candidates: BoolArray, sign: FloatArray, factor: float
+) -> BoolArray:
+    """Which candidates differ in nearly all frames, (frames, rows, columns), from what the pixels about them explain,
+    (candidates,).
+
+    ``ground`` is the background there, ``sign`` is 1 where they are brighter and -1 where they are darker.
+
+    The median over time of an object that moves may have steps from pixel to pixel that no frame has.
+    """
+    # What the interpolation leaves of a Gaussian's middle pixel, for one unit of what it gives there.
+    left = (1 - 1 / factor) ** 2
+    around = np.array([mended(frame.astype(np.float64), candidates)[candidates] for frame in shown])
+    differs = sign * (shown[:, candidates] - around) > left / (1 - left) * np.abs(around - ground)
+    return np.asarray(differs.mean(axis=0) >= _NEARLY)
+
+
+def _stands_out(flat: FloatArray, factor: float, least: float) -> tuple[BoolArray, BoolArray]:
+    """Where a pixel is too bright for its neighbours, and where it is a hole in light, (rows, columns) each."""
+    ring = np.ones((3, 3), dtype=np.bool_)
+    ring[1, 1] = False
+    brighter = ndimage.rank_filter(flat, -2, footprint=ring, mode="mirror")
+    darker = ndimage.rank_filter(flat, 1, footprint=ring, mode="mirror")
+    peak = flat > factor * np.maximum(brighter, 0.0) + least
+    hole = darker > factor * np.maximum(flat, 0.0) + least
+    return np.asarray(peak), np.asarray(hole)
+
+
+def _peak_over_neighbour(sd: float) -> float:
+    """Light of a Gaussian's middle pixel over that of the pixel beside it."""
+    half, beyond = (math.erf(edge / (sd * math.sqrt(2))) for edge in (0.5, 1.5))
+    return 2 * half / max(beyond - half, 1e-9)
