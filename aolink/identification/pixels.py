@@ -6,9 +6,6 @@ more: where a spot turns, and how often. So the filter of `profile` goes through
 model, and the sum of its log-evidences, which is the log-likelihood of the pixels except for Laplace's approximation
 (`aolink.estimation.pixels.modes`), decides between candidates. One that is far behind is left out at once, so that most
 of them take few exposures.
-
-Beside a process that moves the centroid much more than the vibration does, there may be no maximum near the vibration's
-frequency at all. So the frequencies are also scanned by the pixels alone.
 """
 
 from __future__ import annotations
@@ -22,9 +19,8 @@ import numpy as np
 from aolink.errors import EstimatorError
 from aolink.estimation import Estimator, make_estimator
 from aolink.exposure import Exposure
-from aolink.identification.likelihood import Likelihood
 from aolink.identification.readings import Readings
-from aolink.identification.search import BLOCK, Maximum, Space, climb
+from aolink.identification.search import Maximum, Space
 from aolink.numerics.arrays import FloatArray
 from aolink.rig import Rig
 
@@ -42,15 +38,6 @@ _DECAY = 1 / 8
 """Decay time of the vibration of a candidate beside a maximum, in lengths of the recording."""
 _ALIKE = 3.0
 """Such a candidate is not made where the maximum's own damping is within this factor."""
-_FIRST_LASTING, _LEAST_CYCLES = 1.5, 0.5
-"""How long the vibrations of the first scan last, in exposures, and where it begins, in cycles an exposure: below that,
-centroids show the frequency."""
-_SPACING = 0.15
-"""Distance of a scan's frequencies, in cycles in the time that its vibrations last: half of a resonance's width."""
-_SCANNED = 12
-"""Exposures of a scan, in times that its vibrations last."""
-_STAYED = 0.02
-"""A maximum of the likelihood of readings belongs to a frequency of a scan if it differs by less than this share."""
 _AROUND = np.arange(-2.0, 3.0)
 """Steps from a parameter at which the evidence is compared."""
 _MOVES = 3
@@ -96,47 +83,6 @@ def candidates(space: Space, found: Sequence[Maximum], seen: Sequence[Readings])
             out.append(Candidate(each.x, each))
         if (x != each.x).any():
             out.append(Candidate(x, each))
-    return out
-
-
-def scanned(
-    space: Space, highest: Maximum, seen: Sequence[Readings], rig_of: RigOf, exposures: Sequence[Exposure],
-    tell: Tell = lambda done, of: None,
-) -> list[Candidate]:  # fmt: skip
-    """A candidate for each vibration of a sum: the frequency that the pixels prefer, beside the highest maximum's other
-    parameters.
-
-    The first scan has vibrations that last for one and a half exposures, so that its frequencies may be far apart. Each
-    further one has them last twice as long, at five frequencies around the best one, up to an eighth of the recording.
-    There is no candidate where `profile` cannot work on the rig. The parameters are those of `candidates`.
-    """
-    if len(space.kinds) < 2 or not exposures:  # alone, a vibration is easily found
-        return []
-    try:
-        make_estimator(rig_of(highest.x), _ESTIMATOR)
-    except EstimatorError:
-        return []
-    period_s, exposure_s = (steps * seen[0].step_s for steps in (seen[0].period_steps, seen[0].n_steps))
-    longest = max(_FIRST_LASTING, _DECAY * len(exposures))
-    stages = 1 + math.ceil(math.log2(longest / _FIRST_LASTING))
-    of = [Likelihood(each, BLOCK) for each in seen]
-    out = []
-    for k in _frequencies(space):
-        x, low, high = highest.x, *np.array(space.bounds).T
-        hz = np.arange(_LEAST_CYCLES / exposure_s, math.exp(high[k]), _SPACING / (_FIRST_LASTING * period_s))
-        for stage in range(stages):
-            tell(stage, stages)
-            lasting = min(_FIRST_LASTING * 2**stage, longest)
-            if stage:
-                hz = math.exp(x[k]) + _SPACING / (lasting * period_s) * _AROUND
-            points = np.tile(x, (len(hz), 1))
-            points[:, k], points[:, k + 1] = np.log(hz), -np.log(2 * math.pi * hz * lasting * period_s)
-            found = [Candidate(point, highest) for point in np.clip(points, low, high)]
-            x = by_pixels(found, rig_of, exposures[: _SETTLED + round(_SCANNED * lasting)])[0].x
-        top = climb(space, x, of)
-        if abs(top.x[k] - x[k]) > _STAYED:
-            top = Maximum(x, space.log_likelihood(x, of, top.nodes), top.nodes)
-        out.append(Candidate(x, top))
     return out
 
 

@@ -17,7 +17,6 @@ from aolink.identification import (
     identified_text,
     readings,
     refined,
-    scanned,
     space_of,
 )
 from aolink.rig import load_rig, parse_rig
@@ -80,34 +79,6 @@ def test_without_evidence_the_order_stays():
     assert by_pixels(found[:1], refused, []) == found[:1]
     of, _ = space(frames(2.4, 32))
     np.testing.assert_array_equal(refined(of, found[0].x, refused, []), found[0].x)
-
-
-@pytest.mark.long
-def test_a_scan_finds_a_vibration_far_from_every_maximum():
-    """The maximum that it begins with is at an alias of another frequency, and lasts for ever."""
-    exposures = frames(2.4, 64)
-    of, seen = space(exposures)
-    highest, told = candidate(1.13, 0.0, 1e-4).maximum, []
-    (found,) = scanned(of, highest, seen, shaken, exposures, lambda *done: told.append(done))
-    assert math.exp(found.x[2]) * EXPOSURE_S == pytest.approx(2.4, abs=0.02)
-    lasting = 1 / (2 * math.pi * math.exp(found.x[2]) * math.exp(found.x[3]) * EXPOSURE_S)
-    assert lasting == pytest.approx(64 / 8)
-    np.testing.assert_array_equal(found.x[[0, 1, 4]], highest.x[[0, 1, 4]])
-    assert math.exp(found.maximum.x[2]) * EXPOSURE_S == pytest.approx(2.4, abs=0.05)
-    assert told == [(0, 4), (1, 4), (2, 4), (3, 4)]
-
-
-def test_nothing_is_scanned_where_one_vibration_is_alone_or_there_are_no_pixels():
-    def refused(x):
-        raise EstimatorError("profile follows the posterior's modes for at most 24 states")
-
-    exposures, highest = frames(2.4, 32), candidate(2.6, 0.0).maximum
-    of, seen = space(exposures)
-    assert scanned(of, highest, seen, shaken, []) == []
-    assert scanned(of, highest, seen, refused, exposures) == []
-    variance = load_rig("loop").sensor.kernel.variance
-    alone = space_of(("resonance",), seen, variance, with_noise=False, with_kernel=False)
-    assert scanned(alone, Maximum(highest.x[2:], 0.0, 12), seen, refused, exposures) == []
 
 
 @pytest.mark.parametrize(
