@@ -63,7 +63,7 @@ def processes(count: int) -> Iterator[ProcessPoolExecutor]:
     with _unheard_by_children():
         resource_tracker.ensure_running()
     try:
-        with _Pool(count, mp_context=get_context("spawn"), initializer=end_with_parent) as pool:
+        with _Pool(count, mp_context=get_context("spawn"), initializer=_begin_to_watch) as pool:
             calls = os.dup(_inside(pool)._call_queue._reader.fileno())
             try:
                 yield pool
@@ -89,6 +89,10 @@ def end_with_parent() -> None:
     The standard library gives each child one end of a pipe that closes when the parent ends, however that comes about.
     """
     signal.signal(signal.SIGTERM, _exit)
+    _begin_to_watch()
+
+
+def _begin_to_watch() -> None:
     threading.Thread(target=_watch_parent, name="aolink-parent", daemon=True).start()
 
 
@@ -126,11 +130,18 @@ def _unheard_by_children() -> Iterator[None]:
 
 
 def _until_ended(function: Callable[..., Result], *arguments: Any, **options: Any) -> Result:
-    """Call a function in a worker, which ends if a signal asks it to; the pool itself would only note an error."""
+    """Call a function in a worker, which ends if a signal asks it to; the pool itself would only note an error.
+
+    Between calls the signal ends the worker at once: where it interrupts an import, of what a call needs, the worker
+    would print an error.
+    """
+    signal.signal(signal.SIGTERM, _exit)
     try:
         return function(*arguments, **options)
     except SystemExit as end:
         os._exit(end.code if isinstance(end.code, int) else 1)
+    finally:
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
 
 def _inside(pool: ProcessPoolExecutor) -> Any:

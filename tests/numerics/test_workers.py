@@ -66,6 +66,37 @@ def test_the_workers_of_a_killed_batch_end_and_the_next_run_does_it_all(
     assert not [*tmp_path.glob("out/.*")]
 
 
+def test_a_worker_that_is_ended_while_it_imports_what_a_call_needs_prints_nothing(tmp_path: Path) -> None:
+    """Code in C gives an interrupted import as an error of the import."""
+    (tmp_path / "needed.py").write_text(
+        "import multiprocessing, pathlib, time\n"
+        "def work(): pass\n"
+        "if multiprocessing.parent_process() is not None:\n"
+        "    pathlib.Path('begun').touch()\n"
+        "    try:\n"
+        "        time.sleep(60)\n"
+        "    except BaseException as error:\n"
+        "        raise ImportError('initialisation failed') from error\n"
+    )
+    # Imported inside, so that the worker imports it with the call, not with the program.
+    (tmp_path / "program.py").write_text(
+        "import pathlib, time\n"
+        "from aolink.numerics.workers import processes\n"
+        "if __name__ == '__main__':\n"
+        "    from needed import work\n"
+        "    try:\n"
+        "        with processes(1) as pool:\n"
+        "            pool.submit(work)\n"
+        "            while not pathlib.Path('begun').exists():\n"
+        "                time.sleep(0.01)\n"
+        "            raise ValueError\n"
+        "    except ValueError:\n"
+        "        pass\n"
+    )
+    done = subprocess.run([sys.executable, "program.py"], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
 def test_workers_that_have_nothing_to_do_end_as_well(tmp_path: Path) -> None:
     program = (
         "import os, sys\n"
