@@ -93,7 +93,9 @@ def test_a_worker_that_is_ended_while_it_imports_what_a_call_needs_prints_nothin
         "    except ValueError:\n"
         "        pass\n"
     )
-    done = subprocess.run([sys.executable, "program.py"], cwd=tmp_path, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [sys.executable, "program.py"], cwd=tmp_path, capture_output=True, text=True, check=False, timeout=_PATIENCE_S
+    )
     assert (done.returncode, done.stderr) == (0, "")
 
 
