@@ -125,7 +125,7 @@ def profile(rig: Rig, options: Options) -> Filter:
     if alike_systems(rig.plant) is None:
         from aolink.estimation.pixels.updates import PROFILE
 
-        return _of_pixels(rig, options, PROFILE.within(options.tempered))
+        return _of_pixels(rig, options, PROFILE.within(options.tempered, options.draws / 100))
     _warm_up(rig)
     return _blur_filter(rig, options, JointProfile(_spots(rig), rig.plant.n_outputs))
 
@@ -133,7 +133,7 @@ def profile(rig: Rig, options: Options) -> Filter:
 def mixture(rig: Rig, options: Options) -> Filter:
     from aolink.estimation.pixels.updates import MIXTURE
 
-    return _of_pixels(rig, options, MIXTURE.within(options.tempered))
+    return _of_pixels(rig, options, MIXTURE.within(options.tempered, options.draws / 100))
 
 
 def sampled(rig: Rig, options: Options) -> Filter:

@@ -6,6 +6,9 @@ more: where a spot turns, and how often. So the filter of `profile` goes through
 model, and the sum of its log-evidences, which is the log-likelihood of the pixels except for Laplace's approximation
 (`aolink.estimation.pixels.modes`), decides between candidates. One that is far behind is left out at once, so that most
 of them take few exposures.
+
+Beside a process that moves the centroid much more than a vibration does, there may be no maximum near the vibration's
+frequency at all. So the pixels also choose among frequencies at equal distances (`scanned`).
 """
 
 from __future__ import annotations
@@ -13,19 +16,24 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
 from aolink.errors import EstimatorError
 from aolink.estimation import Estimator, make_estimator
 from aolink.exposure import Exposure
+from aolink.identification.likelihood import Likelihood
 from aolink.identification.readings import Readings
-from aolink.identification.search import Maximum, Space
+from aolink.identification.search import BLOCK, Maximum, Space, climb
 from aolink.numerics.arrays import FloatArray
+from aolink.numerics.workers import in_threads
 from aolink.rig import Rig
 
 _ESTIMATOR = "profile:tempered=0"
 """Without tempered points: they cost ten times as much, and the evidence is not from them."""
+_QUICK = f"{_ESTIMATOR},draws=5"
+"""With few points, which cost most of the rest: enough to decide between candidates."""
 _RULED_OUT = 30.0
 """Nats by which a candidate is behind where it is left out: the evidence is approximate."""
 _MOST = 10.0
@@ -38,6 +46,17 @@ _DECAY = 1 / 8
 """Decay time of the vibration of a candidate beside a maximum, in lengths of the recording."""
 _ALIKE = 3.0
 """Such a candidate is not made where the maximum's own damping is within this factor."""
+_LASTING, _LEAST_CYCLES = 3.0, 0.5
+"""How long the vibrations of a scan's first round last, in exposures, and its lowest frequency, in cycles an exposure:
+below that, centroids show the frequency."""
+_SPACING = 0.15
+"""Distance of a scan's frequencies, in cycles in the time that its vibrations last: half of a resonance's width."""
+_PEAKS = 4
+"""Most frequencies of a round of a scan, each better than its neighbours, about which the next one looks."""
+_NEAR_ENOUGH = 0.1
+"""Nats to which a scan maximises the likelihood of readings."""
+_STAYED = 0.02
+"""A maximum of the likelihood of readings belongs to a frequency of a scan if it differs by less than this share."""
 _AROUND = np.arange(-2.0, 3.0)
 """Steps from a parameter at which the evidence is compared."""
 _MOVES = 3
@@ -86,6 +105,72 @@ def candidates(space: Space, found: Sequence[Maximum], seen: Sequence[Readings])
     return out
 
 
+def scanned(
+    space: Space, highest: Maximum, seen: Sequence[Readings], rig_of: RigOf, exposures: Sequence[Exposure],
+    tell: Tell = lambda done, of: None,
+) -> list[Candidate]:  # fmt: skip
+    """Candidates for each vibration of a sum at the frequencies that the pixels prefer, wherever the maxima are.
+
+    In the first round vibrations last for three exposures, so that their frequencies may be far apart; at each
+    frequency the other parameters are those that maximise the likelihood of readings. In each further round they last
+    twice as long, up to an eighth of the recording, at half the distance, beside the frequencies that are left.
+
+    There is no candidate for a vibration that is alone, which `maxima` finds, and where `profile` cannot work on the
+    rig. The parameters are those of `candidates`, and ``highest`` is the maximum from which the others are climbed to.
+    """
+    if len(space.kinds) < 2 or not exposures:
+        return []
+    try:
+        make_estimator(rig_of(highest.x), _QUICK)
+    except EstimatorError:
+        return []
+    out = []
+    for k in _frequencies(space):
+        out += _scan(space, k, highest.x, seen, rig_of, exposures, tell)
+    return out
+
+
+def _scan(
+    space: Space, k: int, start: FloatArray, seen: Sequence[Readings], rig_of: RigOf, exposures: Sequence[Exposure],
+    tell: Tell,
+) -> list[Candidate]:  # fmt: skip
+    """The candidates of the vibration whose frequency is parameter k."""
+    of = [Likelihood(each, BLOCK) for each in seen]
+    period_s, exposure_s = (steps * seen[0].step_s for steps in (seen[0].period_steps, seen[0].n_steps))
+    longest = max(_LASTING, _DECAY * len(exposures))
+    rounds = 1 + math.ceil(math.log2(longest / _LASTING))
+    low, high = np.array(space.bounds).T
+    peaks: list[Candidate] = []
+    for number in range(rounds):
+        lasting = min(_LASTING * 2**number, longest) * period_s
+        spacing = _SPACING / lasting
+        if peaks:
+            near = np.array([math.exp(each.x[k]) for each in peaks])
+            at = np.unique(np.round(near / spacing)[:, None] + [-1, 0, 1])
+        else:
+            at = np.arange(math.ceil(_LEAST_CYCLES / exposure_s / spacing), math.floor(math.exp(high[k]) / spacing) + 1)
+        found = []
+        for hz in at * spacing:
+            x = min((each.x for each in peaks), key=lambda x: abs(math.exp(x[k]) - hz), default=start).copy()
+            x[k], x[k + 1] = math.log(hz), -math.log(2 * math.pi * hz * lasting)
+            top = climb(space, np.clip(x, low, high), of, _NEAR_ENOUGH, fixed=(k, k + 1))
+            found.append(Candidate(top.x, top))
+        left = by_pixels(found, rig_of, exposures, partial(_tell_of_round, tell, number, rounds))
+        peaks = [
+            each for rank, each in enumerate(left)
+            if all(abs(math.exp(each.x[k]) - math.exp(better.x[k])) > 1.5 * spacing for better in left[:rank])
+        ][:_PEAKS]  # fmt: skip
+    tops = [climb(space, each.x, of) for each in peaks]
+    return [
+        Candidate(each.x, top if abs(top.x[k] - each.x[k]) < _STAYED else each.maximum)
+        for each, top in zip(peaks, tops, strict=True)
+    ]
+
+
+def _tell_of_round(tell: Tell, number: int, rounds: int, done: int, of: int) -> None:
+    tell(done + number * of, rounds * of)
+
+
 def _frequencies(space: Space) -> list[int]:
     """Where the frequencies of the disturbance's vibrations are among the parameters; a damping follows each."""
     return [k for k, name in enumerate(space.names) if name.endswith("frequency_hz") and not name.startswith("plant.")]
@@ -112,14 +197,14 @@ def by_pixels(
     if len(found) < 2:
         return list(found)
     try:
-        running = {k: make_estimator(rig_of(each.x), _ESTIMATOR) for k, each in enumerate(found)}
+        running = {k: make_estimator(rig_of(each.x), _QUICK) for k, each in enumerate(found)}
     except EstimatorError:
         return list(found)
     total = np.zeros(len(found))
     used = exposures[:_ENOUGH]
     for number, exposure in enumerate(used):
         tell(number, len(used))
-        each = np.array([_log_evidence(estimator, exposure) for estimator in running.values()])
+        each = np.array(in_threads(partial(_log_evidence, exposure), list(running.values())))
         if number < _SETTLED or not np.isfinite(each).any():
             continue
         at = list(running)
@@ -145,7 +230,7 @@ def refined(
 
     def evidence(x: FloatArray) -> FloatArray:
         estimator = make_estimator(rig_of(x), _ESTIMATOR)
-        return np.array([_log_evidence(estimator, exposure) for exposure in exposures[:_ENOUGH]][_SETTLED:])
+        return np.array([_log_evidence(exposure, estimator) for exposure in exposures[:_ENOUGH]][_SETTLED:])
 
     # With a damping that is far too high, any frequency nearby will do.
     moved = [at for k in _frequencies(space) for at in (k + 1, k)]
@@ -157,7 +242,7 @@ def refined(
             beside = np.tile(x, (len(_AROUND), 1))
             beside[:, k] = np.clip(x[k] + step * _AROUND, *space.bounds[k])
             try:
-                each = np.array([evidence(other) for other in beside])
+                each = np.array(in_threads(evidence, list(beside)))
             except EstimatorError:
                 return x
             # The evidence of an exposure jumps where the filter has lost a mode of the posterior.
@@ -171,7 +256,7 @@ def refined(
     return x
 
 
-def _log_evidence(estimator: Estimator, exposure: Exposure) -> float:
+def _log_evidence(exposure: Exposure, estimator: Estimator) -> float:
     """Log-evidence of a frame, nats, the sum over axes; NaN where it shows none."""
     estimator.step(exposure)
     assert estimator.posterior is not None

@@ -318,8 +318,10 @@ def _add(space: Space, found: list[Maximum], new: Maximum) -> None:
     found.append(new)
 
 
-def climb(space: Space, start: FloatArray, of: Sequence[Likelihood], enough: float = 1e-3) -> Maximum:
-    """The local maximum that a start leads to, to ``enough`` nats."""
+def climb(
+    space: Space, start: FloatArray, of: Sequence[Likelihood], enough: float = 1e-3, fixed: Sequence[int] = ()
+) -> Maximum:  # fmt: skip
+    """The local maximum that a start leads to, to ``enough`` nats, where the ``fixed`` parameters stay as they are."""
     nodes = max(each.nodes(space.model(start)) for each in of)
     nodes += 4 if nodes < of[0].seen.n_steps - 4 else 0
 
@@ -337,6 +339,7 @@ def climb(space: Space, start: FloatArray, of: Sequence[Likelihood], enough: flo
     def whitened(u: FloatArray) -> float:
         return cost(at + u * scale)
 
+    low[list(fixed)] = high[list(fixed)] = at[list(fixed)]
     done = optimize.minimize(
         whitened, np.zeros(len(at)), method="L-BFGS-B",
         bounds=list(zip((low - at) / scale, (high - at) / scale, strict=True)),

@@ -29,6 +29,7 @@ from aolink.identification import (
     maxima,
     readings,
     refined,
+    scanned,
     space_of,
     tried,
 )
@@ -191,7 +192,8 @@ def _of_output(
             if tell:
                 tell(f"pixels, {output}", done, of)
 
-        left = by_pixels(candidates(of, everything, seen), rig_of, exposures, on_pixels)
+        found = [*candidates(of, everything, seen), *scanned(of, tops[0], seen, rig_of, exposures, on_pixels)]
+        left = by_pixels(found, rig_of, exposures, on_pixels)
         tops = list(dict.fromkeys(each.maximum for each in left))
         x = refined(of, left[0].x, rig_of, exposures, on_pixels)
     sets = identified(of, tops, seen, (lambda k: tell(f"fit, {output}", k + 1, len(of.names) + 1)) if tell else None)

@@ -17,6 +17,7 @@ from aolink.identification import (
     identified_text,
     readings,
     refined,
+    scanned,
     space_of,
 )
 from aolink.rig import load_rig, parse_rig
@@ -79,6 +80,39 @@ def test_without_evidence_the_order_stays():
     assert by_pixels(found[:1], refused, []) == found[:1]
     of, _ = space(frames(2.4, 32))
     np.testing.assert_array_equal(refined(of, found[0].x, refused, []), found[0].x)
+
+
+@pytest.mark.long
+def test_a_scan_finds_a_vibration_far_from_every_maximum():
+    """The maximum that it is given is at another frequency, and its vibration never changes."""
+    exposures = frames(2.4, 64)
+    of, seen = space(exposures)
+    highest, told = candidate(1.13, 0.0, 1e-4).maximum, []
+    found = scanned(of, highest, seen, shaken, exposures, lambda *done: told.append(done))
+    best = found[0]
+    assert math.exp(best.x[2]) * EXPOSURE_S == pytest.approx(2.4, abs=0.02)
+    assert 1 / (2 * math.pi * math.exp(best.x[2]) * math.exp(best.x[3]) * EXPOSURE_S) == pytest.approx(64 / 8)
+    assert math.exp(best.x[4]) == pytest.approx(0.08, rel=0.25)  # its sd
+    assert math.exp(best.maximum.x[2]) == pytest.approx(math.exp(best.x[2]), rel=0.02)
+    apart = np.diff(np.sort([math.exp(each.x[2]) * EXPOSURE_S for each in found]))
+    assert (apart > 0.15 / 8).all()  # no two at one peak
+    done, _ = np.array(told).T
+    assert told[0][0] == 0
+    assert (np.diff(done) > 0).all()
+    assert {of for _, of in told} == {3 * 64}
+
+
+def test_nothing_is_scanned_where_one_vibration_is_alone_or_there_are_no_pixels():
+    def refused(x):
+        raise EstimatorError("profile follows the posterior's modes for at most 24 states")
+
+    exposures, highest = frames(2.4, 32), candidate(2.6, 0.0).maximum
+    of, seen = space(exposures)
+    assert scanned(of, highest, seen, shaken, []) == []
+    assert scanned(of, highest, seen, refused, exposures) == []
+    variance = load_rig("loop").sensor.kernel.variance
+    alone = space_of(("resonance",), seen, variance, with_noise=False, with_kernel=False)
+    assert scanned(alone, Maximum(highest.x[2:], 0.0, 12), seen, refused, exposures) == []
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import aolink
 from aolink.identification import maxima, readings, space_of
+from aolink.identification.likelihood import Likelihood
+from aolink.identification.search import climb
 from aolink.jobs.closed_loop import closed_loop
 from aolink.rig import load_rig
 
@@ -46,3 +49,18 @@ def test_a_sharp_line_in_turbulence_is_among_the_maxima(cycles, seed, tmp_path):
     space = space_of(kinds, seen, rig.sensor.kernel.variance, with_noise=False, with_kernel=False)
     lines = [np.exp(each.x[space.names.index("resonance.frequency_hz")]) * 0.05 for each in maxima(space, seen)]
     assert min(abs(each - cycles) for each in lines) < 0.03
+
+
+def test_a_climb_with_fixed_parameters_moves_the_others_to_their_maximum():
+    exposures = aolink.simulate("jitter", 32, seed=2)
+    seen = [readings(exposures.rig, list(exposures))]
+    variance = exposures.rig.sensor.kernel.variance
+    space = space_of(("resonance",), seen, variance, with_noise=False, with_kernel=False)
+    of = [Likelihood(each, 16) for each in seen]
+    start = np.log([8.0, 0.01, 0.05])
+    free, top = climb(space, start, of), climb(space, start, of, fixed=(0, 1))
+    np.testing.assert_array_equal(top.x[:2], start[:2])
+    assert top.log_likelihood == pytest.approx(space.log_likelihood(top.x, of, top.nodes))
+    assert top.log_likelihood < free.log_likelihood
+    for sd in (0.95, 1.05):  # the only one that is free
+        assert space.log_likelihood(np.add(top.x, [0, 0, np.log(sd)]), of, top.nodes) < top.log_likelihood

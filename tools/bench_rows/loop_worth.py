@@ -27,6 +27,7 @@ from aolink.identification import (
     maxima,
     readings,
     refined,
+    scanned,
     space_of,
 )
 from aolink.jobs.closed_loop import closed_loop
@@ -285,7 +286,9 @@ def _identified(cell: Cell, rig: Rig, exposures: list[Exposure]) -> ProcessSum:
     def rig_of(x: FloatArray) -> Rig:
         return cell.rig(space.model(x))
 
-    left = by_pixels(candidates(space, maxima(space, seen), seen), rig_of, exposures)
+    tops = maxima(space, seen)
+    found = [*candidates(space, tops, seen), *scanned(space, tops[0], seen, rig_of, exposures)]
+    left = by_pixels(found, rig_of, exposures)
     return space.model(refined(space, left[0].x, rig_of, exposures))
 
 

@@ -46,9 +46,10 @@ _SCATTERED = 2.5
 LEAST_EFFECTIVE = 128.0
 HALVINGS = 6
 # Points of a round for each pair of coefficients, rounded up to a power of two. For one or two coefficients that would
-# be too few.
+# be too few. And the fewest, whatever share of them is asked for.
 _POINTS = 14
 _FEWEST_POINTS = 128
+_FEWEST_OF_A_SHARE = 32
 _MOST_POINTS = 2048
 # Share of the points that are drawn from the wide Gaussians.
 _WIDE = 0.3
@@ -131,7 +132,8 @@ def importance_corrected(
 
 def points_of_round(n: int, share: float) -> int:
     """Points that each round has for n coefficients: this share of the usual number, to a power of two."""
-    return min(_MOST_POINTS, 1 << math.ceil(math.log2(share * max(_FEWEST_POINTS, _POINTS * n**2))))
+    wanted = max(_FEWEST_OF_A_SHARE, share * max(_FEWEST_POINTS, _POINTS * n**2))
+    return min(_MOST_POINTS, 1 << math.ceil(math.log2(wanted)))
 
 
 @lru_cache(maxsize=32)

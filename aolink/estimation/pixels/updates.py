@@ -63,19 +63,20 @@ class ImportanceUpdater:
     free: float
     """Components are merged further while a merger costs less than this, in nats."""
     share: float
-    """Share of the usual number of points, and of the usual effective sample size, where the posterior has one mode.
-
-    Where it has several all are taken: random errors of their weights would add up from exposure to exposure.
-    """
+    """Share of the usual number of points, and of the usual effective sample size, where the posterior has one mode."""
 
     points: int
     """Tempered points of an axis where the usual points are not enough; 0 for none."""
+    several: float = 1.0
+    """The same share where the posterior has several modes: with fewer points, random errors of the modes' weights
+    would add up from exposure to exposure."""
     enough: float = 100.0
     """The usual effective sample size: with less than half of it, points are tempered."""
 
-    def within(self, points: int | None) -> ImportanceUpdater:
-        """The same with another number of tempered points, if not None."""
-        return self if points is None else replace(self, points=points)
+    def within(self, points: int | None, share: float) -> ImportanceUpdater:
+        """The same with another number of tempered points, if not None, and a share of the others."""
+        points = self.points if points is None else points
+        return replace(self, points=points, share=share * self.share, several=share * self.several)
 
     def when_poor(self, reduced: Reduction) -> str:
         """Its action where importance sampling is not enough, in words, for the estimate's reason."""
@@ -116,7 +117,7 @@ class ImportanceUpdater:
         usual = np.flatnonzero(~lost | (self.points == 0))
         after, poor = proposal, lost.copy()
         several = has_several(modes, _LEAST_DOUBTED_SHARE)[usual]
-        for which, share in ((usual[~several], self.share), (usual[several], 1.0)):
+        for which, share in ((usual[~several], self.share), (usual[several], self.several)):
             if len(which):
                 fit, good = posterior(view.part(which), before.part(which), proposal.part(which), share, self.enough)
                 after = after.replaced(which, fit)

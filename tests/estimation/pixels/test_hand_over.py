@@ -93,3 +93,28 @@ def test_several_vibrations_are_within_their_intervals():
 def test_a_budget_too_small_to_describe_anything_is_refused(tempered):
     with pytest.raises(EstimatorError, match=f"tempered = {tempered}: use at least 100 points, or 0"):
         make_estimator(LIVELY, "profile", tempered=tempered)
+
+
+def log_evidence(estimator):
+    assert estimator.posterior is not None
+    assert estimator.posterior.log_evidence is not None
+    return float(estimator.posterior.log_evidence.sum())
+
+
+@pytest.mark.parametrize("name", ["profile", "mixture"])
+def test_few_draws_find_the_same_motion_and_nearly_the_same_evidence(name):
+    rig = load_rig("jitter")
+    usual, few = make_estimator(rig, f"{name}:tempered=0"), make_estimator(rig, f"{name}:tempered=0,draws=5")
+    apart, evidence = [], []
+    for exposure in list(simulate(rig, 8, seed=4))[2:]:
+        one, other = usual.step(exposure), few.step(exposure)
+        apart.append(np.sqrt(np.mean((one.path - other.path) ** 2) / np.mean(one.path_sd**2)))
+        evidence.append([log_evidence(each) for each in (usual, few)])
+    assert 0 < np.median(apart) < 0.5
+    assert np.abs(np.diff(np.sum(evidence, axis=0))) < 10
+
+
+@pytest.mark.parametrize("draws", [0, 401])
+def test_a_share_of_the_draws_that_makes_no_sense_is_refused(draws):
+    with pytest.raises(EstimatorError, match=f"draws = {draws}: use 1 to 400 per cent of the usual points"):
+        make_estimator(LIVELY, "profile", draws=draws)
