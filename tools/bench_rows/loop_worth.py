@@ -100,19 +100,21 @@ class Cell:
         return parse_rig(identified_text(text, parse_rig(text), [model]))
 
 
+_WITH_PROFILE = ("o1", "moments", "profile")
 HEADLINE = tuple(
-    Cell("own", at, estimators=("o1", "moments", "profile"), identified=("o1", "profile")) for at in (2.4, 2.7)
+    Cell("own", at, estimators=_WITH_PROFILE, identified=("o1", "profile")) for at in (2.4, 2.7)
 )  # fmt: skip
 # At 3.0 whole periods fit into an exposure: the centroid is zero, the blur has no phase, and nothing can help.
 TURBULENCE_AND_LINE = (
-    *(Cell("own", at, estimators=("o1", "moments", "profile")) for at in (0.6, 1.5)),
-    *(Cell("own", at) for at in (0.24, 1.2, 3.0, 3.3)),
+    *(Cell("own", at, estimators=_WITH_PROFILE) for at in (0.6, 1.2, 1.5, 3.0)),
+    *(Cell("own", at) for at in (0.24, 3.3)),
     *(Cell("hcipy", at) for at in (2.4, 2.7)),
 )  # fmt: skip
 LINE = (
-    *(Cell("", at) for at in (0.24, 1.2, 1.5, 2.4, 2.7, 3.0, 3.3)), Cell("", 0.6, identified=("o1",)),
+    *(Cell("", at) for at in (0.24, 1.2, 1.5, 2.7, 3.0, 3.3)), Cell("", 2.4, estimators=_WITH_PROFILE),
+    Cell("", 0.6, estimators=_WITH_PROFILE, identified=("o1",)),
 )  # fmt: skip
-TURBULENCE = (Cell("hcipy", 0.0), Cell("own", 0.0, identified=("o1",)))
+TURBULENCE = (Cell("hcipy", 0.0), Cell("own", 0.0, estimators=_WITH_PROFILE, identified=("o1",)))
 FACTORS = tuple(
     cell
     for at in (0.6, 2.4)
@@ -142,7 +144,7 @@ class Size:
 FULL = Size()
 LONG_PAST = Size(seeds=range(901, 906), past=600)
 """Three times as much past, for the models that are identified and for the rivals alike, on seeds of its own."""
-FRESH = Size(seeds=range(906, 910))
+FRESH = Size(seeds=range(910, 914))
 """Seeds on which nothing was tuned, and which nobody had looked at when the identification was built."""
 SHORT = Size(seeds=range(1, 3), past=64, exposures=6, settled=3, gains=GAINS[:1])
 
@@ -184,7 +186,7 @@ class Measured:
             found += [Goal(name, "", 1.02) for name in self.ours]
         elif self.cell.turbulence and at in (2.4, 2.7) and "profile" in self.ours:
             found += [Goal("identified profile", "", 0.95), Goal("profile", "", 0.95)]
-        elif "profile" in self.ours:
+        elif "profile" in self.ours and 0.6 <= at <= 1.5:
             found.append(Goal("profile", "o1", 0.9))
         if at and "identified o1" in self.ours:
             found.append(Goal("identified o1", "o1", 1.05))
