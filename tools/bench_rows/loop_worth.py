@@ -104,7 +104,7 @@ _WITH_PROFILE = ("o1", "moments", "profile")
 HEADLINE = tuple(
     Cell("own", at, estimators=_WITH_PROFILE, identified=("o1", "profile")) for at in (2.4, 2.7)
 )  # fmt: skip
-# At 3.0 whole periods fit into an exposure: the centroid is zero, the blur has no phase, and nothing can help.
+# At 3.0 whole periods fit into an exposure: the centroid is zero, and alone the blur has no phase.
 TURBULENCE_AND_LINE = (
     *(Cell("own", at, estimators=_WITH_PROFILE) for at in (0.6, 1.2, 1.5, 3.0)),
     *(Cell("own", at) for at in (0.24, 3.3)),
