@@ -91,7 +91,7 @@ def host_times(effort: Effort) -> list[Row]:
     seeds, duration_s = effort.of(_SEEDS, 3), float(effort.of(round(_SESSION_S), 8))
     sessions = [_session(seed, duration_s, stamps_show_it=True)[0] for seed in range(1, seeds + 1)]
     nees = float(np.mean([np.mean(each**2) for each in sessions]))
-    low, high = (float(each) / seeds for each in stats.chi2.ppf([0.025, 0.975], seeds))
+    low, high = (float(stats.chi2.ppf(share, seeds)) / seeds for share in (0.025, 0.975))
     ratios = np.abs(np.concatenate(sessions))
     covered = [float((ratios < stats.norm.ppf(0.5 + level / 2)).mean()) for level in (0.68, 0.95)]
     hidden = [_session(seed, duration_s, stamps_show_it=False)[1:] for seed in range(1001, 1001 + seeds)]
