@@ -126,7 +126,7 @@ def run_demo(
     The rig runs from its ``source``, a file or a name; paths in the file are relative to it. ``stoppable`` is entered
     for the session alone, which ends in good order when the function that it gives returns True; nothing else is made
     then. With ``control`` the session's loop is closed by that controller, and two others are recorded before, from the
-    same seed: with the loop open, and closed by the integrator.
+    same seed: with the loop open, and closed by the integrator. The Rerun file has the residual slopes of all of them.
     """
     from aolink import plotting, viewing
 
@@ -181,7 +181,8 @@ def run_demo(
             )
         recording = Recording(sharp)
     with part("write .rrd"):
-        viewing.save_rrd(recording, rrd)
+        loops = {of or "open": Recording(where) for of, where, _ in sessions} if control else {}
+        viewing.save_rrd(recording, rrd, look=viewing.Look(loops=loops))
     drawn: Path | None = picture
     not_of_viewer = ""
     with part("draw"):

@@ -42,6 +42,8 @@ class Contents:
     scenes: list[str]
     """The entities that the scene has, of: as it came, restored, at rest."""
     restored_spots: bool = False
+    loops: list[str] = field(default_factory=list)
+    """Names of what closed the loops whose residual slopes are drawn in one plot."""
     topics: frozenset[str] = frozenset()
     """Topics of the devices that have messages."""
     drawn: Drawing
@@ -76,7 +78,9 @@ def blueprint(contents: Contents) -> rrb.Blueprint:
         if beliefs := [*_errors(contents), *_nis(contents), *_states(contents), *_maps(contents)]:
             rows.append(rrb.Horizontal(contents=beliefs))
         bottom = _devices(contents)
-        rows.append(rrb.Horizontal(contents=bottom, column_shares=[2.0] * (len(bottom) - 1) + [3.0]))
+        # Loops that are compared come first, and are what such a session is about.
+        shares = [4.0 if contents.loops else 2.0, *[2.0] * (len(bottom) - 2), 3.0]
+        rows.append(rrb.Horizontal(contents=bottom, column_shares=shares))
         layout = rrb.Vertical(contents=rows, row_shares=[10, 7, 7] if len(rows) == 3 else [10, 7])
     if contents.scenes:
         scenes = rrb.Vertical(contents=[_scene(contents, path) for path in contents.scenes])
@@ -234,6 +238,9 @@ def _maps(contents: Contents) -> list[rrb.Container]:
 
 def _devices(contents: Contents) -> list[rrb.Container | rrb.View]:
     views: list[rrb.Container | rrb.View] = []
+    if contents.loops:
+        shown = [f"residual/{name}" for name in contents.loops]
+        views.append(_lines(contents, "Residual of each loop, RMS an exposure (slope units)", shown, legend=True))
     if contents.topics & {topics.COMMAND, topics.APPLIED}:
         shown = [
             path for topic, path in ((topics.COMMAND, "mirror/command"), (topics.APPLIED, "mirror/applied"))

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -23,6 +24,9 @@ class Look:
     """Number of the spot whose lines, profile and pages are shown."""
     compared: Recording | None = None
     """Another recording that is shown beside it, from its own first exposure on."""
+    loops: Mapping[str, Recording] = field(default_factory=dict)
+    """Recordings of one disturbance by the names of what closed their loops, this one among them: their residual
+    slopes are drawn in one plot, each from its own first exposure on."""
 
 
 def identity(recording: Recording, look: Look) -> str:
@@ -31,4 +35,5 @@ def identity(recording: Recording, look: Look) -> str:
         return recording.digest
     exposures, spot, other = look.exposures, look.spot, look.compared
     part = f"{exposures.start}-{exposures.stop}" if exposures else "all"
-    return f"{recording.digest}/{part}/{spot}/{other.digest if other else ''}"
+    loops = "".join(f"/{name}={loop.digest}" for name, loop in look.loops.items())
+    return f"{recording.digest}/{part}/{spot}/{other.digest if other else ''}{loops}"

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-from aolink.colours import estimator_colour
+from aolink.colours import Colour, estimator_colour
 from aolink.estimation.estimate import Estimate
 from aolink.exporting.summary import estimate_scalars
-from aolink.exposure import Exposure, Truth
+from aolink.exposure import Exposure, Truth, residual_rms
 from aolink.numerics.arrays import FloatArray
 from aolink.plotting.overview import NIS_COVERAGE, nis_bounds
 from aolink.plotting.style import BAND, extremes, hides_swings
@@ -106,6 +106,21 @@ def log_errors(
     ended = np.array([e.end_state - truth.end_state for e, truth in known])
     for i in range(min(ended.shape[2], MOST_STATES)):
         _send_state(drawing, f"error/end/x{i + 1}/{name}", ends, ended[:, :, i], style)
+
+
+def log_residual(
+    drawing: Drawing, timebase: Timebase, name: str, exposures: Iterable[Exposure], colour: Colour
+) -> None:  # fmt: skip
+    """The slopes left by a loop in each exposure, true root mean square over its fast steps and all outputs, slope
+    units: ``/residual/NAME``.
+
+    The session may be another than that of the ``timebase``; its first exposure is then where that session's is.
+    NaN where the truth is not known.
+    """
+    left = [(each.first_step, residual_rms([each])) for each in exposures]
+    if left:
+        steps = timebase.first_step + np.array([step for step, _ in left]) - left[0][0]
+        send_line(drawing, f"residual/{name}", timebase.at_steps(steps), [rms for _, rms in left], Style(name, colour))
 
 
 def _send_table(drawing: Drawing, path: str, times: Sequence[rr.TimeColumn], estimates: Sequence[Estimate]) -> None:

@@ -23,6 +23,7 @@ from aolink.rig import Rig
 from aolink.viewing import camera, devices, incidents, motion, scene
 from aolink.viewing.blueprint import PATH_WINDOW, Contents, blueprint
 from aolink.viewing.look import APPLICATION, Look, identity
+from aolink.viewing.palette import series_colour
 from aolink.viewing.pupil import log_maps
 from aolink.viewing.rrd_file import new_rrd
 from aolink.viewing.series import POINTS, Chosen, Drawing
@@ -72,7 +73,8 @@ def save_rrd(
         The file exists already or cannot be written, or the recording has nothing to show.
     """
     path, look = Path(path), look or Look()
-    sources = [*recording.files, *(look.compared.files if look.compared else ())]
+    beside = [*([look.compared] if look.compared else ()), *look.loops.values()]
+    sources = [file for each in (recording, *beside) for file in each.files]
     with new_rrd(APPLICATION, path, overwrite=overwrite, sources=sources, identity=identity(recording, look)) as stream:
         for done in sent_parts(stream, recording, look):
             if progress:
@@ -169,6 +171,10 @@ class Sender:
                 f"there is no exposure in {recording.path}, so nothing to view; `aolink info` says what it holds"
             )
         self._send_messages(list(self._messages([topic for topic in self._shown if topic not in topics.RUNS])))
+        part = self._look.exposures
+        for k, (name, loop) in enumerate(self._look.loops.items()):
+            series = loop[part.start : part.stop] if part is not None else loop
+            motion.log_residual(self._drawing, self._timebase, name, series, series_colour(k))
         true_scene = recording.true_scene
         if self._rig.scene is not None and true_scene is not None:
             scene.log_true_scene(self._drawing, self._rig.scene, true_scene)
@@ -297,6 +303,7 @@ class Sender:
             truth="truth" in self._known,
             scenes=list(compress(scene.SCENES, (each in self._known for each in scene.SCENES))),
             restored_spots=scene.RESTORED_SPOTS in self._known,
+            loops=list(self._look.loops),
             topics=frozenset(self._known.intersection(self._shown) if self._finished else self._shown),
             drawn=self._drawing,
             maps=self._scales,
