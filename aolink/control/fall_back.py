@@ -27,7 +27,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from aolink.control.controller import Controller, ControllerRow, Seen
+from aolink.control.checked import CheckedController
+from aolink.control.controller import ControllerRow, Seen
 from aolink.control.drift import TOLERATED_RATIO, Fit
 from aolink.control.integrator import Integrator
 from aolink.control.modes import reached
@@ -107,7 +108,9 @@ class Rival:
 
     def __init__(self, rig: Rig, row: ControllerRow, delay_steps: int, held: FloatArray) -> None:
         plant, mirror = rig.plant, rig.mirror
-        self._rig, self._controller, self._delay = rig, row.build(rig), delay_steps
+        self._rig, self._delay = rig, delay_steps
+        # The check of each step would cost time before new inputs are sent; aolink's own two need none here.
+        self._controller = row.build(rig) if row in (INTEGRATOR, STILL) else CheckedController(row, rig)
         self._moved, _ = reached(plant)
         self._A, self._B = plant.A[np.ix_(self._moved, self._moved)].T.copy(), plant.B[self._moved].T.copy()
         self._C = plant.C[:, self._moved].T.copy()
@@ -174,9 +177,9 @@ class FallBack:
         """The step after the newest exposure."""
         self._begin()
 
-    def controller(self) -> Controller:
+    def controller(self) -> CheckedController:
         """A controller of the kind that acts."""
-        return self._rows[self.acting].build(self._rig)
+        return CheckedController(self._rows[self.acting], self._rig)
 
     def interrupt(self) -> None:
         """Begin the rivals anew from the input that the mirror holds, because the loop is open or exposures are

@@ -5,17 +5,15 @@ from __future__ import annotations
 
 import enum
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
-from aolink.control.controller import Controller, ControllerRow, Seen
+from aolink.control.checked import CheckedController
+from aolink.control.controller import ControllerRow, Seen
 from aolink.control.drift import Fit, FitMonitor
 from aolink.control.fall_back import ControllerChange, FallBack
 from aolink.control.registry import find_controller
-from aolink.errors import AolinkError, ControlError
 from aolink.estimation import Estimate, Needs, Status
 from aolink.estimation.frames.measure import measure
 from aolink.exposure import Exposure
@@ -90,7 +88,7 @@ class ControlLoop:
     Raises
     ------
     ControlError
-        As `find_controller`.
+        As `find_controller` and `CheckedController`.
     """
 
     def __init__(self, rig: Rig, controller: str | ControllerRow) -> None:
@@ -99,7 +97,7 @@ class ControlLoop:
         self.delay_steps = delay_steps(rig)
         self.state, self.reason = State.CLOSED, ""
         self.fit: Fit | None = None
-        self._rig, self._controller = rig, _made(row, rig)
+        self._rig, self._controller = rig, CheckedController(row, rig)
         self._fall_back: FallBack | None = None
         if row.believes_a_model and rig.control.fall_back:
             self._fall_back = FallBack(rig, row, self.delay_steps)
@@ -137,7 +135,7 @@ class ControlLoop:
 
     def inputs(self, first_step: int, n_steps: int) -> FloatArray:
         """Inputs to command for ``n_steps`` fast steps from ``first_step``, (n_steps, n_inputs); the same when called
-        again, until an exposure changes them. Raises ControlError if the controller's own code fails."""
+        again, until an exposure changes them. Raises ControlError if the controller fails."""
         while self.next_step < first_step + n_steps:
             self._go_on()
         start = first_step - self._oldest
@@ -187,7 +185,7 @@ class ControlLoop:
         change = self._compare(exposure, slopes, estimate)
         if self.state is State.CLOSED and len(pending):
             state = None if estimate is None else estimate.end_state
-            self._ask(lambda: self._controller.see(Seen(slopes=slopes, state=state, pending=pending)))
+            self._controller.see(Seen(slopes=slopes, state=state, pending=pending))
             self._seen_any = True
         self._drop_before(exposure.first_step)
         clipped, self._clipped = self._clipped, 0
@@ -225,8 +223,7 @@ class ControlLoop:
         if self.state is not State.CLOSED or not self._seen_any:
             self._fall_back.interrupt()
             return None
-        fall_back = self._fall_back
-        change: ControllerChange | None = self._ask(lambda: fall_back.see(exposure, slopes, estimate, self.fit))
+        change = self._fall_back.see(exposure, slopes, estimate, self.fit)
         if change is not None:
             self._controller = self._fall_back.controller()
         return change
@@ -257,31 +254,13 @@ class ControlLoop:
         if not self._seen_any or (lost and self._rig.control.when_lost == "park"):
             wanted = self._park
         else:
-            wanted = sent if lost else self._wanted(held)
+            wanted = sent if lost else self._controller.step(held)
         u = np.minimum(np.maximum(wanted, self._low), self._high)
         if self._most_change < math.inf:
             u = np.minimum(np.maximum(u, sent - self._most_change), sent + self._most_change)
         self._limited.append(bool((u != wanted).any()))
         self._sent.append(u)
         self._held.append(self._rig.mirror.quantise(u))
-
-    def _wanted(self, held: FloatArray) -> FloatArray:
-        u: FloatArray = self._ask(lambda: self._controller.step(held))
-        if np.shape(u) != self._park.shape or not np.isfinite(u).all():
-            found = "a number that is not finite" if np.shape(u) == self._park.shape else f"an array of {np.shape(u)}"
-            raise ControlError(
-                f"the controller {self.name} gives {found}, expected ({len(self._park)},) finite inputs: the mirror is"
-                " parked"
-            )
-        return u
-
-    def _ask(self, call: Callable[[], Any]) -> Any:
-        try:
-            return call()
-        except AolinkError:
-            raise
-        except Exception as error:  # any error of another package
-            raise ControlError(f"the controller {self.name} failed: {error!r}; the mirror is parked") from error
 
     def _forget_from(self, step: int) -> None:
         """Forget the inputs of the steps from this one on."""
@@ -302,15 +281,6 @@ def delay_steps(rig: Rig) -> int:
     """``control.delay_s`` in whole fast steps, at least one: the step after an exposure's last has begun at the
     exposure's end."""
     return max(1, math.ceil(rig.control.delay_s / rig.timing.fast_step_s - 1e-9))
-
-
-def _made(row: ControllerRow, rig: Rig) -> Controller:
-    try:
-        return row.build(rig)
-    except AolinkError:
-        raise
-    except Exception as error:  # any error of another package
-        raise ControlError(f"the controller {row.name} cannot work on the rig {rig.name}: {error!r}") from error
 
 
 def _rms(values: FloatArray) -> float:

@@ -8,6 +8,7 @@ Another package adds one with an entry point in its pyproject.toml, whose name i
 
 from __future__ import annotations
 
+from aolink.control.checked import refusal
 from aolink.control.controller import ControllerRow
 from aolink.control.fall_back import INTEGRATOR
 from aolink.control.lqg import LQG
@@ -42,6 +43,6 @@ def find_controller(name: str, rig: Rig) -> ControllerRow:
         There is no such controller, the installed package that has it is broken, or it cannot work on this rig.
     """
     row = row_named(name, _OURS, GROUP, "controller", ControlError)
-    if reason := row.refusal(rig):
+    if reason := refusal(row, rig):
         raise ControlError(reason)
     return row

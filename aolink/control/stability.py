@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 from itertools import repeat
 
 import numpy as np
 
-from aolink.control.controller import Controller, Seen
+from aolink.control.checked import CheckedController
+from aolink.control.controller import Controller, ControllerRow, Seen
 from aolink.control.loop import delay_steps
 from aolink.control.modes import reached
 from aolink.control.registry import find_controller
@@ -33,6 +34,8 @@ _SETTLED = 1e-9
 _BURST = 1e6
 """A loop that has fallen to the first share of its beginning has settled, and one that has grown to the second never
 will."""
+_BEYOND = 1e100
+"""A loop that has grown to this has no growth that can be computed: the next number may be none."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,9 +69,10 @@ def stability(rig: Rig, name: str) -> Stability:
     Raises
     ------
     ControlError
-        There is no such controller, or no steady gain for this plant.
+        There is no such controller, it fails or gives something that is no input of this rig, or there is no steady
+        gain for this plant.
     """
-    grows = partial(_growth, rig, find_controller(name, rig).build, _observer_gain(rig))
+    grows = partial(_growth, rig, find_controller(name, rig), _observer_gain(rig))
     radius = grows(1.0)
     low, high = (1.0, _MOST_GAIN) if radius < 1 else (1 / _MOST_GAIN, 1.0)
     if radius < 1 and grows(high) < 1:
@@ -101,19 +105,22 @@ def _observer_gain(rig: Rig) -> FloatArray:
     return np.asarray(model.transition @ gain)
 
 
-def _growth(rig: Rig, build: Callable[[Rig], Controller], gain: FloatArray, of_mirror: float) -> float:
+def _growth(rig: Rig, row: ControllerRow, gain: FloatArray, of_mirror: float) -> float:
     """Factor by which a disturbance grows in an exposure, with a true mirror of ``of_mirror`` times the gain."""
     moved, _ = reached(rig.plant)
     start = np.zeros((rig.plant.axes, rig.plant.n_states))
     start[:, moved] = np.random.default_rng(0).standard_normal((len(start), len(moved)))
-    disturbed = _followed(rig, build(rig), gain, of_mirror, start)
+    disturbed = _followed(rig, CheckedController(row, rig), gain, of_mirror, start)
     # An undisturbed loop may move by itself where its safe input is not zero: this motion is subtracted.
     alone: Iterator[FloatArray] = repeat(np.zeros(1))
     if rig.mirror.park.any():
-        alone = _followed(rig, build(rig), gain, of_mirror, np.zeros_like(start))
+        alone = _followed(rig, CheckedController(row, rig), gain, of_mirror, np.zeros_like(start))
     sizes: list[float] = []
     for one, other in zip(disturbed, alone, strict=False):
-        sizes.append(float(np.linalg.norm(one - other)))
+        size = math.hypot(*(one - other))  # numpy's norm squares, and would overflow earlier
+        if sizes and not size < _BEYOND * sizes[0]:
+            return math.inf
+        sizes.append(size)
         if len(sizes) > _SWING and not _SETTLED < max(sizes[-_SWING:]) / sizes[0] < _BURST:
             break
     # Maxima over some exposures, because a loop may swing as it shrinks or grows.
@@ -145,7 +152,7 @@ def _followed(
             controller.see(Seen(slopes=slopes, state=state, pending=np.array(recent)))
             waiting, acting = None, True
         if acting:
-            u = np.asarray(controller.step(u), dtype=np.float64)
+            u = controller.step(u)
         recent.append(u)
         if k < timing.exposure_steps:
             means[0] += true @ C

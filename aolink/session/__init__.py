@@ -203,12 +203,14 @@ def record(
         try:
             loop.run(exposures, stop, progress)
         except BaseException as error:
-            report.ended = f"error: {error}" if isinstance(error, AolinkError) else f"error: {error!r}"
             clock.hurry()
             try:
                 loop.make_safe()
+                if isinstance(error, ControlError):
+                    error.args = (f"{error}; the mirror is parked",)
             except AolinkError as unsafe:
                 report.warnings.append(str(unsafe))
+            report.ended = f"error: {error}" if isinstance(error, AolinkError) else f"error: {error!r}"
             loop.close_account()
             with contextlib.suppress(AolinkError):
                 loop.finish_estimates(ESTIMATES_S if isinstance(error, PortError | DeviceError) else 0.0)

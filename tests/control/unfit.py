@@ -1,0 +1,58 @@
+"""Controllers of another package that do not fit the rig on which they are asked for."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from aolink.control import ControllerRow, Seen
+from aolink.numerics.arrays import FloatArray
+from aolink.rig import Rig
+
+EXPOSURES = 45
+"""Exposures after which `late` fails: more than its stability is computed for."""
+
+
+class Unfit:
+    """Its inputs are those that a function gives of the number of exposures and the last slopes."""
+
+    def __init__(self, given: Callable[[int, FloatArray], FloatArray]) -> None:
+        self._given, self._exposures = given, 0
+        self._slopes = np.zeros(0)
+
+    def see(self, seen: Seen) -> None:
+        self._exposures += 1
+        self._slopes = seen.slopes
+
+    def step(self, held: FloatArray) -> FloatArray:
+        return self._given(self._exposures, self._slopes)
+
+
+def row(name: str, given: Callable[[int, FloatArray], FloatArray]) -> ControllerRow:
+    return ControllerRow(name=name, summary="for other rigs", build=lambda rig: Unfit(given), needs_state=False)
+
+
+def _fails(rig: Rig) -> str | None:
+    raise ValueError("no rig like this")
+
+
+THREE = row("three", lambda exposures, slopes: np.zeros(3))
+CROSSED = row("crossed", lambda exposures, slopes: np.eye(1, 3) @ slopes)
+NOT_A_NUMBER = row("not_a_number", lambda exposures, slopes: np.full(1, np.nan))
+INFINITE = row("infinite", lambda exposures, slopes: np.full(1, np.inf))
+HUGE = row("huge", lambda exposures, slopes: 1e250 * slopes)
+LATE = row("late", lambda exposures, slopes: np.full(1 if exposures <= EXPOSURES else 3, 0.5 * (exposures > 42)))
+REFUSES = ControllerRow(name="refuses", summary="", build=lambda rig: Unfit(lambda *_: np.zeros(1)), refusal=_fails)
+
+
+def installed(folder: Path, environment: dict[str, str]) -> dict[str, str]:
+    """An environment in which a package in ``folder`` adds these controllers by their entry points."""
+    metadata = folder / "unfit-0.1.dist-info"
+    metadata.mkdir(parents=True)
+    (metadata / "METADATA").write_text("Metadata-Version: 2.1\nName: unfit\nVersion: 0.1\n")
+    rows = ("three", "crossed", "not_a_number", "infinite", "huge", "late", "refuses")
+    points = "".join(f"{name} = {__name__}:{name.upper()}\n" for name in rows)
+    (metadata / "entry_points.txt").write_text(f"[aolink.controllers]\n{points}")
+    return environment | {"PYTHONPATH": f"{folder}:{environment['PYTHONPATH']}"}
