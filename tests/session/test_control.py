@@ -79,6 +79,20 @@ def test_on_virtual_time_the_session_is_the_loop_in_memory_bit_for_bit(
         )
 
 
+@pytest.mark.parametrize("name", ["tip-tilt", "sh-4x4"])
+def test_spots_close_the_loop_over_the_wire_as_in_memory(tmp_path: Path, name: str) -> None:
+    """Two slopes of one mirror; sixteen spots, each with a plant of its own."""
+    path = rig_file(tmp_path, load_rig(name))
+    report = close(path, tmp_path, "lqg", "moments", exposures=8)
+    rig = load_rig(path)
+    assert report.ended == "complete"
+    assert report.steps_commanded == report.steps_applied == 8 * rig.timing.frame_period_steps
+    memory = list(closed_loop(rig, "lqg", "moments", 8))
+    for ours, theirs in zip(Recording(tmp_path / "a.mcap").exposures(), memory, strict=True):
+        assert np.array_equal(ours.inputs, theirs.exposure.inputs)
+    assert np.ptp(memory[-1].exposure.inputs, axis=0).all()  # every input moves
+
+
 def test_the_recording_says_who_closed_the_loop_and_how(tmp_path: Path) -> None:
     path = rig_file(tmp_path, small_rig(DRIFT, control="gain = 0.4"))
     report = close(path, tmp_path, "lqg", "moments", "o1")
