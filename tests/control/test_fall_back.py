@@ -22,11 +22,11 @@ STEPS = 40
 """Fast steps of an exposure."""
 
 
-def played(folder: Path, slopes: FloatArray, *parts: str) -> Rig:
-    """A small rig that believes in these parts of a model, while other slopes disturb it."""
+def played(folder: Path, slopes: FloatArray, *parts: str, **changes: str) -> Rig:
+    """A small rig that believes in these parts of a model, while other slopes disturb it; changes as `small_rig`."""
     np.save(folder / "slopes.npy", slopes[:, None])
     path = folder / "played.toml"
-    text = small_rig(*parts).toml
+    text = small_rig(*parts, **changes).toml
     path.write_text(text + '\n[disturbance]\nplant_noise = false\nrecorded = "slopes.npy"\n')
     return load_rig(path)
 

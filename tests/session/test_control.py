@@ -13,6 +13,7 @@ from aolink.devices.gate import Gate
 from aolink.devices.identity import identify
 from aolink.devices.native import NativeCamera, NativeMirror
 from aolink.errors import ControlError
+from aolink.estimation import Status
 from aolink.jobs.closed_loop import closed_loop, replayed
 from aolink.jobs.demo import simulated_rig
 from aolink.recording import schemas_pb2 as pb
@@ -190,6 +191,61 @@ def test_a_light_that_goes_out_opens_the_loop(tmp_path: Path, when_lost: str, st
     assert any("the loop is open from frame" in warning for warning in report.warnings)
     logged = [each.message for each in messages_of(Log, Recording(tmp_path / "a.mcap"), topics.LOG)]
     assert any("the loop is open from frame" in text for text in logged)
+
+
+def lost_and_found(folder: Path, when_lost: str, away: float, gone: range, estimator: str) -> tuple[Report, list[int]]:
+    """A session of 40 exposures whose disturbance is farther away by so many slope units in some of them; and its
+    states. All that must hold whatever befalls a loop is asserted: limits, each step accounted for, the open loop."""
+    slopes = line(0.5, 40, 0.1)
+    slopes[gone.start * 40 : gone.stop * 40] += away
+    played(folder, slopes, DRIFT, control=f'when_lost = "{when_lost}"')
+    report = close(folder / "played.toml", folder, "lqg", estimator)
+    assert (report.ended, report.exposures) == ("complete", 40)
+    assert report.steps_commanded == report.steps_applied == 40 * 40
+    recording = Recording(folder / "a.mcap")
+    rig, blocks = recording.rig, messages_of(wire.CommandBlock, recording, topics.COMMAND)
+    commanded = np.concatenate([block.u for block in blocks])
+    assert rig.mirror.input_min[0] <= commanded.min() <= commanded.max() <= rig.mirror.input_max[0]
+    states = [int(act.state) for act in acts(folder)]
+    opened = states.index(State.HELD if when_lost == "hold" else State.PARKED)
+    closed = states.index(State.CLOSED, opened)
+    assert states == [0] * opened + [states[opened]] * (closed - opened) + [0] * (40 - closed)
+    inputs = np.concatenate([each.inputs for each in recording.exposures()])[:, 0]
+    first, last = (acts(folder)[k].first_step - acts(folder)[0].first_step + 50 for k in (opened, closed))
+    open_inputs = inputs[first:last]
+    assert len(set(open_inputs)) == 1
+    assert open_inputs[0] == (inputs[first - 1] if when_lost == "hold" else rig.mirror.quantise(rig.mirror.park)[0])
+    assert len(set(inputs[last : last + 40])) > 1
+    for text in (f"open from frame {opened + 1} on", f"closed again from frame {closed + 1} on"):
+        assert [f"the loop is {text}" in warning for warning in report.warnings].count(True) == 1
+    return report, states
+
+
+@pytest.mark.parametrize("when_lost", ["hold", "park"])
+def test_light_that_is_lost_in_a_closed_loop_and_comes_back(tmp_path: Path, when_lost: str) -> None:
+    """The spot jumps off the sensor in exposure 20 of a loop that is closed, and is back in exposure 30."""
+    report, states = lost_and_found(tmp_path, when_lost, 3.0, range(20, 30), "o1")
+    slopes = np.array([act.slope_rms for act in acts(tmp_path)])
+    # One of 100 dark frames has enough noise to count as a measurement; the loop is open after six in a row without.
+    opened = next(k for k in range(40) if np.isnan(slopes[k - 5 : k + 1]).sum() == 6)
+    assert 25 <= opened < 30
+    assert np.count_nonzero(states) == 32 - opened
+    assert any("6 exposures in a row gave no measurement" in warning for warning in report.warnings)
+    assert slopes[34:].max() < 0.02 < 0.05 < slopes[30:32].min()
+
+
+@pytest.mark.parametrize(("when_lost", "estimator"), [("hold", "o1"), ("park", "o1"), ("hold", "moments")])
+def test_an_estimator_that_diverges_in_a_closed_loop_opens_it_until_it_has_started_again(
+    tmp_path: Path, when_lost: str, estimator: str
+) -> None:
+    """A knock shifts the spot for good by four standard deviations of what the model believes in, in exposure 20."""
+    report, states = lost_and_found(tmp_path, when_lost, 0.6, range(20, 40), estimator)
+    found = [each.status for each in Recording(tmp_path / "a.mcap").estimates(estimator)]
+    assert found[20:25] == [Status.GATED, Status.GATED, Status.DIVERGED, Status.REINITIALISED, Status.OK]
+    assert [k for k, state in enumerate(states) if state] == [22, 23, 24, 25]
+    assert any("the estimator is diverged at frame 23" in warning for warning in report.warnings)
+    slopes = [act.slope_rms for act in acts(tmp_path)]
+    assert max(slopes[30:]) < 0.1 < 0.5 < min(slopes[20:26])
 
 
 def test_a_model_that_no_longer_fits_is_said(tmp_path: Path) -> None:
