@@ -2,8 +2,8 @@
 to.
 
 Each recording is cut in two; a model is fitted to one half and scored on the other, both ways. A score is the
-log-likelihood of a stretch of exposures. Of the models whose score is not worse than the best one's by more than the
-standard error of the difference over stretches, that with the fewest parameters is chosen.
+log-likelihood of a stretch of exposures. Among the models whose score is below the best one's by no more than the
+standard error of the difference over stretches, the one with the fewest parameters is chosen.
 """
 
 from __future__ import annotations

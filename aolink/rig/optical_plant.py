@@ -76,8 +76,8 @@ def read_optics(table: Table, grid: tuple[int, ...]) -> Optics:
     )
     if not optics.lit.any():
         raise RigError(
-            f"{table.key('least_light')} = {optics.least_light:g}: no lenslet is lit so much, the brightest has"
-            f" {lenslets.light.max():.2g} of its area in the pupil"
+            f"{table.key('least_light')} = {optics.least_light:g}: no lenslet has that share of light,"
+            f" the brightest has {lenslets.light.max():.2g} of its area in the pupil"
         )
     return optics
 

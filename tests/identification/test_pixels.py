@@ -61,7 +61,7 @@ def cycles_of(found):
 @pytest.mark.long
 @pytest.mark.parametrize("cycles", [1.51, 2.4])
 def test_the_pixels_decide_whatever_the_likelihood_of_centroid_and_width_says(cycles):
-    """Of the two aliases one is a cycle below, and one as far from a whole or half number of cycles, on the other
+    """One of the two aliases is a cycle below, and one as far from a whole or half number of cycles, on the other
     side."""
     whole = round(2 * cycles)
     found = [candidate(whole - cycles, 0.0), candidate(cycles - 1, -1.0), candidate(cycles, -9.0)]

@@ -107,7 +107,7 @@ def test_an_exposure_of_one_step_is_an_integral():
 
 @pytest.mark.long
 def test_copies_of_a_plant_may_have_kernels_of_their_own(tmp_path):
-    """Of two spots one is narrower and one wider than the rig file's kernel: both are read alike only where the kernel
+    """One of two spots is narrower and one wider than the rig file's kernel: both are read alike only where the kernel
     is not taken as known."""
     random, middle = np.random.default_rng(1), np.array([[24.0, 24.0]])
     motion = random_walk(random, 40, 1, 0.4)

@@ -194,7 +194,7 @@ def test_less_noise_is_no_worse(method: str, noise_sd: float) -> None:
 
 
 def test_almost_no_noise_is_more_than_conjugate_gradients_can_bear() -> None:
-    """They are told of more: with what there is they would end far from the scene."""
+    """They are given more noise: with what there is they would end far from the scene."""
     turn = np.linspace(0, math.pi, 200)
     psf = motion_psf(np.stack([8 * np.cos(turn), 8 * np.sin(turn)]), None, SMALL, 1.0)
     image, inside = picture(psf.values, psf.origin, (128, 128))

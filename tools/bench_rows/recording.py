@@ -152,8 +152,8 @@ def flipped_bits(effort: Effort) -> Row:
 
 
 def loop_stall(effort: Effort) -> Row:
-    """The longest time that a 1 kHz loop waits for the recorder, in 20 s; and the delays by the machine without a
-    recorder."""
+    """The longest time that a 1 kHz loop waits for the recorder, in 20 s; and the delays that the machine causes
+    without a recorder."""
     with tempfile.TemporaryDirectory() as folder:
         spent = np.array(_session(Path(folder) / "a.mcap", effort.share * _LOOP_S)) * 1e3
     alone = np.array(_loop(effort.share * _LOOP_S, lambda topic, message, now: message.SerializeToString())) * 1e3

@@ -78,8 +78,8 @@ def restoration_uncertainty(effort: Effort) -> list[Row]:
                         ]
                         found = np.vstack([found, each])
                 knowing, believing, exact = found.mean(axis=0)
-                rows.append(Row(f"{method}, range off by {share:.0%}, noise {noise_sd:g}: told so", f"{knowing:.2f} dB",
-                    f"not told {believing:.2f}; no error {exact:.2f}", knowing / believing, 1))  # fmt: skip
+                rows.append(Row(f"{method}, range off by {share:.0%}, noise {noise_sd:g}: stated", f"{knowing:.2f} dB",
+                    f"not stated {believing:.2f}; no error {exact:.2f}", knowing / believing, 1))  # fmt: skip
     return rows
 
 
