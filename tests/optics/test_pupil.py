@@ -194,7 +194,7 @@ def test_a_window_in_the_dark_may_be_missing_or_bright():
     [
         ("obstruction = 0.25", "obstruction = 1.0", "lenslets.obstruction = 1 is a share of the pupil's diameter"),
         ("least_light = 0.4", "least_light = 1.5", "lenslets.least_light = 1.5 is a share of a lenslet"),
-        ("pupil_m = 2.4e-3      # d", "pupil_m = 0.01e-3 # d", "lenslets.least_light = 0.4: no lenslet has that share of light"),
+        ("pupil_m = 2.4e-3      # d", "pupil_m = 0.01e-3 # d", "lenslets.least_light = 0.4: no lenslet has that share"),
         ("pupil_m = 2.4e-3      # d", "# d", "lenslets.obstruction is not a key"),
     ],
 )  # fmt: skip
