@@ -18,7 +18,7 @@ from aolink.errors import IdentificationError
 from aolink.identification.likelihood import Likelihood
 from aolink.identification.models import kinds_of
 from aolink.identification.readings import FEWEST, Readings
-from aolink.identification.search import BLOCK, Space, maxima
+from aolink.identification.search import SHORT_RUN, Space, maxima
 from aolink.numerics.arrays import FloatArray
 
 CANDIDATES = (
@@ -72,7 +72,7 @@ def tried(name: str, space: Callable[[Sequence[str]], Space], seen: Sequence[Rea
             for first in range(0, other.slots - _STRETCH // 2, _STRETCH):
                 stretch = other.part(first, min(first + _STRETCH, other.slots))
                 if stretch.usable.any():
-                    value = of.log_likelihood(best.x, [Likelihood(stretch, BLOCK)]) if best else -math.inf
+                    value = of.log_likelihood(best.x, [Likelihood(stretch, SHORT_RUN)]) if best else -math.inf
                     scores.append(value)
     return Tried(name, len(of.names), np.array(scores))
 

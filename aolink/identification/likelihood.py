@@ -4,9 +4,9 @@ A path theta = r + b + d has the known response r to the inputs, an unknown cons
 disturbance d, a Gaussian process. With y the means of the path over the exposures and s its mean squares about c, as
 measured, p(y, s) = p(y) p(s | y).
 
-p(y) is Gaussian, exactly, and taken over long runs of exposures. Given y in a block of consecutive exposures the path
-is Gaussian, with mean m and covariance S, and each s_j is a quadratic form of it: its mean is that of (m - c)^2 + diag
-S over the exposure's steps, its variance that of 2 S^2 + 4 (m - c) S (m - c) over pairs of them, and its third cumulant
+p(y) is Gaussian, exactly, and taken over long runs of exposures. Given y in a short run of exposures the path is
+Gaussian, with mean m and covariance S, and each s_j is a quadratic form of it: its mean is that of (m - c)^2 + diag S
+over the exposure's steps, its variance that of 2 S^2 + 4 (m - c) S (m - c) over pairs of them, and its third cumulant
 is as exact. p(s | y) is taken as the product of gamma distributions of these cumulants, with the pixels' noise: where a
 spot swings several times in an exposure, its mean square is an exponential variable. So it is a composite likelihood:
 each factor is right or nearly so, but the dependence of the mean squares on each other, given y, is left out. The
@@ -24,7 +24,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import linalg, special
 
-from aolink.estimation.model.quadrature import blocks, gauss
+from aolink.estimation.model.quadrature import equal_parts, gauss
 from aolink.identification.models import DisturbanceProcesses
 from aolink.identification.readings import Readings
 from aolink.numerics.arrays import BoolArray, FloatArray, Indices
@@ -34,9 +34,9 @@ _FEWEST_NODES = 12
 _NODES_PER_CYCLE = 3.2
 """Nodes in an exposure for each cycle of the fastest process in it, beside half of the fewest."""
 _WALK_START = 4.0
-"""Variance of a random walk's start in a block, in squares of half the field."""
-_RUN = 128
-"""Exposures whose means are taken together."""
+"""Variance of a random walk's start in a run of exposures, in squares of half the field."""
+_LONG_RUN = 128
+"""Exposures in a long run, whose means are taken together."""
 _CELLS = np.linspace(0.0, 1.0, 41) ** 1.5
 _SPAN = 5.0
 """Standard deviations that the cells of a gamma distribution reach to on the lower side; 1.6 times as far above."""
@@ -47,12 +47,12 @@ approximation."""
 _RARE, _WIDE = 1e-3, 3.0
 """The share of a wide Gaussian that is mixed into every distribution, and how many times as wide it is."""
 _AT_ONCE = 128
-"""Blocks that are computed together: their data stay in the processor's cache."""
+"""Short runs that are computed together: their data stay in the processor's cache."""
 
 
 @dataclass(frozen=True, eq=False)
-class Blocks:
-    """Readings divided into blocks, (blocks, L), which all have the same pattern of usable exposures."""
+class ShortRuns:
+    """Readings divided into short runs of exposures, (runs, L), which all have the same pattern of usable exposures."""
 
     usable: BoolArray
     """(L,)"""
@@ -61,9 +61,9 @@ class Blocks:
     square_noise: FloatArray
     centre: FloatArray
     response: FloatArray
-    """Response to the inputs at the nodes, (blocks, L, nodes)."""
+    """Response to the inputs at the nodes, (runs, L, nodes)."""
     output: np.ndarray[tuple[int], np.dtype[np.int64]]
-    """The output of each block."""
+    """The output of each run."""
 
 
 class Likelihood:
@@ -74,12 +74,12 @@ class Likelihood:
     seen:
         The readings; all outputs have one model, of which each output is an independent draw.
     length:
-        Exposures in a block.
+        Exposures in a short run.
     """
 
     def __init__(self, seen: Readings, length: int) -> None:
         self.seen, self.length = seen, min(length, seen.slots)
-        self._blocks: dict[int, list[Blocks]] = {}
+        self._short_runs: dict[int, list[ShortRuns]] = {}
         self._means: dict[int, list[tuple[BoolArray, Indices, FloatArray]]] = {}
         good = seen.usable
         self.mean_noise = float(seen.mean_noise[good].mean())
@@ -115,7 +115,7 @@ class Likelihood:
         out = np.zeros(len(self.seen.mean))
         try:
             constants = self._of_means(model, nodes, noise, out)
-            for each in self._groups(nodes):
+            for each in self._in_short_runs(nodes):
                 given = self._given_means(model, nodes, each.usable, noise)
                 np.add.at(out, each.output, given.log_densities(each, constants[each.output], noise, wider))
         except linalg.LinAlgError:
@@ -131,11 +131,11 @@ class Likelihood:
     def _rule(self, nodes: int) -> tuple[FloatArray, FloatArray]:
         """Rows that give a path at the nodes, (nodes, N), and the nodes' weights."""
         n = self.seen.n_steps
-        rule = blocks(n, n) if nodes >= n else gauss(n, nodes)
+        rule = equal_parts(n, n) if nodes >= n else gauss(n, nodes)
         return rule.rows, rule.weights
 
-    def _groups(self, nodes: int) -> list[Blocks]:
-        if nodes not in self._blocks:
+    def _in_short_runs(self, nodes: int) -> list[ShortRuns]:
+        if nodes not in self._short_runs:
             rows, _ = self._rule(nodes)
             seen, L = self.seen, self.length
             response = seen.response[:, :, :-1] @ rows.T
@@ -145,8 +145,8 @@ class Likelihood:
                     some = slice(first, min(first + L, seen.slots))
                     if seen.usable[o, some].any():
                         patterns.setdefault(seen.usable[o, some].tobytes(), []).append((o, some))
-            self._blocks[nodes] = [
-                Blocks(
+            self._short_runs[nodes] = [
+                ShortRuns(
                     usable=seen.usable[where[0]],
                     mean=_taken(seen.mean, where),
                     square=_taken(seen.square, where),
@@ -157,14 +157,14 @@ class Likelihood:
                 )
                 for where in patterns.values()
             ]
-        return self._blocks[nodes]
+        return self._short_runs[nodes]
 
     def _of_means(self, model: DisturbanceProcesses, nodes: int, noise: float, out: FloatArray) -> FloatArray:
         """Add the log-density of each output's means to ``out``; the constants of the outputs that make it largest."""
         rows, weights = self._rule(nodes)
         seen = self.seen
         at = np.asarray(rows @ np.arange(float(seen.n_steps))) * seen.step_s
-        run = min(_RUN, seen.slots)
+        run = min(_LONG_RUN, seen.slots)
         begin = np.arange(float(run)) * (seen.period_steps * seen.step_s)
         table = np.zeros(run)
         for process in model.processes:
@@ -178,7 +178,7 @@ class Likelihood:
             sigma[np.diag_indices(run)] += inside
         top, count = np.zeros(len(out)), np.zeros(len(out))
         whitened = []
-        for usable, output, y in self._runs(nodes, run):
+        for usable, output, y in self._in_long_runs(nodes, run):
             n = np.flatnonzero(usable)
             root = linalg.cholesky(
                 sigma[np.ix_(n, n)] + noise * self.mean_noise * np.eye(len(n)), lower=True, check_finite=False
@@ -196,7 +196,7 @@ class Likelihood:
             np.add.at(out, output, -0.5 * (left**2).sum(axis=0) - scale)
         return constants
 
-    def _runs(self, nodes: int, run: int) -> list[tuple[BoolArray, Indices, FloatArray]]:
+    def _in_long_runs(self, nodes: int, run: int) -> list[tuple[BoolArray, Indices, FloatArray]]:
         """The means without the inputs' response in long runs: usable (run,), outputs (runs,), means (runs, good)."""
         if nodes not in self._means:
             rows, weights = self._rule(nodes)
@@ -258,7 +258,7 @@ def _walk(model: DisturbanceProcesses) -> float:
 
 
 class _GivenMeans:
-    """The path in a block of exposures, given its means over them.
+    """The path in a short run of exposures, given its means over them.
 
     Parameters
     ----------
@@ -285,8 +285,8 @@ class _GivenMeans:
         """S of each exposure, multiplied by the square roots of the nodes' weights on both sides, (good, nodes,
         nodes)."""
 
-    def log_densities(self, data: Blocks, constants: FloatArray, noise: float, wider: float) -> FloatArray:
-        """Log-density of each block's mean squares, (blocks,); ``constants`` b of each block."""
+    def log_densities(self, data: ShortRuns, constants: FloatArray, noise: float, wider: float) -> FloatArray:
+        """Log-density of each run's mean squares, (runs,); ``constants`` b of each run."""
         good, w, S = self.good, self.weights, self.S
         y = data.mean - data.response @ w + data.centre - constants[:, None]
         white = linalg.solve_triangular(self.root, y[:, good].T, lower=True, check_finite=False)

@@ -16,8 +16,8 @@ from aolink.identification.models import PARAMETERS, PLANTS, IdentifiedPlant, Pr
 from aolink.identification.readings import Readings, by_slot
 from aolink.numerics.arrays import FloatArray
 
-BLOCK = 16
-"""Exposures in a block: more of them add little information, and take longer."""
+SHORT_RUN = BLOCK = 16
+"""Exposures in a short run (`Likelihood`): more of them add little information, and take longer."""
 CYCLES = 4.0
 """Highest frequency that is searched, in cycles per exposure."""
 _SPACING = 0.06
@@ -202,7 +202,7 @@ class Maximum:
 
 def maxima(space: Space, seen: Sequence[Readings]) -> list[Maximum]:
     """The local maxima within `KEPT` of the highest, the highest first."""
-    of = [Likelihood(each, BLOCK) for each in seen]
+    of = [Likelihood(each, SHORT_RUN) for each in seen]
     points = [np.array([*point, *[0.0] * (space.with_noise + space.with_kernel)]) for point in _grid(space, seen)]
     points = [np.clip(point, *np.array(space.bounds).T) for point in points]
     values = [space.log_likelihood(point, of) for point in points]

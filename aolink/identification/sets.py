@@ -18,7 +18,7 @@ import numpy as np
 
 from aolink.identification.likelihood import Likelihood
 from aolink.identification.readings import Readings
-from aolink.identification.search import BLOCK, Maximum, Space
+from aolink.identification.search import SHORT_RUN, Maximum, Space
 from aolink.identification.simulate import simulated
 from aolink.numerics.arrays import FloatArray
 
@@ -84,7 +84,7 @@ def identified(
 ) -> tuple[Identified, ...]:
     """The sets of all parameters, from the local maxima, the best first: the highest, or the one that the pixels prefer
     (`pixels`)."""
-    of = [Likelihood(each, BLOCK) for each in seen]
+    of = [Likelihood(each, SHORT_RUN) for each in seen]
     top = found[0]
     curvature = _curvature(space, top, of)
     factors = _factors(space, top, seen, curvature)
@@ -118,7 +118,7 @@ def _allowed(space: Space, top: Maximum, other: Maximum, seen: Sequence[Readings
         drawn = simulated(
             replace(each, response=space.response(other.x, each)), space.model(other.x), _DRAWS, number, noise
         )
-        likelihood = Likelihood(drawn, BLOCK)
+        likelihood = Likelihood(drawn, SHORT_RUN)
         for sign, at in ((1, top), (-1, other)):
             values = space.driven(at.x, likelihood, _DRAWS).of_outputs(space.model(at.x), *space.others(at.x), at.nodes)
             below += sign * values.reshape(_DRAWS, -1).sum(axis=1)
@@ -177,7 +177,7 @@ def _factors(space: Space, top: Maximum, seen: Sequence[Readings], H: FloatArray
         noise, _ = space.others(top.x)
         own = replace(each, response=space.response(top.x, each))
         drawn = simulated(own, space.model(top.x), _DRAWS, number, noise)
-        likelihood = Likelihood(drawn, BLOCK)
+        likelihood = Likelihood(drawn, SHORT_RUN)
         scores = np.empty((n, _DRAWS))
         for k in range(n):
             h = 0.1 / math.sqrt(H[k, k])

@@ -21,7 +21,7 @@ from aolink.estimation import make_estimator
 from aolink.exposure import Exposure
 from aolink.identification import CANDIDATES, PARAMETERS, Readings, kinds_of, readings, rig_model
 from aolink.identification.likelihood import Likelihood
-from aolink.identification.search import BLOCK
+from aolink.identification.search import SHORT_RUN
 from aolink.jobs.identify import Result, Tell, Wanted, from_readings, outputs_of
 from aolink.rig import Rig, parse_rig
 
@@ -229,7 +229,7 @@ def _log_likelihood(rig: Rig, seen: Readings) -> float:
     per_copy = rig.plant.n_outputs
     try:
         return sum(
-            Likelihood(seen.of_outputs([output]), BLOCK)(rig_model(rig, output % per_copy))
+            Likelihood(seen.of_outputs([output]), SHORT_RUN)(rig_model(rig, output % per_copy))
             for output in outputs_of(seen, range(rig.n_outputs))
         )
     except IdentificationError:

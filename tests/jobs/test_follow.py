@@ -11,7 +11,7 @@ from aolink.errors import IdentificationError
 from aolink.exposure import Exposure
 from aolink.identification import CANDIDATES, readings, rig_model
 from aolink.identification.likelihood import Likelihood
-from aolink.identification.search import BLOCK
+from aolink.identification.search import SHORT_RUN
 from aolink.jobs.follow import FITTED, HELD_OUT, REPORT, Following, News, Offer, offer_path, with_own_kinds
 from aolink.jobs.identify import Wanted
 from aolink.rig import load_rig, parse_rig
@@ -73,7 +73,7 @@ def test_after_a_line_has_moved_its_new_frequency_is_offered_and_then_fits():
     offered = parse_rig(offer.result.text)
     assert np.array_equal(offered.plant.A[:2, :2], rig.plant.A[:2, :2])
     held = [each for each in exposures if offer.held_out[0] <= each.frame_id <= offer.held_out[1]]
-    alone = Likelihood(readings(rig, held), BLOCK)(rig_model(offered, 0))
+    alone = Likelihood(readings(rig, held), SHORT_RUN)(rig_model(offered, 0))
     assert offer.log_likelihood == pytest.approx(alone, abs=5)
     last = must_be(News, said[-1])
     assert last.fits

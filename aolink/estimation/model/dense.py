@@ -103,7 +103,7 @@ class DenseModel(ExposureModel):
     def responses(self, inputs: FloatArray) -> InputResponse:
         if not (inputs[:, -1].any() or inputs.any()):
             return self._at_rest(len(inputs) * self.plant.axes)
-        found = (self._stepped if self.plant.n_states <= _FEW_STATES else self._by_blocks)(inputs)
+        found = (self._stepped if self.plant.n_states <= _FEW_STATES else self._multiplied)(inputs)
         if not self.moved:
             return found
         # Inputs have done nothing yet in the first step.
@@ -144,8 +144,8 @@ class DenseModel(ExposureModel):
             end=end.T, mean=mean.T, slope=np.moveaxis(slope, -1, 0), square=square.T, whole=path
         )  # fmt: skip
 
-    def _by_blocks(self, inputs: FloatArray) -> InputResponse:
-        """`responses` by products of matrices over blocks of steps."""
+    def _multiplied(self, inputs: FloatArray) -> InputResponse:
+        """`responses` by products of matrices, of many steps at once."""
         path, end = input_response(self.plant, by_axis(self.plant, inputs))
         mean, square = batched.mean_over_path(path), batched.mean_over_path(path * path)
         if self._few is self.plant:

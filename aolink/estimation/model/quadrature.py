@@ -4,8 +4,8 @@ Blur is a mean over the steps, and paths are smooth, so a weighted mean over a f
 moves little, the nodes are those of Gauss's quadrature for a sum over equal steps, exact for polynomials in time of
 degree 2 n - 1 (zeros of Gram's polynomials: Golub & Welsch, Calculation of Gauss quadrature rules, Math. Comp. 23
 (1969)); between two steps the path is a straight line. For a spot that goes back and forth, the nodes are means over
-equal blocks of steps. There are enough nodes for the light of the plant's typical paths to be right to a share of the
-camera's noise; and more for an axis whose predicted path moves further between two nodes than a spot is wide.
+equal parts of the steps. There are enough nodes for the light of the plant's typical paths to be right to a share of
+the camera's noise; and more for an axis whose predicted path moves further between two nodes than a spot is wide.
 """
 
 from __future__ import annotations
@@ -51,8 +51,8 @@ class QuadratureRule:
 
 
 @lru_cache(maxsize=64)
-def blocks(n_steps: int, most: int) -> QuadratureRule:
-    """Means over equal blocks, no more than ``most`` of them; the last may be shorter."""
+def equal_parts(n_steps: int, most: int) -> QuadratureRule:
+    """Means over equal parts of the steps, no more than ``most`` of them; the last may be shorter."""
     length = -(-n_steps // most)
     first = np.arange(0, n_steps, length)
     sizes = np.diff(np.append(first, n_steps))
@@ -152,21 +152,21 @@ def resolution(paths: FloatArray, variance: float, sensor: Sensor) -> Resolution
             left += w * gaussian_below(variance, edges, place)[0]
         return np.diff(left, axis=1) / sensor.pixel_width
 
-    right = light(blocks(n_steps, n_steps))
+    right = light(equal_parts(n_steps, n_steps))
     noise = effective_noise_density(sensor) / sensor.pixel_size + shot_gain(sensor) * np.maximum(right, 0.0)
     seen = float(right.sum()) * sensor.pixel_width
 
     def enough(q: QuadratureRule) -> bool:
         return float(((light(q) - right) ** 2 / noise).sum()) <= _WRONG**2 * seen
 
-    count, found = _LEAST, blocks(n_steps, _MOST)
+    count, found = _LEAST, equal_parts(n_steps, _MOST)
     while count < min(n_steps, _MOST) and seen > _LEAST_LIGHT * len(paths):
-        tried = next((q for q in (gauss(n_steps, count), blocks(n_steps, count)) if enough(q)), None)
+        tried = next((q for q in (gauss(n_steps, count), equal_parts(n_steps, count)) if enough(q)), None)
         if tried is not None:
             found = tried
             break
         count += max(1, count // 6)
     levels = [found]
     while len(levels[-1].weights) < n_steps:
-        levels.append(blocks(n_steps, min(n_steps, 2 * max(len(levels[-1].weights), 8))))
+        levels.append(equal_parts(n_steps, min(n_steps, 2 * max(len(levels[-1].weights), 8))))
     return Resolution(tuple(levels), _STRIDE * math.sqrt(variance + sensor.pixel_width**2 / 12))

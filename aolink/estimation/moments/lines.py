@@ -12,7 +12,7 @@ from aolink.estimation.frames.frame_data import HALF, Flux, Needs, Profile
 from aolink.estimation.frames.moments import LEAST_FLUX
 from aolink.estimation.kalman.gaussian import Gaussian, Update
 from aolink.estimation.model.base import ExposureModel, InputResponse
-from aolink.estimation.model.quadrature import QuadraturePaths, blocks, quadrature_paths
+from aolink.estimation.model.quadrature import QuadraturePaths, equal_parts, quadrature_paths
 from aolink.estimation.moments.windowed import (
     KERNEL_REACH,
     MOST_MEMORY,
@@ -59,7 +59,7 @@ class WindowedMoments:
 
     def update(self, model: ExposureModel, response: InputResponse, prior: Gaussian, measured: Profile) -> Update:
         """Iterated statistical linearisation, from the prior to the posterior."""
-        nodes = quadrature_paths(model, response, blocks(model.n_steps, MOST_NODES))
+        nodes = quadrature_paths(model, response, equal_parts(model.n_steps, MOST_NODES))
         axes, n_states = len(prior.mean), len(model.transition)
         lines = _lines(self.sensor, self.orders, self.basis, self.flux, nodes, measured, n_states, model.end_rows)
         mean, covariance = _contiguous(prior.mean), _contiguous(prior.covariance)

@@ -35,7 +35,7 @@ from aolink.estimation.frames.moments import LEAST_FLUX
 from aolink.estimation.kalman.gaussian import Gaussian, Update
 from aolink.estimation.kalman.update import joseph_update
 from aolink.estimation.model.base import ExposureModel, InputResponse
-from aolink.estimation.model.quadrature import QuadraturePaths, blocks, quadrature_paths
+from aolink.estimation.model.quadrature import QuadraturePaths, equal_parts, quadrature_paths
 from aolink.numerics import batched
 from aolink.numerics.arrays import BoolArray, FloatArray
 from aolink.optics.camera import effective_noise_density
@@ -48,7 +48,7 @@ PASSES = 3
 # Half width of the window beyond the path's mean, in standard deviations of the path, and of the kernel beyond that.
 PATH_REACH = 3.0
 KERNEL_REACH = 2.0
-# The path is averaged over blocks of steps so that there are no more than this; a mean over it stays exact.
+# The path is averaged over equal parts of the steps so that there are no more than this; a mean over it stays exact.
 MOST_NODES = 100
 MOST_MEMORY = 1e3
 # Axes together: more of them do not fit into the processor's cache.
@@ -101,7 +101,7 @@ class Windowed(ABC, Generic[Data]):
 
     def update(self, model: ExposureModel, response: InputResponse, prior: Gaussian, measured: Data) -> Update:
         """Iterated statistical linearisation, from the prior to the posterior."""
-        nodes = quadrature_paths(model, response, blocks(model.n_steps, self.most_nodes))
+        nodes = quadrature_paths(model, response, equal_parts(model.n_steps, self.most_nodes))
         parts = [
             self._update(model, nodes.part(s), prior.part(s), measured.part(s))
             for s in (slice(k, k + _AT_ONCE) for k in range(0, len(prior.mean), _AT_ONCE))

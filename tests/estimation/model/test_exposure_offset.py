@@ -10,7 +10,7 @@ from scipy import linalg
 from aolink.errors import RigError
 from aolink.estimation import exposure_model, run, score
 from aolink.estimation.kalman.path_moments import predicted_moments
-from aolink.estimation.model.quadrature import blocks, quadrature_paths
+from aolink.estimation.model.quadrature import equal_parts, quadrature_paths
 from aolink.optics.frame import frame_density
 from aolink.optics.kernel import exposure_density
 from aolink.rig import Plant, Rig, load_rig, parse_rig
@@ -101,7 +101,7 @@ def test_the_simulated_camera_sees_the_first_and_the_last_step_in_part(offset):
 def test_windowed_moments_expect_what_finer_steps_show():
     rig, offset = shaken(0.75, 8), 0.75
     model = exposure_model(rig.plant, 8, offset)
-    nodes = quadrature_paths(model, model.response(np.zeros((8, 1))), blocks(8, 8))
+    nodes = quadrature_paths(model, model.response(np.zeros((8, 1))), equal_parts(8, 8))
     z = np.zeros(model.n_coefficients)
     z[:2] = 0.1, 20.0
     path = nodes.basis[0] @ z

@@ -33,8 +33,8 @@ def test_gauss_is_exact_for_polynomials(n_steps: int, count: int) -> None:
 
 
 @given(st.integers(1, 300), st.integers(1, 300))
-def test_blocks_of_steps_keep_the_mean_of_a_path(n_steps: int, most: int) -> None:
-    q = quadrature.blocks(n_steps, most)
+def test_equal_parts_of_the_steps_keep_the_mean_of_a_path(n_steps: int, most: int) -> None:
+    q = quadrature.equal_parts(n_steps, most)
     path = np.random.default_rng(n_steps).standard_normal(n_steps)
     assert len(q.weights) <= max(most, 1)
     assert q.at(path) @ q.weights == pytest.approx(path.mean(), abs=1e-12)

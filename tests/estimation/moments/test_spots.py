@@ -13,7 +13,7 @@ from aolink.estimation.frames.frame_data import SpotWindows
 from aolink.estimation.frames.measure import measure
 from aolink.estimation.kalman.filter import BlurFilter
 from aolink.estimation.kalman.gaussian import Gaussian
-from aolink.estimation.model.quadrature import blocks, quadrature_paths
+from aolink.estimation.model.quadrature import equal_parts, quadrature_paths
 from aolink.estimation.moments.spots import WindowedSpots
 from aolink.optics.camera import pixel_noise_sd, shot_gain
 from aolink.optics.plane import exposure_density_2d, pixel_mass_2d
@@ -91,7 +91,7 @@ def spread_prior(rig, share=0.3):
 
 
 def at_prior(rig, observation, prior, model):
-    nodes = quadrature_paths(model, model.response(np.zeros((200, 1))), blocks(200, observation.most_nodes))
+    nodes = quadrature_paths(model, model.response(np.zeros((200, 1))), equal_parts(200, observation.most_nodes))
     spots, (height, width) = observation.spots, rig.sensor.window
     whole = SpotWindows(
         density=np.zeros((1, spots, height, width)), mask=np.ones((1, spots, height, width), dtype=bool)

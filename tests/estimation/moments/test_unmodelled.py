@@ -12,7 +12,7 @@ from aolink.errors import RigError
 from aolink.estimation import Estimate, Status, exposure_model, make_estimator, run, score
 from aolink.estimation.model.dense import DenseModel
 from aolink.estimation.model.factored import FactoredModel
-from aolink.estimation.model.quadrature import blocks, quadrature_paths
+from aolink.estimation.model.quadrature import equal_parts, quadrature_paths
 from aolink.exposure import Exposure
 from aolink.rig import Plant, Rig, load_rig, parse_rig
 from aolink.rig.parts import UnmodelledSlopes
@@ -55,7 +55,7 @@ def test_they_are_one_coefficient_of_each_output_that_lasts_the_whole_exposure(r
     np.testing.assert_allclose(model.end_rows[:, :n], without.end_rows[:, :n])
     np.testing.assert_allclose(model.process_noise, without.process_noise)
     # They last to the end of an exposure that ends between two steps, too.
-    held = quadrature_paths(model, model.response(np.zeros((N_STEPS, rig.n_inputs))), blocks(N_STEPS, 5))
+    held = quadrature_paths(model, model.response(np.zeros((N_STEPS, rig.n_inputs))), equal_parts(N_STEPS, 5))
     np.testing.assert_allclose(np.tensordot(held.weights, held.basis[:, :, n : n + m], axes=(0, 1)), sd * np.eye(m))
 
 

@@ -11,7 +11,7 @@ from aolink.estimation import Status, exposure_model, make_estimator, run, score
 from aolink.estimation.frames.frame_data import Flux, Profile
 from aolink.estimation.kalman.filter import BlurFilter
 from aolink.estimation.kalman.gaussian import Gaussian
-from aolink.estimation.model.quadrature import blocks, quadrature_paths
+from aolink.estimation.model.quadrature import equal_parts, quadrature_paths
 from aolink.estimation.moments.lines import WindowedMoments
 from aolink.estimation.moments.windowed import weighted_sums
 from aolink.optics.camera import pixel_noise_sd, shot_gain, to_counts
@@ -74,7 +74,7 @@ def test_regression_is_that_of_samples(basis):
     model, prior = spread_prior()
     observation = PlainMoments(SENSOR, (0, 1, 2, 3), basis=basis)
     nodes = quadrature_paths(
-        model, model.response(np.zeros((model.n_steps, model.plant.axes))), blocks(model.n_steps, 100)
+        model, model.response(np.zeros((model.n_steps, model.plant.axes))), equal_parts(model.n_steps, 100)
     )
     rows, weights = nodes.basis[0], nodes.weights
     mean = prior.mean @ rows.T
@@ -101,7 +101,7 @@ def test_slope_is_the_derivative_of_what_is_expected():
     model, prior = spread_prior(1)
     observation = PlainMoments(SENSOR)
     nodes = quadrature_paths(
-        model, model.response(np.zeros((model.n_steps, model.plant.axes))), blocks(model.n_steps, 100)
+        model, model.response(np.zeros((model.n_steps, model.plant.axes))), equal_parts(model.n_steps, 100)
     )
     rows, weights = nodes.basis[0], nodes.weights
     spread = rows @ prior.covariance @ rows.T
@@ -148,10 +148,10 @@ def test_noise_of_the_sums_is_that_of_many_frames(photoelectrons):
     np.testing.assert_allclose(noise[0], spread, atol=0.03 * spread.max())
 
 
-def test_blocks_of_steps_keep_the_mean_of_the_path():
+def test_equal_parts_of_the_steps_keep_the_mean_of_the_path():
     model = exposure_model(RIG.plant, 1037)
     nodes = quadrature_paths(
-        model, model.response(np.zeros((model.n_steps, model.plant.axes))), blocks(model.n_steps, 100)
+        model, model.response(np.zeros((model.n_steps, model.plant.axes))), equal_parts(model.n_steps, 100)
     )
     rows, weights = nodes.basis[0], nodes.weights
     assert len(weights) <= 100
