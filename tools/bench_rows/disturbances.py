@@ -54,7 +54,7 @@ def together(parts: Sequence[DisturbanceRun]) -> DisturbanceRun:
 
 
 def line(frequency_hz: float, sd: float, steps: int, seed: int) -> DisturbanceRun:
-    """A resonance that noise drives. Its model is the true one."""
+    """A vibration: a resonance that noise drives. Its model is the true one."""
     model = ProcessSum((Process("resonance", (frequency_hz, DAMPING, sd)),))
     space, random = model.state_space(STEP_S), np.random.default_rng([seed, 1])
     pushes = random.standard_normal((steps, len(space.A))) @ psd_root(space.W).T @ space.B_w.T

@@ -145,9 +145,9 @@ class DisturbanceChange:
 
     name: str
     frequency: float = 1.0
-    """Factor of the line's frequency."""
+    """Factor of the vibration's frequency."""
     sd: float = 1.0
-    """Factor of the gain of all its noise: of the sd of drift and line."""
+    """Factor of the gain of all its noise: of the sd of drift and vibration."""
 
     def rig(self) -> Rig:
         text = load_rig("loop").toml.replace("frequency_hz = 12.0", f"frequency_hz = {12.0 * self.frequency}")
@@ -155,10 +155,10 @@ class DisturbanceChange:
 
 
 _CHANGES = (
-    DisturbanceChange("line 10 % higher", frequency=1.1),
-    DisturbanceChange("line 10 % lower", frequency=0.9),
-    DisturbanceChange("line 20 % higher", frequency=1.2),
-    DisturbanceChange("line 20 % lower", frequency=0.8),
+    DisturbanceChange("vibration 10 % higher", frequency=1.1),
+    DisturbanceChange("vibration 10 % lower", frequency=0.9),
+    DisturbanceChange("vibration 20 % higher", frequency=1.2),
+    DisturbanceChange("vibration 20 % lower", frequency=0.8),
     DisturbanceChange("gain of the noise times 3", sd=3.0),
     DisturbanceChange("gain of the noise by 3", sd=1 / 3),
 )

@@ -78,8 +78,9 @@ def restoration_uncertainty(effort: Effort) -> list[Row]:
                         ]
                         found = np.vstack([found, each])
                 knowing, believing, exact = found.mean(axis=0)
-                rows.append(Row(f"{method}, range off by {share:.0%}, noise {noise_sd:g}: stated", f"{knowing:.2f} dB",
-                    f"not stated {believing:.2f}; no error {exact:.2f}", knowing / believing, 1))  # fmt: skip
+                name = f"{method}, range off by {share:.0%}, noise {noise_sd:g}: range error stated"
+                rows.append(Row(name, f"{knowing:.2f} dB",
+                    f"not stated: {believing:.2f}; no error {exact:.2f}", knowing / believing, 1))  # fmt: skip
     return rows
 
 

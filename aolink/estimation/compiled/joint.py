@@ -21,10 +21,10 @@ def informed(information: FloatArray, patterns: FloatArray, course_of: Indices, 
     """
     for s in range(len(information)):
         for d in range(2):
-            told = information[s, d, course]
+            row = information[s, d, course]
             for k in range(out.shape[1]):
                 c = course_of[k]
-                out[2 * s + d, k] = told[0, c] * patterns[2 * s, k] + told[1, c] * patterns[2 * s + 1, k]
+                out[2 * s + d, k] = row[0, c] * patterns[2 * s, k] + row[1, c] * patterns[2 * s + 1, k]
 
 
 @compiled_sums
@@ -92,7 +92,7 @@ def looked_at(
     m, pixels = courses.shape[1], side * side
     f, J = np.empty((side, side)), np.empty((2 * m, side, side))
     flat, light = J.reshape(2 * m, pixels), f.reshape(pixels)
-    scores, told, weighted = np.empty(pixels), np.empty(pixels), np.empty(pixels)
+    scores, fisher, weighted = np.empty(pixels), np.empty(pixels), np.empty(pixels)
     for s in range(spots):
         f[:] = 0.0
         J[:] = 0.0
@@ -111,7 +111,7 @@ def looked_at(
                             J[m + q, r, c] += z * X[t, s, k, c]
         total, product, quiet = 0.0, 1.0, 1.0 / read[s]
         for p in range(pixels):
-            scores[p] = told[p] = 0.0
+            scores[p] = fisher[p] = 0.0
             if usable[s, p]:
                 grows = gain[s] if light[p] > 0.0 else 0.0
                 R = read[s] + grows * light[p]
@@ -122,13 +122,13 @@ def looked_at(
                     total += math.log(product)
                     product = 1.0
                 scores[p] = e / R + grows * (e * e / R - 1.0) / (2.0 * R)
-                told[p] = 1.0 / R + grows * grows / (2.0 * R * R)
+                fisher[p] = 1.0 / R + grows * grows / (2.0 * R * R)
         log_likelihood[s] = -0.5 * (total + math.log(product))
         for i in range(2 * m):
             pull = 0.0
             for p in range(pixels):
                 pull += flat[i, p] * scores[p]
-                weighted[p] = flat[i, p] * told[p]
+                weighted[p] = flat[i, p] * fisher[p]
             score[s, i] = pull
             for j in range(i + 1):
                 square = 0.0

@@ -175,14 +175,14 @@ def fisher_information(
                 total += math.log(product)
                 product = 1.0
     for i in range(n):
-        told = 0.0
+        summed = 0.0
         for p in range(pixels):
-            told += J[i, pad + p] * scores[0, p]
+            summed += J[i, pad + p] * scores[0, p]
             scores[2, p] = J[i, pad + p] * scores[1, p]
-        pull[i] = told
+        pull[i] = summed
         for j in range(i + 1):
-            told = 0.0
+            summed = 0.0
             for p in range(pixels):
-                told += J[j, pad + p] * scores[2, p]
-            H[i, j] = told
+                summed += J[j, pad + p] * scores[2, p]
+            H[i, j] = summed
     return -0.5 * (total + math.log(product)), square

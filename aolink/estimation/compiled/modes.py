@@ -86,12 +86,12 @@ def innovations_of_lines(
         nis[row] = 0.0
         for d in range(k):
             size = max(values[d], 0.0)
-            moved = told = 0.0
+            moved = pulled = 0.0
             for i in range(n):
                 moved += vectors[d, i] * s[i]
-                told += vectors[d, i] * pull[i]
+                pulled += vectors[d, i] * pull[i]
             # The innovation is zero in a direction about which the pixels have no information.
-            along = told / math.sqrt(size) if size > tells_nothing * values[0] else 0.0
+            along = pulled / math.sqrt(size) if size > tells_nothing * values[0] else 0.0
             value[row, d] = along + math.sqrt(size) * moved
             information[row, d] = size
             nis[row] += value[row, d] * value[row, d] / (1.0 + size)

@@ -113,14 +113,14 @@ class JointMoments(JointObservation):
                 light = (y[lit] / np.sqrt(np.einsum("skk->sk", noise[lit])))[:, 0].min()
                 y, noise, fit = self._spot.ratios(y, noise, fit)
             new = y - fit.expected - batched.matvec(fit.slope, of_spots(prior.mean - t))
-            H, score = _told(paths, fit, noise + memory * fit.remainder, new)
+            H, score = _information_and_score(paths, fit, noise + memory * fit.remainder, new)
             P = covariance_of_information(precision + H)
             t = prior.mean + matmul_one_thread(P, score)
             if to_come:
                 spread = paths.spread(P)
         # The covariance of this one innovation is without the memory.
         own = noise + fit.remainder
-        H, score = _told(paths, fit, own, new)
+        H, score = _information_and_score(paths, fit, own, new)
         weighted = batched.solve(own, new)
         nis = np.asarray((new * weighted).sum() - score @ solve_information(precision + H, score))
         if light is not None and light < LEAST_FLUX:
@@ -135,7 +135,9 @@ def by_spot(measured: SpotWindows, axis: int) -> SpotWindows:
     return SpotWindows(density=measured.density[axis, :, None], mask=measured.mask[axis, :, None], light=light)
 
 
-def _told(paths: JointPaths, fit: Regression, R: FloatArray, new: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _information_and_score(
+    paths: JointPaths, fit: Regression, R: FloatArray, new: FloatArray
+) -> tuple[FloatArray, FloatArray]:
     """Information and score of the coefficients from the sums of all spots."""
     weighted = np.linalg.solve(R, np.concatenate([fit.slope, new[..., None]], axis=2))
     products = batched.transpose(fit.slope) @ weighted
