@@ -50,28 +50,42 @@ class Topic:
     """Whether a rig that gets the same commands again gives the same messages: `aolink replay` to a rig compares
     these."""
     shown_by: str = ""
-    """The function of `aolink.viewing.devices` that shows its messages; '' for none, and for what is shown as the
-    exposures and estimates that it is read as."""
+    """The module of `aolink.viewing` and its function that shows the topic; '' for one that is not in the table.
+    Functions of `devices` get the messages themselves, other ones the exposures, estimates and pictures that the reader
+    makes of them."""
 
 
 TOPICS = (
-    Topic(name=EXPOSURE, message=pb.ExposureInfo, belongs_to="exposure", repeatable=True, shown_by="log_drops"),
-    Topic(name=IMAGE, message=RawImage, belongs_to="exposure", after=EXPOSURE, repeatable=True),
-    Topic(name=COMMAND, message=wire.CommandBlock, belongs_to="steps", repeatable=True, shown_by="log_commands"),
-    Topic(name=APPLIED, message=wire.Applied, belongs_to="steps", repeatable=True, shown_by="log_applied"),
-    Topic(name=SCENE_EXPOSURE, message=pb.ExposureInfo, belongs_to="exposure"),
-    Topic(name=SCENE, message=RawImage, belongs_to="exposure", after=SCENE_EXPOSURE),
-    Topic(name=TRUTH, message=wire.Truth, belongs_to="exposure", repeatable=True),
-    Topic(name=ESTIMATE, message=pb.Estimate, belongs_to="exposure", repeatable=True),
-    Topic(name=ESTIMATION, message=pb.Estimation, belongs_to="exposure", shown_by="log_estimation"),
-    Topic(name=RESTORATION, message=pb.Restoration, belongs_to="exposure"),
-    Topic(name=RESTORED_SCENE, message=RawImage, belongs_to="exposure", after=RESTORATION),
-    Topic(name=RESTORED_SPOTS, message=RawImage, belongs_to="exposure", after=RESTORATION),
-    Topic(name=CONTROL, message=pb.Control, belongs_to="exposure", shown_by="log_control"),
-    Topic(name=LATENCY, message=pb.Latency, belongs_to="exposure", shown_by="log_latency"),
-    Topic(name=LINK, message=pb.LinkStatistics, shown_by="log_link"),
-    Topic(name=CLOCK, message=pb.ClockSample, shown_by="log_clock"),
-    Topic(name=LOG, message=Log, shown_by="log_log"),
+    Topic(name=EXPOSURE, message=pb.ExposureInfo, belongs_to="exposure", repeatable=True, shown_by="devices.log_drops"),
+    Topic(
+        name=IMAGE,
+        message=RawImage,
+        belongs_to="exposure",
+        after=EXPOSURE,
+        repeatable=True,
+        shown_by="camera.log_frames",
+    ),
+    Topic(
+        name=COMMAND, message=wire.CommandBlock, belongs_to="steps", repeatable=True, shown_by="devices.log_commands"
+    ),
+    Topic(name=APPLIED, message=wire.Applied, belongs_to="steps", repeatable=True, shown_by="devices.log_applied"),
+    Topic(name=SCENE_EXPOSURE, message=pb.ExposureInfo, belongs_to="exposure", shown_by="scene.log_scenes"),
+    Topic(name=SCENE, message=RawImage, belongs_to="exposure", after=SCENE_EXPOSURE, shown_by="scene.log_scenes"),
+    Topic(name=TRUTH, message=wire.Truth, belongs_to="exposure", repeatable=True, shown_by="motion.log_truth"),
+    Topic(name=ESTIMATE, message=pb.Estimate, belongs_to="exposure", repeatable=True, shown_by="motion.log_estimates"),
+    Topic(name=ESTIMATION, message=pb.Estimation, belongs_to="exposure", shown_by="devices.log_estimation"),
+    Topic(name=RESTORATION, message=pb.Restoration, belongs_to="exposure", shown_by="scene.log_restored"),
+    Topic(
+        name=RESTORED_SCENE, message=RawImage, belongs_to="exposure", after=RESTORATION, shown_by="scene.log_restored"
+    ),
+    Topic(
+        name=RESTORED_SPOTS, message=RawImage, belongs_to="exposure", after=RESTORATION, shown_by="scene.log_restored"
+    ),
+    Topic(name=CONTROL, message=pb.Control, belongs_to="exposure", shown_by="devices.log_control"),
+    Topic(name=LATENCY, message=pb.Latency, belongs_to="exposure", shown_by="devices.log_latency"),
+    Topic(name=LINK, message=pb.LinkStatistics, shown_by="devices.log_link"),
+    Topic(name=CLOCK, message=pb.ClockSample, shown_by="devices.log_clock"),
+    Topic(name=LOG, message=Log, shown_by="devices.log_log"),
 )
 
 SCHEMAS = {row.message.DESCRIPTOR.full_name: row.message for row in TOPICS}

@@ -133,7 +133,7 @@ class Sender:
         self._skipped = {name: recording.skipped(name) for name in self._names}
         self._scorers = {name: Scorer() for name in self._names}
         self._measuring: set[str] = set()
-        self._shown = [topic for topic in recording.counts if topics.named(topic).shown_by]
+        self._shown = [topic for topic in recording.counts if _shows_messages(topic) is not None]
         self._known: set[str] = set()
         """Entities and kinds of data that have been sent."""
         self._scales: dict[str, float] = {}
@@ -290,7 +290,8 @@ class Sender:
             by_topic.setdefault(record.topic, []).append(record)
         assert self._timebase is not None
         for topic, records in by_topic.items():
-            getattr(devices, topics.named(topic).shown_by)(self._drawing, self._timebase, records)
+            if (shows := _shows_messages(topic)) is not None:
+                shows(self._drawing, self._timebase, records)
         self._known |= by_topic.keys()
 
     def contents(self, other: Sender | None = None) -> Contents:
@@ -366,6 +367,15 @@ class Sender:
         if topics.LATENCY not in known:
             found.append("no latencies")
         return found
+
+
+def _shows_messages(topic: str) -> Callable[[Drawing, Timebase, Sequence[RecordedMessage]], None] | None:
+    """The function of `devices` that a topic's messages are handed to; None for what is shown as exposures, estimates
+    or pictures, or not at all."""
+    module, _, function = topics.named(topic).shown_by.partition(".")
+    shows: Callable[[Drawing, Timebase, Sequence[RecordedMessage]], None] | None
+    shows = getattr(devices, function) if module == "devices" else None
+    return shows
 
 
 def send_camera(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import importlib
 import re
 from pathlib import Path
 
@@ -26,8 +27,20 @@ def test_a_message_has_the_fields_by_which_it_belongs(row: Topic) -> None:
 
 
 def test_every_function_that_shows_messages_of_devices_is_in_the_table() -> None:
-    shown = [row.shown_by for row in TOPICS if row.shown_by]
-    assert sorted(shown) == [name for name in sorted(vars(devices)) if name.startswith("log_")]
+    shown = [row.shown_by for row in TOPICS if row.shown_by.startswith("devices.")]
+    assert sorted(shown) == [f"devices.{name}" for name in sorted(vars(devices)) if name.startswith("log_")]
+
+
+@pytest.mark.parametrize("row", TOPICS, ids=lambda row: row.name)
+def test_every_topic_is_shown_by_a_function_of_the_viewer(row: Topic) -> None:
+    module, function = row.shown_by.split(".")
+    assert callable(getattr(importlib.import_module(f"aolink.viewing.{module}"), function))
+    page = (PACKAGE / "viewing" / "README.md").read_text()
+    assert any(f"`{module}`" in line.split("|")[-2] for line in page.splitlines() if line.startswith("| `"))
+
+
+def test_nothing_shows_a_topic_that_is_not_in_the_table() -> None:
+    assert topics.named("/somebody/elses").shown_by == ""
 
 
 def test_an_estimators_topic_is_found_by_its_prefix() -> None:
