@@ -108,8 +108,8 @@ class Device(Protocol):
         """
 
     def statistics(self) -> dict[str, Any]:
-        """Counts since the session began, by the fields of ``LinkStatistics``; empty for a device without a serial
-        line."""
+        """Counts of what was exchanged with the device, and of what was wrong with it, since the session began, each by
+        its name; empty for a device that counts nothing. The recording has a field of the same name for each."""
 
 
 class Camera(Device, Protocol):
@@ -161,7 +161,7 @@ class Mirror(Device, Protocol):
 
     @property
     def last_sent_ns(self) -> int:
-        """Host time at which the mirror was last sent a packet: its watchdog runs from then."""
+        """Host time at which anything was last sent to the mirror: its watchdog runs from then."""
 
     def since_zero_ns(self, host_ns: int) -> int:
         """Time from the beginning of its fast step 0 to a host time, on the mirror's own clock, ns."""

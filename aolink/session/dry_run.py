@@ -51,8 +51,8 @@ def dry_run(
 ) -> DryRun:
     """Check a session as far as possible without moving the mirror; parameters as for `aolink.session.record`.
 
-    The devices are opened, asked for their identity and their time, and closed. The request for its identity parks a
-    native mirror, and a mirror without a queue is opened at its safe input; nothing else is sent. No file is made.
+    The devices are opened, asked for their time, and closed. Opening parks a mirror that has a queue of its own,
+    and puts one without a queue at its safe input; nothing else is sent. No file is made.
 
     Raises
     ------

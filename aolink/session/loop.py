@@ -278,7 +278,7 @@ class SessionLoop:
         self._journal.log(f"the {device.name} has returned {away_s:.2f} s after its port had vanished", Log.WARNING)
 
     def _go_on_with(self, device: Device) -> None:
-        """Go on with a device that has returned: the request for its identity has stopped or parked it."""
+        """Go on with a device that has returned: it takes no frames, or is parked, since it was opened again."""
         self._returned.remove(device)
         self._absent.remove(device)
         try:
