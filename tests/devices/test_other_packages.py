@@ -30,18 +30,16 @@ EXAMPLE = ROOT / "tests" / "example_package"
 
 
 @pytest.fixture(scope="module")
-def installed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+def installed(with_example: dict[str, str], tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     """The environment of a process in which the example package is installed, and one whose drivers are broken."""
-    folder = tmp_path_factory.mktemp("installed")
-    command = [sys.executable, "-m", "pip", "install", "-q", "--no-deps", "--no-build-isolation", "--no-index"]
-    subprocess.run([*command, "--target", folder, EXAMPLE], check=True)
+    folder = tmp_path_factory.mktemp("broken")
     broken = folder / "broken-1.0.dist-info"
     broken.mkdir()
     (broken / "METADATA").write_text("Metadata-Version: 2.1\nName: broken\nVersion: 1.0\n")
     (broken / "entry_points.txt").write_text(
         "[aolink.cameras]\nbroken = no_such_module:Camera\nbare = contextlib:nullcontext\n"
     )
-    return {**os.environ, "PYTHONPATH": os.pathsep.join([str(folder), str(ROOT)]), "COLUMNS": "200"}
+    return {**with_example, "PYTHONPATH": os.pathsep.join([str(folder), with_example["PYTHONPATH"]]), "COLUMNS": "200"}
 
 
 def rig_file(folder: Path, camera: str = 'driver = "example"', mirror: str = 'driver = "example"') -> Path:
@@ -279,9 +277,7 @@ def test_native_devices_may_stand_in_the_rig_file(aolink: Run, tmp_path: Path) -
     assert len(list(Recording(tmp_path / "a.mcap"))) == 2
 
 
-def test_each_driver_of_the_example_has_at_most_40_lines() -> None:
-    """And the page of the devices shows the mirror as it is."""
+def test_the_page_shows_the_examples_mirror_as_it_is() -> None:
     text = (EXAMPLE / "aolink_example" / "devices.py").read_text()
-    _, mirror, camera = text.split("\nclass ")
-    assert max(len(part.strip().splitlines()) for part in (mirror, camera)) <= 40
+    _, mirror, _ = text.split("\nclass ")
     assert f"class {mirror.rstrip()}\n```" in (ROOT / "aolink" / "devices" / "README.md").read_text()
