@@ -25,7 +25,7 @@ from aolink.estimation import Estimator, make_estimator
 from aolink.exposure import Exposure
 from aolink.identification.likelihood import Likelihood
 from aolink.identification.readings import Readings
-from aolink.identification.search import BLOCK, Maximum, Space, climb
+from aolink.identification.search import SHORT_RUN, Maximum, Space, climb
 from aolink.numerics.arrays import FloatArray
 from aolink.numerics.workers import in_threads
 from aolink.rig import Rig
@@ -135,7 +135,7 @@ def _scan(
     tell: Tell,
 ) -> list[Candidate]:  # fmt: skip
     """The candidates of the vibration whose frequency is parameter k."""
-    of = [Likelihood(each, BLOCK) for each in seen]
+    of = [Likelihood(each, SHORT_RUN) for each in seen]
     period_s, exposure_s = (steps * seen[0].step_s for steps in (seen[0].period_steps, seen[0].n_steps))
     longest = max(_LASTING, _DECAY * len(exposures))
     rounds = 1 + math.ceil(math.log2(longest / _LASTING))

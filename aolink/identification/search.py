@@ -16,7 +16,7 @@ from aolink.identification.models import PARAMETERS, PLANTS, IdentifiedPlant, Pr
 from aolink.identification.readings import Readings, by_slot
 from aolink.numerics.arrays import FloatArray
 
-SHORT_RUN = BLOCK = 16
+SHORT_RUN = 16
 """Exposures in a short run (`Likelihood`): more of them add little information, and take longer."""
 CYCLES = 4.0
 """Highest frequency that is searched, in cycles per exposure."""
