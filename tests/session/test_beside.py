@@ -39,8 +39,8 @@ from aolink.wire import messages_pb2 as wire
 from tests.conftest import Session
 from tests.kinds import messages_of
 
-SLOW = "sampled"
-"""It takes some tenths of a second for an exposure, ..."""
+SLOW = "sampled:particles=20000"
+"""With so many particles it takes some tenths of a second for an exposure, also where processors are fast, ..."""
 FAST = load_rig("section-vi-lively").toml.replace("exposure_steps = 200", "exposure_steps = 50")
 """... of which this rig's camera has 20 a second."""
 EXPOSURES = 40
