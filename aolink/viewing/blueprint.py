@@ -78,8 +78,9 @@ def blueprint(contents: Contents) -> rrb.Blueprint:
         if beliefs := [*_errors(contents), *_nis(contents), *_states(contents), *_maps(contents)]:
             rows.append(rrb.Horizontal(contents=beliefs))
         bottom = _devices(contents)
-        # Loops that are compared come first, and are what such a session is about.
-        shares = [4.0 if contents.loops else 2.0, *[2.0] * (len(bottom) - 2), 3.0]
+        shares = [2.0] * (len(bottom) - 1) + [3.0]
+        if contents.loops:  # they come first, and are what such a session is about
+            shares[0] = 4.0
         rows.append(rrb.Horizontal(contents=bottom, column_shares=shares))
         layout = rrb.Vertical(contents=rows, row_shares=[10, 7, 7] if len(rows) == 3 else [10, 7])
     if contents.scenes:

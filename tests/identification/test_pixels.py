@@ -106,13 +106,16 @@ def test_nothing_is_scanned_where_one_vibration_is_alone_or_there_are_no_pixels(
     def refused(x):
         raise EstimatorError("profile follows the posterior's modes for at most 24 states")
 
+    def unasked(x):
+        raise AssertionError("no rig is wanted")
+
     exposures, highest = frames(2.4, 32), candidate(2.6, 0.0).maximum
     of, seen = space(exposures)
-    assert scanned(of, highest, seen, shaken, []) == []
+    assert scanned(of, highest, seen, unasked, []) == []
     assert scanned(of, highest, seen, refused, exposures) == []
     variance = load_rig("loop").sensor.kernel.variance
     alone = space_of(("resonance",), seen, variance, with_noise=False, with_kernel=False)
-    assert scanned(alone, Maximum(highest.x[2:], 0.0, 12), seen, refused, exposures) == []
+    assert scanned(alone, Maximum(highest.x[2:], 0.0, 12), seen, unasked, exposures) == []
 
 
 @pytest.mark.parametrize(
