@@ -46,7 +46,7 @@ class Options:
     draws: int = 100
     """Points that `profile` and `mixture` draw for importance sampling, in per cent of the usual number: a budget of
     work as well. With 5 an exposure takes a sixth of the time, the estimates have larger errors, and the log-evidence,
-    which is not from these points, can still tell models apart."""
+    which is not from these points, still tells models that differ much apart."""
     particles: int = 2000
     """Number of particles of `sampled`."""
     seed: int = 0
