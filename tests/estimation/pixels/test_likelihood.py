@@ -205,7 +205,7 @@ def test_noise_that_moves_the_mean_of_a_path_visibly_is_kept():
     above, below = (exposure_density(line.kernel, line.edges, places + d) for d in (step, -step))
     information = (((above - below) / (2 * step)) ** 2).sum(axis=1).mean() * line.pixel_size / line.noise_density
     left_out = np.linalg.eigvalsh(mean @ reduced.left_out @ mean.T)
-    assert np.sqrt(left_out.max()) <= 0.26 / np.sqrt(information)
+    assert left_out.max() <= 0.26**2 / information  # rounding may leave even the largest a little below zero
 
 
 def test_both_ends_of_an_exposure_are_as_sure_as_they_are_right_where_a_slow_process_is_the_weaker():
