@@ -49,7 +49,8 @@ _SETTLING = 5
 _LEAST_GAIN = 0.04
 """Least gain, as a share of the slopes' mean square: it is 2 % of their root mean square."""
 _SIGMAS = 2.0
-"""Standard errors by which the gain must exceed that, and by which the estimate of b^2 is reduced."""
+"""Standard errors by which the gain must exceed that, unless the model is known to be wrong, and by which the estimate
+of b^2 is reduced where it is."""
 _SIGMAS_WHERE_IT_FITS = 3.5
 """The number for b^2 where the model is not known to be wrong: the blur of some exposures may follow the mirror by
 chance."""
@@ -236,7 +237,10 @@ class FallBack:
         if len(self._power) < _FEWEST:
             return None
         power, blur = float(np.mean(self._power)), np.array(self._blur)
-        sigmas = _SIGMAS_WHERE_IT_FITS if fit is None or fit.fits else _SIGMAS
+        known_wrong = fit is not None and not fit.fits
+        sigmas = _SIGMAS if known_wrong else _SIGMAS_WHERE_IT_FITS
+        # With a model that is known to be wrong there is no reason to expect more of the one that acts.
+        required = 0.0 if known_wrong and self.acting == self._preferred else _SIGMAS
         is_time = fit is not None and fit.nis_ratio <= TOLERATED_RATIO and self._since >= self._wait
         best, least, gained = "", -_LEAST_GAIN * power, 0.0
         for name in self._rivals:
@@ -247,8 +251,8 @@ class FallBack:
                 mean, error = _difference(judged, 1.0)
             else:
                 continue
-            if mean + _SIGMAS * error < least:
-                best, least, gained = name, mean + _SIGMAS * error, -mean
+            if mean + required * error < least:
+                best, least, gained = name, mean + required * error, -mean
         if not best:
             return None
         before = power + max(float(np.nanmean(blur)), 0.0) if np.isfinite(blur).any() else power

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy import signal
 
 from aolink.control import ControllerRow, Seen, delay_steps
 from aolink.control.fall_back import INTEGRATOR, Rival
@@ -34,6 +35,13 @@ def played(folder: Path, slopes: FloatArray, *parts: str, **changes: str) -> Rig
 def line(frequency_hz: float, exposures: int, amplitude: float = 0.14) -> FloatArray:
     """A vibration, slope units at each fast step."""
     return np.asarray(amplitude * np.sin(2 * math.pi * frequency_hz * 0.001 * np.arange(exposures * STEPS) + 1))
+
+
+def wandering(exposures: int, seed: int) -> FloatArray:
+    """An Ornstein-Uhlenbeck process with a memory of 60 fast steps and a sd of 0.12, slope units at each fast step."""
+    keep = math.exp(-1 / 60)
+    pushes = np.random.default_rng(seed).standard_normal(exposures * STEPS)
+    return np.asarray(signal.lfilter([0.12 * math.sqrt(1 - keep**2)], [1, -keep], pushes))
 
 
 def run(rig: Rig, exposures: int, *, fall_back: bool = True, seed: int = 3) -> list[Closed]:
@@ -88,6 +96,15 @@ def test_a_line_at_another_frequency_than_the_model_has_it_is_left_alone(tmp_pat
     assert act.gained > 0.02
     open_rms = residual(list(closed_loop(rig, "", "", 120, seed=3)), 70)
     assert residual(series, 70) < 1.02 * open_rms < residual(alone, 70)
+
+
+@pytest.mark.parametrize("seed", [5, 6])
+def test_a_model_that_is_known_to_be_wrong_need_not_be_worse_beyond_chance(seed: int, tmp_path: Path) -> None:
+    """The disturbance is faster than the model has it, and innovations show that within 60 exposures. What the others
+    gain is as large, but not significant until 137 exposures or later."""
+    which = acting(run(played(tmp_path, wandering(80, seed), DRIFT, LINE), 80))
+    assert which[:50] == ["lqg"] * 50
+    assert which[-1] != "lqg"
 
 
 def test_a_controller_whose_model_fits_again_acts_again(tmp_path: Path) -> None:

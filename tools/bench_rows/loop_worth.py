@@ -58,7 +58,7 @@ class Cell:
     """Fast steps in an exposure, and from frame to frame."""
     noise: float = 0.02
     """Sd of the centroid's noise (of a sum over all pixels) over that of the path."""
-    estimators: tuple[str, ...] = ("o1", "moments")
+    estimators: tuple[str, ...] = ("o1", "moments", "profile")
     """Estimators with the known model of the disturbance."""
     identified: tuple[str, ...] = ()
     """Estimators with the model that is identified from the past exposures alone."""
@@ -100,21 +100,13 @@ class Cell:
         return parse_rig(identified_text(text, parse_rig(text), [model]))
 
 
-_WITH_PROFILE = ("o1", "moments", "profile")
-HEADLINE = tuple(
-    Cell("own", at, estimators=_WITH_PROFILE, identified=("o1", "profile")) for at in (2.4, 2.7)
-)  # fmt: skip
-# At 3.0 whole periods fit into an exposure: the centroid is zero, and alone the blur has no phase.
+HEADLINE = tuple(Cell("own", at, identified=("o1", "profile")) for at in (2.4, 2.7))
+# At 3.0 whole periods fit into an exposure: the centroid is zero.
 TURBULENCE_AND_LINE = (
-    *(Cell("own", at, estimators=_WITH_PROFILE) for at in (0.6, 1.2, 1.5, 3.0)),
-    *(Cell("own", at) for at in (0.24, 3.3)),
-    *(Cell("hcipy", at) for at in (2.4, 2.7)),
+    *(Cell("own", at) for at in (0.24, 0.6, 1.2, 1.5, 3.0, 3.3)), *(Cell("hcipy", at) for at in (2.4, 2.7)),
 )  # fmt: skip
-LINE = (
-    *(Cell("", at) for at in (0.24, 1.2, 1.5, 2.7, 3.0, 3.3)), Cell("", 2.4, estimators=_WITH_PROFILE),
-    Cell("", 0.6, estimators=_WITH_PROFILE, identified=("o1",)),
-)  # fmt: skip
-TURBULENCE = (Cell("hcipy", 0.0), Cell("own", 0.0, estimators=_WITH_PROFILE, identified=("o1",)))
+LINE = (*(Cell("", at) for at in (0.24, 1.2, 1.5, 2.4, 2.7, 3.0, 3.3)), Cell("", 0.6, identified=("o1",)))
+TURBULENCE = (Cell("hcipy", 0.0), Cell("own", 0.0, identified=("o1",)))
 FACTORS = tuple(
     cell
     for at in (0.6, 2.4)
@@ -181,12 +173,13 @@ class Measured:
     @property
     def goals(self) -> list[Goal]:
         """The goals of the cell, named before anything was measured."""
-        at, found = self.cell.line, []
+        cell, at, found = self.cell, self.cell.line, []
+        as_named = (cell.widths, cell.steps, cell.noise) == (1.5, 50, 0.02)
         if not at:
             found += [Goal(name, "", 1.02) for name in self.ours]
-        elif self.cell.turbulence and at in (2.4, 2.7) and "profile" in self.ours:
-            found += [Goal("identified profile", "", 0.95), Goal("profile", "", 0.95)]
-        elif "profile" in self.ours and 0.6 <= at <= 1.5:
+        elif cell.turbulence and at in (2.4, 2.7) and as_named:
+            found += [Goal(name, "", 0.95) for name in ("identified profile", "profile") if name in self.ours]
+        elif 0.6 <= at <= 1.5 and cell.widths == 1.5:
             found.append(Goal("profile", "o1", 0.9))
         if at and "identified o1" in self.ours:
             found.append(Goal("identified o1", "o1", 1.05))
