@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from aolink.errors import CalibrationError
 from aolink.exposure import Exposure
 from aolink.numerics.arrays import FloatArray
+from aolink.numerics.rms import rms
 from aolink.optics.camera import to_density
 from aolink.optics.centroid import centre_of_gravity
 from aolink.optics.frame import spot_windows
@@ -147,7 +148,7 @@ def measure_interaction(
         matrix=matrix,
         offset=solution[-1],
         singular_values=np.linalg.svd(matrix, compute_uv=False),
-        residual_rms=float(np.sqrt(np.mean(residual**2))),
+        residual_rms=rms(residual),
         sd=noise * np.sqrt(np.diag(np.linalg.inv(design.T @ design))[:-1]),
         exposures=len(u),
     )

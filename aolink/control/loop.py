@@ -18,6 +18,7 @@ from aolink.estimation import Estimate, Needs, Status
 from aolink.estimation.frames.measure import measure
 from aolink.exposure import Exposure
 from aolink.numerics.arrays import FloatArray
+from aolink.numerics.rms import rms
 from aolink.rig import Rig
 
 BLIND_EXPOSURES = 5
@@ -196,8 +197,8 @@ class ControlLoop:
             late=first > end + self.delay_steps,
             state=self.state,
             reason=self.reason,
-            slope_rms=_rms(slopes),
-            path_rms=math.nan if estimate is None else _rms(estimate.path),
+            slope_rms=rms(slopes[np.isfinite(slopes)]),
+            path_rms=math.nan if estimate is None else rms(estimate.path[np.isfinite(estimate.path)]),
             clipped_steps=clipped,
             fit=self.fit,
             acting=self.acting,
@@ -281,8 +282,3 @@ def delay_steps(rig: Rig) -> int:
     """``control.delay_s`` in whole fast steps, at least one: the step after an exposure's last has begun at the
     exposure's end."""
     return max(1, math.ceil(rig.control.delay_s / rig.timing.fast_step_s - 1e-9))
-
-
-def _rms(values: FloatArray) -> float:
-    known = values[np.isfinite(values)]
-    return float(np.sqrt(np.mean(known**2))) if known.size else math.nan

@@ -32,6 +32,8 @@ GROUP = "aolink.estimators"
 DEFAULT_ESTIMATOR = "o3"
 BASELINE_ESTIMATOR = "o1"
 """The estimator that others are compared with: it takes the centroid of a blurred spot alone."""
+LOOP_ESTIMATOR = "moments"
+"""The estimator that serves the controller of a demo, where it can work on the rig."""
 # Spots of one copy of the plant, by `moments`.
 _MOST_SPOTS = 128
 

@@ -13,6 +13,7 @@ from aolink.errors import FrameError
 from aolink.importing.film import Film
 from aolink.importing.frames import FilmLight, mended
 from aolink.numerics.arrays import BoolArray, FloatArray
+from aolink.numerics.rms import rms
 from aolink.optics.maxima import flatten, spread
 
 _SAMPLES, _FEWEST = 49, 9
@@ -66,7 +67,7 @@ def _noise(flat: FloatArray) -> float:
     """
     rest = flat - ndimage.median_filter(flat, 3)
     size = np.abs(rest)
-    return max(spread(rest), float(np.sqrt(np.mean(np.minimum(size, np.quantile(size, 0.9)) ** 2))))
+    return max(spread(rest), rms(np.minimum(size, np.quantile(size, 0.9))))
 
 
 def _always(

@@ -29,6 +29,7 @@ from aolink.importing.frames import (
 from aolink.importing.survey import Survey, reach, spread_in, survey
 from aolink.importing.tracker import WEIGHT, find_objects
 from aolink.numerics.arrays import BoolArray, FloatArray
+from aolink.numerics.rms import rms
 from aolink.optics.centroid import weighted_centroid
 from aolink.optics.maxima import cut_windows
 from aolink.optics.sensor import BaseSensor
@@ -86,7 +87,7 @@ def tracked(
             after = windows.positions(known.places[end : end + 1] if follows else known.places[:0])
             truth = Truth(
                 start_state=_state(rig, path[:, 0]), end_state=_state(rig, after[:, 0] if after.size else None),
-                path=path, path_sd=float(np.sqrt(np.mean(known.place_sd**2))) * sensor.pixel_width,
+                path=path, path_sd=rms(known.place_sd) * sensor.pixel_width,
             )  # fmt: skip
         yield ImportedExposure(frame=frame, inputs=inputs, truth=truth)
 

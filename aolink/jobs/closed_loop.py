@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -14,7 +14,7 @@ from aolink.control import Act, ControllerRow, ControlLoop, State, find_controll
 from aolink.errors import RecordingError
 from aolink.estimation import Driver, Estimate
 from aolink.exposure import Exposure, residual_rms
-from aolink.numerics.arrays import FloatArray
+from aolink.numerics.rms import rms
 from aolink.recording.reader import Recording
 from aolink.rig import Rig
 from aolink.session.replay import would_command
@@ -141,12 +141,7 @@ def replayed(
             runs[name] = residual_rms(each.exposure for each in series)
     return Replayed(
         controller=controller, estimator=served, exposures=len(acts),
-        open_exposures=sum(act.state is not State.CLOSED for act in acts), input_rms=_rms(wanted),
-        difference_rms=_rms(differences), stability=found.text(), seed=seed,
+        open_exposures=sum(act.state is not State.CLOSED for act in acts), input_rms=rms(np.concatenate(wanted)),
+        difference_rms=rms(np.concatenate(differences)), stability=found.text(), seed=seed,
         recorded_rms=residual_rms(recording.exposures()), **runs,
     )  # fmt: skip
-
-
-def _rms(arrays: Sequence[FloatArray]) -> float:
-    values = np.concatenate(arrays)
-    return float(np.sqrt(np.mean(values**2))) if values.size else math.nan

@@ -14,8 +14,10 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from aolink.control.fall_back import INTEGRATOR
 from aolink.errors import AolinkError, DeviceError, ExportError, ViewerError
 from aolink.estimation import estimator_rows
+from aolink.estimation.registry import BASELINE_ESTIMATOR, LOOP_ESTIMATOR
 from aolink.exposure import residual_rms
 from aolink.files import writing
 from aolink.recording.deblur import RestoredCounts, write_deblurred
@@ -26,8 +28,6 @@ from aolink.session import Report, record
 
 _RIG_START_S = 60.0
 _RIG_END_S = 5.0
-_SERVING = ("moments", "o1", "open-loop")
-"""Estimators for the demo's controller: the first that can work on the rig serves it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -146,12 +146,12 @@ def run_demo(
     options = ["--real-time"] if real_time else []
     options += ["--seed", str(seed)] if seed is not None else []
     if control:  # the first one serves the controller
-        serving = next(name for name in _SERVING if name in estimators)
+        serving = LOOP_ESTIMATOR if LOOP_ESTIMATOR in estimators else BASELINE_ESTIMATOR
         estimators = (serving, *(name for name in estimators if name != serving))
     sessions = [("", path, estimators)]
     if control:
-        beside = [("open", "", ()), *([("integrator", "integrator", ())] if control != "integrator" else [])]
-        sessions = [(of, folder / f"{name}.mcap", none) for name, of, none in beside] + [(control, path, estimators)]
+        others = [each for each in ("", INTEGRATOR.name) if each != control]
+        sessions = [(of, folder / f"{of or 'open'}.mcap", ()) for of in others] + [(control, path, estimators)]
     residuals: dict[str, float] = {}
     for of, where, names in sessions:
         what = f"record {of or 'open'}" if control else "record"

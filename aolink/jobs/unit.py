@@ -21,6 +21,7 @@ from aolink.estimation import Driver, Engine, Estimate, Score, Scorer
 from aolink.exposure import Exposure
 from aolink.files import check_target, writing
 from aolink.jobs.tables import COLUMNS, is_table_of, rows_into, table_beside
+from aolink.numerics.rms import rms
 from aolink.recording.editing import recorded_estimate, side_file
 from aolink.recording.reader import Recording
 from aolink.recording.reestimate import check_has_exposures
@@ -151,22 +152,18 @@ def exposure_row(time_ns: int, exposure: Exposure, estimate: Estimate) -> dict[s
         "frame_id": estimate.frame_id, "time_ns": time_ns, "first_step": estimate.first_step,
         "status": estimate.status.name, "reason": estimate.reason,
         "nis": float(estimate.nis[seen].sum()), "nis_degrees": estimate.innovation.shape[1] * int(seen.sum()),
-        "path_rms": _rms(estimate.path), "path_sd": _rms(estimate.path_sd),
+        "path_rms": rms(estimate.path), "path_sd": rms(estimate.path_sd),
         "path_rmse": None, "start_rmse": None, "end_rmse": None,
     }  # fmt: skip
     if truth is not None:
-        row["path_rmse"] = _rms((estimate.path - truth.path)[truth.known])
+        row["path_rmse"] = rms((estimate.path - truth.path)[truth.known])
         for name, error in (
             ("start_rmse", estimate.start_state - truth.start_state),
             ("end_rmse", estimate.end_state - truth.end_state),
         ):
             known = np.isfinite(error).all(axis=1)
-            row[name] = _rms(np.linalg.norm(error[known] if known.any() else error, axis=1))
+            row[name] = rms(np.linalg.norm(error[known] if known.any() else error, axis=1))
     return row
-
-
-def _rms(values: np.ndarray[Any, np.dtype[np.float64]]) -> float:
-    return math.sqrt(float(np.mean(values**2)))
 
 
 def _estimates(recording: Recording, settings: Settings) -> Iterator[tuple[int, Exposure, Estimate]]:

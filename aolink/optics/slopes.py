@@ -14,7 +14,7 @@ from aolink.files import writing
 from aolink.numerics.arrays import FloatArray, IntArray
 from aolink.optics.frame_file import read_frame
 from aolink.optics.lattice import Lattice, find_lattice, match
-from aolink.optics.wavefront import SpotReconstructor, modal_reconstructor, residual_rms, zernike_slopes
+from aolink.optics.wavefront import SpotReconstructor, modal_reconstructor, wavefront_rms, zernike_slopes
 from aolink.optics.zernike import zernike
 
 # Highest fitted Zernike mode by Noll's index, that of the fourth order; fewer modes are fitted where the spots do not
@@ -72,7 +72,7 @@ class FrameSlopes:
     @property
     def rms(self) -> float:
         """Root mean square of the wavefront."""
-        return residual_rms(self.wavefront)
+        return wavefront_rms(self.wavefront)
 
     @property
     def peak_to_valley(self) -> float:

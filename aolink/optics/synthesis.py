@@ -50,7 +50,7 @@ class Psi:
                 raise FrameError("a kernel's image needs two odd sides, light in it, and finer >= 1")
 
 
-def spot_windows(psi: Psi, side: int, path_px: FloatArray) -> FloatArray:
+def light_in_windows(psi: Psi, side: int, path_px: FloatArray) -> FloatArray:
     """Share of each spot's light in the pixels of its window, averaged over its path.
 
     Parameters

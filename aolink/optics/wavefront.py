@@ -146,6 +146,6 @@ def modal_reconstructor(slopes: FloatArray, weights: FloatArray) -> FloatArray:
     return np.asarray(linalg.solve(normal, H.T * both, assume_a="pos"))
 
 
-def residual_rms(wavefront: FloatArray) -> float:
+def wavefront_rms(wavefront: FloatArray) -> float:
     """Standard deviation of a wavefront over the pupil; points that are NaN do not count."""
     return float(wavefront[np.isfinite(wavefront)].std())

@@ -17,6 +17,7 @@ from aolink.exporting.common import Progress, check_frame, no_progress
 from aolink.exposure import Exposure
 from aolink.numerics.arrays import FloatArray, IntArray
 from aolink.numerics.chi_square import chi_square_quantile
+from aolink.numerics.rms import rms
 from aolink.optics.camera import to_density
 from aolink.optics.sensor import BaseSensor, Sensor
 from aolink.plotting.style import TimeUnit, extremes, hides_swings
@@ -202,7 +203,7 @@ class _Gathered:
         for name, estimate in zip(self.names, estimates, strict=True):
             self.status[name].append(_NONE if estimate is None else int(estimate.status))
             self.errors[name].append(
-                np.nan if estimate is None or truth is None else _rms((estimate.path - truth)[known])
+                np.nan if estimate is None or truth is None else rms((estimate.path - truth)[known])
             )
             nis = (np.nan, np.nan)
             if estimate is not None:
@@ -215,9 +216,9 @@ class _Gathered:
             self.nis[name].append(nis)
         last = self.names[-1] if self.names else ""
         about = truth if truth is not None else found.get(last)
-        self.moved.append(np.nan if about is None else _rms((about - about.mean(axis=1, keepdims=True))[known]))
+        self.moved.append(np.nan if about is None else rms((about - about.mean(axis=1, keepdims=True))[known]))
         other = truth if truth is not None else found.get(self.names[0]) if len(self.names) > 1 else None
-        self.apart.append(np.nan if other is None or last not in found else _rms((found[last] - other)[known]))
+        self.apart.append(np.nan if other is None or last not in found else rms((found[last] - other)[known]))
         shown = {name: path[self.output] for name, path in found.items() if np.isfinite(path[self.output]).all()}
         self.column.append((exposure, shown))
         if len(self.column) == self.stride:
@@ -313,7 +314,3 @@ def nis_bounds(degrees_of_freedom: int) -> tuple[float, float]:
     """The bounds of a consistent estimator's NIS in `NIS_COVERAGE` of the exposures (two-sided)."""
     tail = (1 - NIS_COVERAGE) / 2
     return chi_square_quantile(tail, degrees_of_freedom), chi_square_quantile(1 - tail, degrees_of_freedom)
-
-
-def _rms(values: FloatArray) -> float:
-    return float(np.sqrt(np.mean(values**2)))

@@ -16,12 +16,19 @@ from aolink.recording.schemas_pb2 import Estimate as EstimateMessage
 from aolink.recording.schemas_pb2 import ExposureInfo
 
 _LOSSES = (
-    "frames_lost", "frames_incomplete", "scenes_lost", "scenes_incomplete", "packets_missing", "packets_bad_crc",
-    "packets_bad_framing", "packets_bad_payload", "chunks_refused", "steps_late", "steps_refused", "steps_not_reported",
+    "frames_lost", "frames_incomplete", "scenes_lost", "scenes_incomplete", "line_sequence_gaps", "line_bad_crc",
+    "line_bad_framing", "line_bad_payload", "chunks_refused", "steps_late", "steps_refused", "steps_not_reported",
     "steps_clipped", "steps_parked", "ports_vanished", "control_open_exposures", "control_late_exposures",
     "control_misfit_exposures", "control_fall_back_exposures",
 )  # fmt: skip
 """A session's counts of losses and faults."""
+_FORMERLY = {
+    "line_sequence_gaps": "packets_missing",
+    "line_bad_crc": "packets_bad_crc",
+    "line_bad_framing": "packets_bad_framing",
+    "line_bad_payload": "packets_bad_payload",
+}
+"""Their names in older recordings."""
 _ENDS = ("commanded", "applied", "superseded", "late", "refused", "not_reported")
 """Steps that a session commanded, and how they ended: the first is the sum of the others."""
 
@@ -90,12 +97,12 @@ def _gaps_and_estimates(recording: Recording) -> tuple[dict[str, float], dict[st
 
 def _losses(recording: Recording) -> dict[str, int]:
     """The losses in the session, by cause; and those in the file."""
-    counted = {
-        name: int(recording.metadata[name])
-        for name in _LOSSES
-        if recording.metadata.get(name, "0").isdigit() and int(recording.metadata.get(name, "0"))
-    }
-    for name, value in recording.metadata.items():  # exposures, by the estimator that had no time for them
+    known, counted = recording.metadata, {}
+    for name in _LOSSES:
+        value = known.get(name) or known.get(_FORMERLY.get(name, ""), "")
+        if value.isdigit() and int(value):
+            counted[name] = int(value)
+    for name, value in known.items():  # exposures, by the estimator that had no time for them
         if name.startswith("skipped_") and value.isdigit() and int(value):
             counted[name] = int(value)
     if recording.losses:

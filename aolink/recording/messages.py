@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -103,6 +105,25 @@ class RecordedMessages:
     def complete(self) -> bool:
         """Whether the file ends as a recording should."""
         return not self.damage
+
+    @cached_property
+    def digest(self) -> str:
+        """The name of the recording in side files: SHA-256 of its index, which has the place and the length of all
+        records. Where there is no index, it is that of the results of a scan: rig, session, times and counts."""
+        if self.index_digest is None:
+            with open_recording(self.path) as file:
+                summary = read_summary(file)
+            if summary is not None and summary.is_index:
+                self.index_digest = summary.digest
+        if self.index_digest is not None:
+            return self.index_digest
+        facts = [self.rig_text, self.metadata.get("session"), self.start_ns, self.end_ns, sorted(self.counts.items())]
+        return hashlib.sha256(json.dumps(facts).encode()).hexdigest()
+
+    @property
+    def side_of(self) -> str:
+        """The `digest` of the recording that this is a side file of; empty where it is a recording of its own."""
+        return self.metadata.get(topics.SIDE_OF, "")
 
     @cached_property
     def size(self) -> int:

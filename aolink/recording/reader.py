@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import hashlib
 import heapq
-import json
 from collections.abc import Iterator, Sequence
 from functools import cached_property, lru_cache
 from itertools import islice
@@ -26,9 +24,8 @@ from aolink.recording.exposures import Companions, ExposureAssembly
 from aolink.recording.frame_index import FrameIndex, StepRun
 from aolink.recording.messages import END_OF_TIME, RawMessage, RecordedMessage, RecordedMessages, in_time
 from aolink.recording.remote import Url, only_paths
-from aolink.recording.scan import Loss, open_recording, read_summary
+from aolink.recording.scan import Loss
 from aolink.recording.side_files import check_is_side_of
-from aolink.recording.slices import RecordingSlice
 from aolink.recording.sound import what_is_wrong
 from aolink.rig import Rig, parse_rig
 from aolink.series import Series
@@ -112,25 +109,6 @@ class Recording(RecordedMessages, Series):
     def files(self) -> list[Path]:
         """The files of this machine that it is read from: no file made from it may replace them."""
         return only_paths([self.path, *(side.path for side in self._side)])
-
-    @cached_property
-    def digest(self) -> str:
-        """The name of the recording in side files: SHA-256 of its index, which has the place and the length of all
-        records. Where there is no index, it is that of the results of a scan: rig, session, times and counts."""
-        if self.index_digest is None:
-            with open_recording(self.path) as file:
-                summary = read_summary(file)
-            if summary is not None and summary.is_index:
-                self.index_digest = summary.digest
-        if self.index_digest is not None:
-            return self.index_digest
-        facts = [self.rig_text, self.metadata.get("session"), self.start_ns, self.end_ns, sorted(self.counts.items())]
-        return hashlib.sha256(json.dumps(facts).encode()).hexdigest()
-
-    @property
-    def side_of(self) -> str:
-        """The `digest` of the recording that this is a side file of; empty where it is a recording of its own."""
-        return self.metadata.get(topics.SIDE_OF, "")
 
     @property
     def estimators(self) -> list[str]:
@@ -392,6 +370,59 @@ class Recording(RecordedMessages, Series):
             self.schemas = each.schemas | self.schemas
             self.encodings |= each.encodings
         self.rig, self.rig_is_recorded = self._side[0].rig, True
+
+
+class RecordingSlice(Series):
+    """The result of ``recording[10:20]``: these exposures and their estimates, as in the whole recording, bit for bit.
+
+    From a file with an index little more is read than they need. Estimators that are run on a slice begin anew there.
+    """
+
+    def __init__(self, recording: Recording, numbers: range) -> None:
+        if numbers.step < 0:
+            raise ValueError("a recording is read forwards: take a slice with a positive step, and turn its list round")
+        self.recording, self.numbers = recording, numbers
+        self.rig, self.path, self.metadata = recording.rig, recording.path, recording.metadata
+
+    @property
+    def estimators(self) -> list[str]:
+        return self.recording.estimators
+
+    @property
+    def has_truth(self) -> bool:
+        return self.recording.has_truth
+
+    def exposures(self) -> Iterator[Exposure]:
+        for start, stop in self._runs():
+            yield from self.recording.exposures(start, stop)
+
+    def iter_estimates(self, name: str) -> Iterator[Estimate]:
+        for start, stop in self._runs():
+            yield from self.recording.iter_estimates(name, start, stop)
+
+    def _runs(self) -> Iterator[tuple[int, int]]:
+        """First number and end of each run of consecutive numbers."""
+        if self.numbers.step == 1:
+            yield self.numbers.start, self.numbers.stop
+        else:
+            yield from ((number, number + 1) for number in self.numbers)
+
+    def __len__(self) -> int:
+        return len(self.numbers)
+
+    @overload
+    def __getitem__(self, index: int) -> Exposure: ...
+    @overload
+    def __getitem__(self, index: slice) -> RecordingSlice: ...
+    def __getitem__(self, index: int | slice) -> Exposure | RecordingSlice:
+        if isinstance(index, slice):
+            return RecordingSlice(self.recording, self.numbers[index])
+        return self.recording[self.numbers[index]]
+
+    def title(self) -> str:
+        numbers = self.numbers
+        step = f":{numbers.step}" if numbers.step > 1 else ""
+        return f"Recording {self.path.name}[{numbers.start}:{numbers.stop}{step}]"
 
 
 @lru_cache(maxsize=8)

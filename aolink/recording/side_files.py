@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 from aolink.errors import RecordingError
-
-if TYPE_CHECKING:
-    from aolink.recording.reader import Recording
+from aolink.recording.messages import RecordedMessages
 
 
-def check_is_side_of(side: Recording, recording: Recording) -> None:
+def check_is_side_of(side: RecordedMessages, recording: RecordedMessages) -> None:
     """Raise RecordingError where a file does not hold estimates of a recording and nothing else."""
     if not side.side_of:
         raise RecordingError(
@@ -25,7 +21,7 @@ def check_is_side_of(side: Recording, recording: Recording) -> None:
         )
 
 
-def check_stands_alone(recording: Recording) -> None:
+def check_stands_alone(recording: RecordedMessages) -> None:
     """Raise RecordingError for a side file, which shows nothing without its recording."""
     if recording.side_of:
         name = recording.metadata.get("estimated_from", "a recording")

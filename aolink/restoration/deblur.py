@@ -117,7 +117,11 @@ def _unit(image: FloatArray) -> NDArray[np.float32]:
 
 
 def psnr(picture: FloatArray, scene: FloatArray, mask: BoolArray | None = None) -> float:
-    """Peak signal-to-noise ratio, dB, for a peak of one."""
+    """Peak signal-to-noise ratio, dB, for a peak of one; with a mask, of the pixels in it.
+
+    >>> round(psnr(np.array([0.6, 0.0]), np.array([0.5, 1.0]), np.array([True, False])), 9)
+    20.0
+    """
     error = (picture - scene)[... if mask is None else mask]
     return float(-10 * np.log10(np.mean(error**2))) if error.size else math.nan
 

@@ -67,12 +67,8 @@ class Journal:
     def statistics(self, devices: Sequence[Camera | Mirror], now: int) -> None:
         """Record the counts of each device's line."""
         counts = {device.name: device.statistics() for device in devices}
-        report = self.report
-        report.packets_bad_crc = sum(each.get("bad_crc", 0) for each in counts.values())
-        report.packets_bad_framing = sum(each.get("bad_framing", 0) for each in counts.values())
-        report.packets_bad_payload = sum(each.get("bad_payload", 0) for each in counts.values())
-        report.packets_duplicate = sum(each.get("duplicates", 0) for each in counts.values())
-        report.packets_missing = sum(each.get("sequence_gaps", 0) for each in counts.values())
+        for fault in topics.LINE_FAULTS:
+            self.report.line_faults[fault] = sum(each.get(fault, 0) for each in counts.values())
         for name, each in counts.items():
             if each:
                 self.record(topics.LINK, pb.LinkStatistics(device=name, **each), now)

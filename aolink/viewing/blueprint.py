@@ -12,9 +12,9 @@ from aolink.plotting.pupil import MAPS
 from aolink.plotting.style import BAND
 from aolink.recording import topics
 from aolink.rig import Rig
+from aolink.viewing import entities
 from aolink.viewing.camera import HISTORY, profile_bounds
 from aolink.viewing.motion import MOST_STATES
-from aolink.viewing.scene import RESTORED_SCENE, RESTORED_SPOTS, SCENE, TRUE_SCENE
 from aolink.viewing.series import Drawing
 from aolink.viewing.timebase import FAST_STEP, TIME
 
@@ -103,16 +103,16 @@ def _camera(contents: Contents) -> rrb.Container | rrb.View:
             continue
         root, title = each.drawn.root, "Compared: " if each.drawn.root else "Camera: "
         if sensor.directions == 2:
-            shown = ["camera/image", *(f"camera/image/path/{name}" for name in _drawn_paths(each))]
+            shown = [entities.FRAME, *(f"{entities.FRAME}/path/{name}" for name in _drawn_paths(each))]
             views.append(_picture([root + path for path in shown], f"{title}frame (pixels), paths", *sensor.shape))
-        shown = ["camera/history", "camera/history/centroid", "camera/history/now"]
-        shown += [f"camera/history/path/{name}" for name in _drawn_paths(each)]
+        shown = [entities.PAGE, entities.CENTROIDS, entities.ROW_NOW]
+        shown += [f"{entities.PAGE}/path/{name}" for name in _drawn_paths(each)]
         what = "paths in their blur" if sensor.directions == 1 else "one spot along x"
         count = "one exposure" if contents.alone else f"{HISTORY} exposures"
         name = f"{title}{count} (pixels), {what}"
         views.append(_picture([root + path for path in shown], name, HISTORY, sensor.profile.pixels))
         if each.restored_spots:
-            views.append(_picture([root + RESTORED_SPOTS], f"{title}frame restored (pixels)", *sensor.shape))
+            views.append(_picture([root + entities.RESTORED_SPOTS], f"{title}frame restored (pixels)", *sensor.shape))
     if contents.alone and contents.restored_spots:
         return rrb.Horizontal(contents=views)
     return rrb.Tabs(contents=views, active_tab=0) if len(views) > 1 else views[0]
@@ -125,7 +125,11 @@ def _drawn_paths(contents: Contents) -> list[str]:
 
 def _scene(contents: Contents, path: str) -> rrb.View:
     assert contents.rig.scene is not None
-    name = {SCENE: "Scene as it came", RESTORED_SCENE: "Scene restored", TRUE_SCENE: "Scene at rest (truth)"}[path]
+    name = {
+        entities.SCENE: "Scene as it came",
+        entities.RESTORED_SCENE: "Scene restored",
+        entities.TRUE_SCENE: "Scene at rest (truth)",
+    }[path]
     return _picture([path], f"{name} (pixels)", *contents.rig.scene.shape)
 
 
@@ -145,7 +149,7 @@ def _profile(contents: Contents) -> rrb.Container | rrb.View:
         title = "Compared: path" if each.drawn.root else "Path"
         views.append(
             rrb.Spatial2DView(
-                origin=f"{each.drawn.root}profile",
+                origin=each.drawn.root + entities.PROFILE,
                 name=f"{title}; time at a position; intensity (1/slope unit) over slope",
                 visual_bounds=rrb.VisualBounds2D(x_range=x_range, y_range=y_range),
             )
@@ -162,23 +166,23 @@ def _paths(contents: Contents) -> rrb.Container | rrb.View:
     tabs = [
         _lines(
             contents, f"Path, {name} ± {BAND:g} sd (slope units{what})",
-            [*truth, *_path(contents, name), f"path/{name}/band"], window=not contents.alone,
+            [*truth, *_path(contents, name), f"{entities.PATH}/{name}/band"], window=not contents.alone,
         )
         for name in reversed(names)
     ]  # fmt: skip
     if not truth and not names:
-        return rrb.TextDocumentView(origin="session", name="No paths: no estimates, no truth")
+        return rrb.TextDocumentView(origin=entities.SESSION, name="No paths: no estimates, no truth")
     everyone = [path for name in names for path in _path(contents, name)]
     tabs.append(_lines(contents, f"Path, all (slope units{what})", [*truth, *everyone], window=not contents.alone))
     return rrb.Tabs(contents=tabs, active_tab=0)
 
 
-def _path(contents: Contents, name: str, what: str = "path") -> list[str]:
+def _path(contents: Contents, name: str, what: str = entities.PATH) -> list[str]:
     """A path's line with its percentiles, or its range."""
     root = f"{what}/{name}"
     if contents.drawn.swinging.get(root):
         return [f"{root}/range"]
-    line = root if name == "truth" or what != "path" else f"{root}/mean"
+    line = root if name == "truth" or what != entities.PATH else f"{root}/mean"
     return [line, f"{line}/axes"]
 
 
@@ -186,14 +190,15 @@ def _errors(contents: Contents) -> list[rrb.Container | rrb.View]:
     if not contents.truth or not contents.estimators:
         return []
     names = contents.estimators
-    every_step = [path for n in names for path in _path(contents, n, "error/path")]
+    every_step = [path for n in names for path in _path(contents, n, entities.PATH_ERROR)]
+    rms = [f"{entities.RMS_ERROR}/{n}" for n in names]
     views = [
-        _lines(contents, "Path error, RMS an exposure (slope units)", _with_axes(f"error/path_rms/{n}" for n in names)),
+        _lines(contents, "Path error, RMS an exposure (slope units)", _with_axes(rms)),
         _lines(contents, "Path error at fast steps (slope units)", every_step, window=True),
         *[
             _lines(
                 contents, f"End state x{i + 1} error (plant's units)",
-                _with_axes(f"error/end/x{i + 1}/{n}" for n in names),
+                _with_axes(f"{entities.END_ERROR}/x{i + 1}/{n}" for n in names),
             )
             for i in range(_states_of(contents))
         ],
@@ -202,7 +207,8 @@ def _errors(contents: Contents) -> list[rrb.Container | rrb.View]:
 
 
 def _nis(contents: Contents) -> list[rrb.View]:
-    shown = [p for n in contents.measuring for p in (f"nis/{n}/value", f"nis/{n}/value/axes", f"nis/{n}/bounds")]
+    roots = [f"{entities.NIS}/{name}" for name in contents.measuring]
+    shown = [path for root in roots for path in (f"{root}/value", f"{root}/value/axes", f"{root}/bounds")]
     return [_lines(contents, f"NIS (no unit) with its {NIS_COVERAGE:.0%} bounds", shown)] if shown else []
 
 
@@ -211,7 +217,7 @@ def _states(contents: Contents) -> list[rrb.Container]:
     tabs = []
     for where in ("end", "start"):
         for i in range(_states_of(contents) if names else 0):
-            root = f"state/{where}/x{i + 1}"
+            root = f"{entities.STATE}/{where}/x{i + 1}"
             shown = [f"{root}/truth"] if contents.truth else []
             shown += [f"{root}/{n}/mean" for n in names]
             shown = [*_with_axes(shown), f"{root}/{contents.focus}/band"]
@@ -233,39 +239,39 @@ def _maps(contents: Contents) -> list[rrb.Container]:
             end = f"{contents.maps[name]:.2g}"
             low = f"-{end}" if colours == "RdBu_r" else "0"
             words = f"{title[0].upper()}{title[1:]} ({unit}), {low} to {end}"
-            views.append(_picture([f"pupil/{name}"], words, *contents.rig.sensor.grid))
+            views.append(_picture([f"{entities.PUPIL}/{name}"], words, *contents.rig.sensor.grid))
     return [rrb.Grid(contents=views, grid_columns=2)]
 
 
 def _devices(contents: Contents) -> list[rrb.Container | rrb.View]:
     views: list[rrb.Container | rrb.View] = []
     if contents.loops:
-        shown = [f"residual/{name}" for name in contents.loops]
+        shown = [f"{entities.RESIDUAL}/{name}" for name in contents.loops]
         views.append(_lines(contents, "Residual of each loop, RMS an exposure (slope units)", shown, legend=True))
     if contents.topics & {topics.COMMAND, topics.APPLIED}:
         shown = [
-            path for topic, path in ((topics.COMMAND, "mirror/command"), (topics.APPLIED, "mirror/applied"))
+            path for topic, path in ((topics.COMMAND, entities.COMMAND), (topics.APPLIED, entities.APPLIED))
             if topic in contents.topics
         ]  # fmt: skip
         views.append(_lines(contents, "Mirror input (mirror's units)", _with_axes(shown), legend=True))
     if topics.CONTROL in contents.topics:
         loop = [
-            ("Loop: residual (slope units)", ["control/slope_rms", "control/path_rms"]),
-            ("Loop: delay (ms)", ["control/delay"]),
-            ("Loop: steps clipped (count)", ["control/clipped"]),
+            ("Loop: residual (slope units)", [f"{entities.CONTROL}/slope_rms", f"{entities.CONTROL}/path_rms"]),
+            ("Loop: delay (ms)", [f"{entities.CONTROL}/delay"]),
+            ("Loop: steps clipped (count)", [f"{entities.CONTROL}/clipped"]),
         ]
         lines = [_lines(contents, title, shown, legend=True) for title, shown in loop]
         views.append(rrb.Tabs(contents=lines, active_tab=0))
     if topics.LATENCY in contents.topics:
-        views.append(_lines(contents, "Latency since exposure end (ms)", ["latency/**"], legend=True))
-    health = [_lines(contents, "Lost since start (count)", ["link/lost/**"], legend=True)]
+        views.append(_lines(contents, "Latency since exposure end (ms)", [f"{entities.LATENCY}/**"], legend=True))
+    health = [_lines(contents, "Lost since start (count)", [f"{entities.LOST}/**"], legend=True)]
     if topics.LINK in contents.topics:
-        lost = ["link/lost/**", "link/faults/camera", "link/faults/mirror"]
+        lost = [f"{entities.LOST}/**", f"{entities.FAULTS}/camera", f"{entities.FAULTS}/mirror"]
         health = [
             _lines(contents, "Lost and faulty since start (count)", lost, legend=True),
-            _lines(contents, "Link faults by cause (count)", ["link/faults/**"], legend=True),
-            _lines(contents, "Command round trip (ms)", ["link/round_trip/**"], legend=True),
-            _lines(contents, "Received (kB/s)", ["link/received/**"], legend=True),
+            _lines(contents, "Link faults by cause (count)", [f"{entities.FAULTS}/**"], legend=True),
+            _lines(contents, "Command round trip (ms)", [f"{entities.ROUND_TRIP}/**"], legend=True),
+            _lines(contents, "Received (kB/s)", [f"{entities.RECEIVED}/**"], legend=True),
         ]
     if topics.EXPOSURE in contents.topics:
         views.append(rrb.Tabs(contents=health, active_tab=0))
@@ -276,21 +282,21 @@ def _devices(contents: Contents) -> list[rrb.Container | rrb.View]:
             ("frequency", "Clock rate (ppm)"),
             ("round_trip", "Clock round trip (µs)"),
         ]
-        lines = [_lines(contents, title, [f"clock/{name}/**"], legend=True) for name, title in clocks]
+        lines = [_lines(contents, title, [f"{entities.CLOCK}/{name}/**"], legend=True) for name, title in clocks]
         views.append(rrb.Tabs(contents=lines, active_tab=0))
-    views.append(rrb.StateTimelineView(origin="status", name="Exposures, status of estimators and mirror"))
+    views.append(rrb.StateTimelineView(origin=entities.STATUS, name="Exposures, status of estimators and mirror"))
     views.append(_texts(contents))
     return views
 
 
 def _texts(contents: Contents) -> rrb.Container:
-    texts: list[rrb.View] = [rrb.TextDocumentView(origin="session", name="Session")]
+    texts: list[rrb.View] = [rrb.TextDocumentView(origin=entities.SESSION, name="Session")]
     if contents.warnings:
-        texts.append(rrb.TextLogView(origin="warnings", name="Warnings"))
+        texts.append(rrb.TextLogView(origin=entities.WARNINGS, name="Warnings"))
     if topics.LOG in contents.topics:
-        texts.append(rrb.TextLogView(origin="log", name="Log"))
+        texts.append(rrb.TextLogView(origin=entities.LOG, name="Log"))
     if contents.compared:
-        texts.append(rrb.TextDocumentView(origin=f"{contents.compared.drawn.root}session", name="Compared"))
+        texts.append(rrb.TextDocumentView(origin=contents.compared.drawn.root + entities.SESSION, name="Compared"))
     return rrb.Tabs(contents=texts, active_tab=0)
 
 

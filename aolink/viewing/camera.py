@@ -23,6 +23,7 @@ from aolink.numerics.arrays import FloatArray
 from aolink.optics.camera import pixel_noise_sd, to_density
 from aolink.optics.sensor import BaseSensor, Sensor
 from aolink.plotting.style import extremes, hides_swings
+from aolink.viewing.entities import CENTROIDS, FRAME, PAGE, PROFILE, ROW_NOW
 from aolink.viewing.palette import MEASURED, MISSING, NOTHING, TRUTH
 from aolink.viewing.series import POINTS, Drawing
 from aolink.viewing.timebase import Timebase
@@ -88,9 +89,9 @@ def log_frames(drawing: Drawing, timebase: Timebase, exposures: Sequence[Exposur
     """Frames as the camera sent them, in counts: ``/camera/image``. All have one shape."""
     rows, columns = exposures[0].pixels.shape
     layout = rr.components.ImageFormat(width=columns, height=rows, color_model="L", channel_datatype="U16")
-    drawing.log("camera/image", rr.Image.from_fields(format=layout))
+    drawing.log(FRAME, rr.Image.from_fields(format=layout))
     buffers = np.stack([e.pixels.astype("<u2").ravel().view(np.uint8) for e in exposures])
-    _send_at_starts(drawing, "camera/image", timebase, exposures, rr.Image.columns(buffer=buffers))
+    _send_at_starts(drawing, FRAME, timebase, exposures, rr.Image.columns(buffer=buffers))
 
 
 def one_profile(sensor: BaseSensor, exposures: Sequence[Exposure], output: int) -> list[Exposure]:
@@ -124,7 +125,7 @@ def log_spot_paths(
         inside = np.clip((path[:, some] - sensor.field[0]) / sensor.pixel_width, 0, width)
         spots = inside.reshape(sensor.spots, 2, -1).swapaxes(1, 2) + corner[:, None]
         strips.append(list(spots[np.isfinite(spots).all(axis=(1, 2))].astype(np.float32)))
-    _send_strips(drawing, f"camera/image/path/{name}", timebase, known, strips, colour_of(name), 1.5)
+    _send_strips(drawing, f"{FRAME}/path/{name}", timebase, known, strips, colour_of(name), 1.5)
 
 
 def page_of(exposure: Exposure, first_frame: int) -> int:
@@ -161,18 +162,18 @@ def log_page(
     picture[: rows[-1] if until is None else max(0, until - origin)] = MISSING
     picture[rows] = shades
     layout = rr.components.ImageFormat(width=n, height=HISTORY, color_model="RGB", channel_datatype="U8")
-    drawing.log("camera/history", rr.Image.from_fields(format=layout))
+    drawing.log(PAGE, rr.Image.from_fields(format=layout))
     shown = [at or exposures[0]]
-    _send_at_starts(drawing, "camera/history", timebase, shown, rr.Image.columns(buffer=picture.reshape(1, -1)))
+    _send_at_starts(drawing, PAGE, timebase, shown, rr.Image.columns(buffer=picture.reshape(1, -1)))
     slopes = [
         centroid(sensor, p) if e.slopes is None else e.slopes[drawing.chosen.outputs[0]]
         for e, p in zip(exposures, profiles, strict=True)
     ]
     points = np.stack([(np.array(slopes) - sensor.field[0]) / sensor.pixel_width, np.array(rows) + 0.5], axis=1)
     look = rr.Points2D.from_fields(colors=(235, 235, 235), radii=rr.Radius.ui_points(2.5))
-    drawing.log("camera/history/centroid", look)
+    drawing.log(CENTROIDS, look)
     columns = rr.Points2D.columns(positions=points.astype(np.float32)).partition([len(points)])
-    _send_at_starts(drawing, "camera/history/centroid", timebase, shown, columns)
+    _send_at_starts(drawing, CENTROIDS, timebase, shown, columns)
     for name, by_frame in paths.items():
         strips = []
         for row, exposure in zip(rows, exposures, strict=True):
@@ -187,7 +188,7 @@ def log_page(
                     x = np.clip((edge - sensor.field[0]) / sensor.pixel_width, 0, n)
                     strips.append(np.stack([x, row + places], axis=1).astype(np.float32))
         if strips:
-            _send_strips(drawing, f"camera/history/path/{name}", timebase, shown, [strips], colour_of(name), 1.5)
+            _send_strips(drawing, f"{PAGE}/path/{name}", timebase, shown, [strips], colour_of(name), 1.5)
 
 
 def log_now(drawing: Drawing, sensor: Sensor, timebase: Timebase, exposures: Sequence[Exposure]) -> None:
@@ -195,7 +196,7 @@ def log_now(drawing: Drawing, sensor: Sensor, timebase: Timebase, exposures: Seq
     corners = np.array([(0, 0), (sensor.pixels, 0), (sensor.pixels, 1), (0, 1), (0, 0)], dtype=np.float32)
     rows = [(e.frame_id - timebase.frame_id) % HISTORY for e in exposures]
     strips = [[corners + np.array((0, row), dtype=np.float32)] for row in rows]
-    _send_strips(drawing, "camera/history/now", timebase, exposures, strips, (235, 235, 235), 1.0)
+    _send_strips(drawing, ROW_NOW, timebase, exposures, strips, (235, 235, 235), 1.0)
 
 
 def log_profile_axes(drawing: Drawing, sensor: Sensor, top: float, names: Sequence[str]) -> None:
@@ -211,7 +212,7 @@ def log_profile_axes(drawing: Drawing, sensor: Sensor, top: float, names: Sequen
     grid += [panel(np.array([(low, y), (high, y)])) for panel in edges for y in (0.0, 1.0)]
     grid += [place.intensity(np.array([(low, y / top), (high, y / top)])) for y in heights[1:]]
     fine = rr.Radius.ui_points(0.5)
-    drawing.log("profile/axes", rr.LineStrips2D(grid, colors=(90, 90, 90), radii=fine, draw_order=1.0))
+    drawing.log(f"{PROFILE}/axes", rr.LineStrips2D(grid, colors=(90, 90, 90), radii=fine, draw_order=1.0))
     left = low - 0.05 * (high - low)
     below = place.depth / top + 0.08
     places = [place.intensity(np.array([(x, -below)])) for x in slopes]
@@ -220,12 +221,12 @@ def log_profile_axes(drawing: Drawing, sensor: Sensor, top: float, names: Sequen
     points = rr.Points2D(
         np.concatenate(places), labels=numbers, radii=rr.Radius.ui_points(0), colors=(140, 140, 140), show_labels=True
     )
-    drawing.log("profile/axes/numbers", points)
+    drawing.log(f"{PROFILE}/axes/numbers", points)
     shown = ["measured", *names]
     colours = [MEASURED, *map(colour_of, names)]
     at = [place.key(k) for k in range(len(shown))]
     named = rr.Points2D(at, labels=shown, colors=colours, radii=rr.Radius.ui_points(0), show_labels=True)
-    drawing.log("profile/key", named)
+    drawing.log(f"{PROFILE}/key", named)
 
 
 def log_measured_profile(
@@ -236,7 +237,7 @@ def log_measured_profile(
     slopes = np.repeat(sensor.edges, 2)[1:-1]
     seen = [np.repeat(np.nan_to_num(density(sensor, e)), 2) / top for e in exposures]
     strips = [[place.intensity(np.stack([slopes, each], axis=1))] for each in seen]
-    _send_strips(drawing, "profile/measured", timebase, exposures, strips, MEASURED, 1.0)
+    _send_strips(drawing, f"{PROFILE}/measured", timebase, exposures, strips, MEASURED, 1.0)
 
 
 def log_path_profile(
@@ -260,9 +261,9 @@ def log_path_profile(
         stairs.append([place.histogram(_histogram(sensor, path, _LIGHT * top))])
         predicted = light * _predicted(sensor, edges, path) / top
         profiles.append([place.intensity(np.stack([centres, np.minimum(predicted, _MOST)], axis=1))])
-    _send_strips(drawing, f"profile/path/{name}", timebase, known, lines, colour, 1.2)
-    _send_strips(drawing, f"profile/histogram/{name}", timebase, known, stairs, colour, 1.2)
-    _send_strips(drawing, f"profile/predicted/{name}", timebase, known, profiles, colour, 1.5)
+    _send_strips(drawing, f"{PROFILE}/path/{name}", timebase, known, lines, colour, 1.2)
+    _send_strips(drawing, f"{PROFILE}/histogram/{name}", timebase, known, stairs, colour, 1.2)
+    _send_strips(drawing, f"{PROFILE}/predicted/{name}", timebase, known, profiles, colour, 1.5)
 
 
 def profile_bounds(sensor: Sensor, top: float, names: int) -> tuple[tuple[float, float], tuple[float, float]]:

@@ -10,13 +10,15 @@ import rerun as rr
 
 from aolink.colours import estimator_colour
 from aolink.plotting.devices import LATENCY_STEPS
-from aolink.recording import schemas_pb2
+from aolink.recording import schemas_pb2, topics
+from aolink.viewing import entities
+from aolink.viewing.entities import CLOCK, CONTROL, ESTIMATION, FAULTS, LATENCY, LOG, LOST, RECEIVED, ROUND_TRIP, STATUS
 from aolink.viewing.palette import APPLIED, COMMANDED, series_colour
 from aolink.viewing.series import Drawing, Style, send_axes, send_line, send_states, some_rows
 from aolink.viewing.timebase import Timebase
 from aolink.wire.messages_pb2 import Applied
 
-LINK_COUNTS = ("bad_crc", "bad_framing", "bad_payload", "sequence_gaps", "duplicates", "retransmits", "reports_asked")
+LINK_COUNTS = (*topics.LINE_FAULTS, "retransmits", "reports_asked")
 """Fields of LinkStatistics that count faults."""
 
 _MOST_INPUTS = 2
@@ -38,7 +40,7 @@ class Timed(Protocol):
 def log_commands(drawing: Drawing, timebase: Timebase, records: Sequence[Timed]) -> None:
     """Commands as sent (CommandBlock), at every fast step: ``/mirror/command``, in the mirror's unit."""
     blocks = [r.message for r in records]
-    _send_blocks(drawing, "mirror/command", timebase, blocks, Style("commanded", COMMANDED, width=1.0, steps=True))
+    _send_blocks(drawing, entities.COMMAND, timebase, blocks, Style("commanded", COMMANDED, width=1.0, steps=True))
 
 
 def log_applied(drawing: Drawing, timebase: Timebase, records: Sequence[Timed]) -> None:
@@ -48,10 +50,10 @@ def log_applied(drawing: Drawing, timebase: Timebase, records: Sequence[Timed]) 
     blocks = sorted((r.message for r in records if r.message.source != Applied.AWAITED), key=lambda b: b.first_step)
     if not blocks:
         return
-    _send_blocks(drawing, "mirror/applied", timebase, blocks, Style("applied", APPLIED, width=3.5, steps=True))
+    _send_blocks(drawing, entities.APPLIED, timebase, blocks, Style("applied", APPLIED, width=3.5, steps=True))
     sources = Applied.Source.DESCRIPTOR.values_by_number
     names = [sources[b.source].name if b.source in sources else f"UNKNOWN {b.source}" for b in blocks]
-    send_states(drawing, "status/mirror", timebase, [b.first_step for b in blocks], names)
+    send_states(drawing, f"{STATUS}/mirror", timebase, [b.first_step for b in blocks], names)
 
 
 def log_latency(drawing: Drawing, timebase: Timebase, records: Sequence[Timed]) -> None:
@@ -66,7 +68,7 @@ def log_latency(drawing: Drawing, timebase: Timebase, records: Sequence[Timed]) 
         milliseconds = [(t - m.exposure_end_ns) / 1e6 if t else np.nan for t, m in zip(at, latencies, strict=True)]
         if not np.isnan(milliseconds).all():
             send_line(
-                drawing, f"latency/{field.removesuffix('_ns')}", times, milliseconds, Style(name, series_colour(i))
+                drawing, f"{LATENCY}/{field.removesuffix('_ns')}", times, milliseconds, Style(name, series_colour(i))
             )
 
 
@@ -76,7 +78,7 @@ def log_estimation(drawing: Drawing, timebase: Timebase, records: Sequence[Timed
     if made:
         times = timebase.at_frames([m.frame_id for m in made])
         style = Style(f"{name} takes", estimator_colour(name))
-        send_line(drawing, f"latency/estimation/{name}", times, [m.took_ns / 1e6 for m in made], style)
+        send_line(drawing, f"{ESTIMATION}/{name}", times, [m.took_ns / 1e6 for m in made], style)
 
 
 def log_drops(drawing: Drawing, timebase: Timebase, records: Sequence[Timed]) -> None:
@@ -85,8 +87,8 @@ def log_drops(drawing: Drawing, timebase: Timebase, records: Sequence[Timed]) ->
     times = timebase.at_steps([m.first_step for m in infos], [m.frame_id for m in infos])
     frames = np.cumsum([m.frames_lost_before for m in infos])
     chunks = np.cumsum([m.chunks_lost for m in infos])
-    send_line(drawing, "link/lost/frames", times, frames, Style("frames lost", (240, 80, 80), width=2.5, steps=True))
-    send_line(drawing, "link/lost/chunks", times, chunks, Style("chunks lost", (250, 170, 90), steps=True))
+    send_line(drawing, f"{LOST}/frames", times, frames, Style("frames lost", (240, 80, 80), width=2.5, steps=True))
+    send_line(drawing, f"{LOST}/chunks", times, chunks, Style("chunks lost", (250, 170, 90), steps=True))
 
 
 def log_link(drawing: Drawing, timebase: Timebase, records: Sequence[Timed]) -> None:
@@ -100,23 +102,21 @@ def log_link(drawing: Drawing, timebase: Timebase, records: Sequence[Timed]) -> 
         times = timebase.at_host(host)
         total = [sum(getattr(r.message, field) for field in LINK_COUNTS) for r in samples]
         send_line(
-            drawing, f"link/faults/{device}", times, total, Style(f"{device} link faults", series_colour(d), steps=True)
+            drawing, f"{FAULTS}/{device}", times, total, Style(f"{device} link faults", series_colour(d), steps=True)
         )
         for i, field in enumerate(LINK_COUNTS):
             counts = [getattr(r.message, field) for r in samples]
             if not any(counts):
                 continue
             style = Style(f"{device} {field.replace('_', ' ')}", series_colour(i), width=2.5 - d, steps=True)
-            send_line(drawing, f"link/faults/{device}/{field}", times, counts, style)
+            send_line(drawing, f"{FAULTS}/{device}/{field}", times, counts, style)
         trip = np.array([r.message.round_trip_s for r in samples]) * 1e3
         if not np.isnan(trip).all():
-            send_line(
-                drawing, f"link/round_trip/{device}", times, trip, Style(f"{device} round trip", series_colour(d))
-            )
+            send_line(drawing, f"{ROUND_TRIP}/{device}", times, trip, Style(f"{device} round trip", series_colour(d)))
         if len(samples) > 1:
             rate = np.diff([r.message.bytes_received for r in samples]) / np.maximum(np.diff(host), 1) * 1e6
             style = Style(f"{device} to host", series_colour(d))
-            send_line(drawing, f"link/received/{device}", timebase.at_host(host[1:]), rate, style)
+            send_line(drawing, f"{RECEIVED}/{device}", timebase.at_host(host[1:]), rate, style)
 
 
 def log_clock(drawing: Drawing, timebase: Timebase, records: Sequence[Timed]) -> None:
@@ -135,7 +135,7 @@ def log_clock(drawing: Drawing, timebase: Timebase, records: Sequence[Timed]) ->
             ("frequency", "runs fast by", np.array([m.frequency_ppm for m in messages])),
             ("round_trip", "round trip", np.array([m.round_trip_ns for m in messages]) / 1e3),
         ):
-            send_line(drawing, f"clock/{name}/{device}", times, values, Style(f"{device} {label}", series_colour(d)))
+            send_line(drawing, f"{CLOCK}/{name}/{device}", times, values, Style(f"{device} {label}", series_colour(d)))
 
 
 def log_log(drawing: Drawing, timebase: Timebase, records: Sequence[Timed]) -> None:
@@ -143,7 +143,7 @@ def log_log(drawing: Drawing, timebase: Timebase, records: Sequence[Timed]) -> N
     times = timebase.at_host([r.log_time_ns for r in records])
     text = [f"{r.message.name}: {r.message.message}" if r.message.name else r.message.message for r in records]
     levels = [_LEVELS.get(r.message.level, "INFO") for r in records]
-    drawing.send_columns("log", times, rr.TextLog.columns(text=text, level=levels))
+    drawing.send_columns(LOG, times, rr.TextLog.columns(text=text, level=levels))
 
 
 def log_control(drawing: Drawing, timebase: Timebase, records: Sequence[Timed]) -> None:
@@ -160,7 +160,7 @@ def log_control(drawing: Drawing, timebase: Timebase, records: Sequence[Timed]) 
         ("delay", "exposure's end to first input", delay),
         ("clipped", "steps that limits changed", [m.clipped_steps for m in changes]),
     )):  # fmt: skip
-        send_line(drawing, f"control/{name}", times, values, Style(label, series_colour(k)))
+        send_line(drawing, f"{CONTROL}/{name}", times, values, Style(label, series_colour(k)))
     states = [
         f"{schemas_pb2.Control.State.Name(m.state)}{' LATE' if m.late else ''}"
         f"{f' {m.acting.upper()}' if m.acting not in ('', m.controller) else ''}"
@@ -168,7 +168,7 @@ def log_control(drawing: Drawing, timebase: Timebase, records: Sequence[Timed]) 
         else f"UNKNOWN {m.state}"
         for m in changes
     ]
-    send_states(drawing, "status/loop", timebase, timebase.step_of_frame([m.frame_id for m in changes]), states)
+    send_states(drawing, f"{STATUS}/loop", timebase, timebase.step_of_frame([m.frame_id for m in changes]), states)
 
 
 def _send_blocks(drawing: Drawing, path: str, timebase: Timebase, blocks: Sequence[Any], style: Style) -> None:

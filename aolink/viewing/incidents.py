@@ -8,6 +8,7 @@ import rerun as rr
 
 from aolink.estimation.estimate import Estimate, Status
 from aolink.exposure import Exposure
+from aolink.viewing.entities import STATUS, WARNINGS
 from aolink.viewing.series import Drawing, send_states
 from aolink.viewing.timebase import Timebase
 
@@ -44,7 +45,7 @@ def log_exposures(
         steps.append(exposure.first_step)
         states.append("NEXT EXPOSURE" if exposure.frame_id % 2 else "EXPOSURE")
     order = sorted(range(len(steps)), key=steps.__getitem__)
-    send_states(drawing, "status/exposure", timebase, [steps[k] for k in order], [states[k] for k in order])
+    send_states(drawing, f"{STATUS}/exposure", timebase, [steps[k] for k in order], [states[k] for k in order])
 
 
 def log_status(
@@ -65,7 +66,7 @@ def log_status(
         for e in exposures
         if e.frame_id in skipped or e.frame_id in estimates
     ]
-    send_states(drawing, f"status/{name}", timebase, [step for step, _ in known], [state for _, state in known])
+    send_states(drawing, f"{STATUS}/{name}", timebase, [step for step, _ in known], [state for _, state in known])
 
 
 def log_warnings(
@@ -95,7 +96,5 @@ def log_warnings(
                 said.append((e, f"{name}: frame {e.frame_id} {_REFUSED[found.status]}{why}"))
     if said:
         times = timebase.at_steps([e.first_step for e, _ in said], [e.frame_id for e, _ in said])
-        drawing.send_columns(
-            "warnings", times, rr.TextLog.columns(text=[s for _, s in said], level=["WARN"] * len(said))
-        )
+        drawing.send_columns(WARNINGS, times, rr.TextLog.columns(text=[s for _, s in said], level=["WARN"] * len(said)))
     return len(said)

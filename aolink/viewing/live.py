@@ -15,7 +15,7 @@ from aolink.estimation import Estimate
 from aolink.exposure import Exposure
 from aolink.restoration import deblur
 from aolink.rig import Rig
-from aolink.viewing import incidents, motion, scene
+from aolink.viewing import entities, incidents, motion, scene
 from aolink.viewing.blueprint import Contents, blueprint
 from aolink.viewing.camera import HISTORY
 from aolink.viewing.feed import fed
@@ -90,16 +90,16 @@ class LiveView:
         if sensor is None or timebase is None or exposure.scene is None:
             return self._scenes
         scene.log_scenes(self._drawing, sensor, timebase, [exposure])
-        shown.add(scene.SCENE)
+        shown.add(entities.SCENE)
         focus = [each for each in estimates if each.estimator == self._names[-1] and each.frame_id == exposure.frame_id]
         if focus:
             done = deblur(self._rig, exposure, focus[0])
             if scene.log_restored(self._drawing, timebase, [exposure], [done]):
-                shown.add(scene.RESTORED_SCENE)
-        if self._true_scene is not None and scene.TRUE_SCENE not in shown:
+                shown.add(entities.RESTORED_SCENE)
+        if self._true_scene is not None and entities.TRUE_SCENE not in shown:
             scene.log_true_scene(self._drawing, sensor, self._true_scene)
-            shown.add(scene.TRUE_SCENE)
-        return [path for path in scene.SCENES if path in shown]
+            shown.add(entities.TRUE_SCENE)
+        return [path for path in entities.SCENES if path in shown]
 
     def _lay_out(self, exposure: Exposure) -> None:
         contents = Contents(

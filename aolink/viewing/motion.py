@@ -16,6 +16,7 @@ from aolink.exposure import Exposure, Truth, residual_rms
 from aolink.numerics.arrays import FloatArray
 from aolink.plotting.overview import NIS_COVERAGE, nis_bounds
 from aolink.plotting.style import BAND, extremes, hides_swings
+from aolink.viewing.entities import END_ERROR, ESTIMATE, NIS, PATH, PATH_ERROR, RESIDUAL, RMS_ERROR, STATE
 from aolink.viewing.palette import TRUTH
 from aolink.viewing.series import Drawing, Style, send_axes, send_line
 from aolink.viewing.timebase import Timebase
@@ -30,7 +31,7 @@ def log_truth(drawing: Drawing, timebase: Timebase, exposures: Sequence[Exposure
     if not known:
         return
     style = Style("truth", TRUTH, width=2.5)
-    _send_path(drawing, "path/truth", timebase, [(e.first_step, truth.path) for e, truth in known], style)
+    _send_path(drawing, f"{PATH}/truth", timebase, [(e.first_step, truth.path) for e, truth in known], style)
     frames = [e.frame_id for e, _ in known]
     starts = np.array([e.first_step for e, _ in known])
     ends = starts + [e.n_steps for e, _ in known]
@@ -40,7 +41,7 @@ def log_truth(drawing: Drawing, timebase: Timebase, exposures: Sequence[Exposure
     ):
         times = timebase.at_steps(at, frames)
         for i in range(min(states.shape[2], MOST_STATES)):
-            _send_state(drawing, f"state/{where}/x{i + 1}/truth", times, states[:, :, i], style)
+            _send_state(drawing, f"{STATE}/{where}/x{i + 1}/truth", times, states[:, :, i], style)
 
 
 def log_estimates(drawing: Drawing, timebase: Timebase, estimates: Sequence[Estimate]) -> None:
@@ -58,7 +59,7 @@ def log_estimates(drawing: Drawing, timebase: Timebase, estimates: Sequence[Esti
     outputs = list(chosen.outputs)
     means = [(e.first_step, e.path) for e in estimates]
     deviations = [BAND * e.path_sd[outputs] for e in estimates]
-    _send_path(drawing, f"path/{name}", timebase, means, line, deviations, band)
+    _send_path(drawing, f"{PATH}/{name}", timebase, means, line, deviations, band)
 
     frames = [e.frame_id for e in estimates]
     starts = np.array([e.first_step for e in estimates])
@@ -72,11 +73,11 @@ def log_estimates(drawing: Drawing, timebase: Timebase, estimates: Sequence[Esti
         every = np.array(states)
         deviation = np.sqrt(np.diagonal(np.array(covariances), axis1=2, axis2=3))
         for i in range(min(every.shape[2], MOST_STATES)):
-            _send_state(drawing, f"state/{where}/x{i + 1}/{name}/mean", times, every[:, :, i], line)
+            _send_state(drawing, f"{STATE}/{where}/x{i + 1}/{name}/mean", times, every[:, :, i], line)
             limits = _about(every[:, axes, i], BAND * deviation[:, :, i])
-            send_line(drawing, f"state/{where}/x{i + 1}/{name}/band", times, limits, band)
+            send_line(drawing, f"{STATE}/{where}/x{i + 1}/{name}/band", times, limits, band)
     _log_nis(drawing, timebase, estimates)
-    _send_table(drawing, f"estimate/{name}", timebase.at_steps(starts, frames), estimates)
+    _send_table(drawing, f"{ESTIMATE}/{name}", timebase.at_steps(starts, frames), estimates)
 
 
 def log_errors(
@@ -93,7 +94,7 @@ def log_errors(
     style = Style(name, estimator_colour(name))
     errors = [e.path - truth.path for e, truth in known]
     _send_path(
-        drawing, f"error/path/{name}", timebase,
+        drawing, f"{PATH_ERROR}/{name}", timebase,
         [(e.first_step, error) for (e, _), error in zip(known, errors, strict=True)], style,
     )  # fmt: skip
     frames = [e.frame_id for e, _ in known]
@@ -101,11 +102,11 @@ def log_errors(
     rms = [np.sqrt(np.mean(error**2, axis=1)) for error in errors]
     chosen = drawing.chosen
     times = timebase.at_steps(starts, frames)
-    send_axes(drawing, f"error/path_rms/{name}", times, np.array(rms), style, chosen.outputs, chosen.labels)
+    send_axes(drawing, f"{RMS_ERROR}/{name}", times, np.array(rms), style, chosen.outputs, chosen.labels)
     ends = timebase.at_steps(starts + [e.n_steps for e, _ in known], frames)
     ended = np.array([e.end_state - truth.end_state for e, truth in known])
     for i in range(min(ended.shape[2], MOST_STATES)):
-        _send_state(drawing, f"error/end/x{i + 1}/{name}", ends, ended[:, :, i], style)
+        _send_state(drawing, f"{END_ERROR}/x{i + 1}/{name}", ends, ended[:, :, i], style)
 
 
 def log_residual(
@@ -120,7 +121,9 @@ def log_residual(
     left = [(each.first_step, residual_rms([each])) for each in exposures]
     if left:
         steps = timebase.first_step + np.array([step for step, _ in left]) - left[0][0]
-        send_line(drawing, f"residual/{name}", timebase.at_steps(steps), [rms for _, rms in left], Style(name, colour))
+        send_line(
+            drawing, f"{RESIDUAL}/{name}", timebase.at_steps(steps), [rms for _, rms in left], Style(name, colour)
+        )
 
 
 def _send_table(drawing: Drawing, path: str, times: Sequence[rr.TimeColumn], estimates: Sequence[Estimate]) -> None:
@@ -142,13 +145,13 @@ def _log_nis(drawing: Drawing, timebase: Timebase, estimates: Sequence[Estimate]
     times = timebase.at_steps([e.first_step for e in measured], [e.frame_id for e in measured])
     line = Style(name, estimator_colour(name))
     values = np.array([e.nis for e in measured])
-    _send_state(drawing, f"nis/{name}/value", times, values, line)
+    _send_state(drawing, f"{NIS}/{name}/value", times, values, line)
     bounds = np.array([nis_bounds(e.innovation.shape[1]) for e in measured])
     # A constant is a line between its ends.
     kept = [0, *range(len(bounds) - 1, 0, -1)[:1]] if (bounds == bounds[0]).all() else list(range(len(bounds)))
     ends = timebase.at_steps([measured[k].first_step for k in kept], [measured[k].frame_id for k in kept])
     label = f"{name}, {NIS_COVERAGE:.0%} bounds"
-    send_line(drawing, f"nis/{name}/bounds", ends, bounds[kept], Style(label, line.colour, width=1.0, alpha=140))
+    send_line(drawing, f"{NIS}/{name}/bounds", ends, bounds[kept], Style(label, line.colour, width=1.0, alpha=140))
 
 
 def _band_style(name: str) -> Style:

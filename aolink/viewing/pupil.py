@@ -12,6 +12,7 @@ from aolink.estimation.estimate import Estimate
 from aolink.exposure import Exposure
 from aolink.plotting.pupil import MAPS, spot_values
 from aolink.rig import Rig
+from aolink.viewing.entities import PUPIL
 from aolink.viewing.series import Drawing
 from aolink.viewing.timebase import Timebase
 
@@ -56,7 +57,7 @@ def log_maps(
         look = rr.DepthImage.from_fields(
             format=layout, colormap=colours, depth_range=(-reach if signed else 0.0, reach)
         )
-        drawing.log(f"pupil/{name}", look)
+        drawing.log(f"{PUPIL}/{name}", look)
         times = timebase.at_steps([e.first_step for e, _ in pictures], [e.frame_id for e, _ in pictures])
         buffers = np.stack([picture.view(np.uint8) for _, picture in pictures])
-        drawing.send_columns(f"pupil/{name}", times, rr.DepthImage.columns(buffer=buffers))
+        drawing.send_columns(f"{PUPIL}/{name}", times, rr.DepthImage.columns(buffer=buffers))

@@ -20,7 +20,7 @@ from aolink.plotting.pupil import has_pupil
 from aolink.recording import topics
 from aolink.recording.side_files import check_stands_alone
 from aolink.rig import Rig
-from aolink.viewing import camera, devices, incidents, motion, scene
+from aolink.viewing import camera, devices, entities, incidents, motion, scene
 from aolink.viewing.blueprint import PATH_WINDOW, Contents, blueprint
 from aolink.viewing.look import APPLICATION, Look, identity
 from aolink.viewing.palette import series_colour
@@ -34,8 +34,6 @@ if TYPE_CHECKING:
     from aolink.recording.reader import Recording
     from aolink.restoration import RestoredPictures
 
-COMPARED = "compared/"
-"""Prefix of the entities of the recording that is compared."""
 
 _PAGES = 16
 """Pages of exposures in a part of a recording, which is in memory as a whole; the first part has one page, so that it
@@ -99,7 +97,7 @@ def sent_parts(
     sender = Sender(stream, recording, look)
     other = None
     if look.compared is not None:
-        other = Sender(stream, look.compared, Look(exposures=look.exposures, spot=look.spot), root=COMPARED)
+        other = Sender(stream, look.compared, Look(exposures=look.exposures, spot=look.spot), root=entities.COMPARED)
     stream.send_recording_name(f"{recording.rig.name} · {recording.path.name}")
 
     def lay_out() -> None:
@@ -178,9 +176,9 @@ class Sender:
         true_scene = recording.true_scene
         if self._rig.scene is not None and true_scene is not None:
             scene.log_true_scene(self._drawing, self._rig.scene, true_scene)
-            self._known.add(scene.TRUE_SCENE)
+            self._known.add(entities.TRUE_SCENE)
         text = rr.TextDocument(self._summary(), media_type="text/markdown")
-        self._drawing.log("session", text)
+        self._drawing.log(entities.SESSION, text)
         self._finished = True
 
     def _read(self) -> Iterator[tuple[list[Exposure], dict[str, dict[int, Estimate]], Exposure | None]]:
@@ -243,11 +241,11 @@ class Sender:
             best = estimates[self._names[-1]] if self._names else {}
             log_maps(drawing, timebase, rig, exposures, best, self._scales)
         if rig.scene is not None and scene.log_scenes(drawing, rig.scene, timebase, exposures):
-            self._known.add(scene.SCENE)
+            self._known.add(entities.SCENE)
         if scene.log_restored(drawing, timebase, exposures, restored):
-            self._known.add(scene.RESTORED_SCENE)
+            self._known.add(entities.RESTORED_SCENE)
         if any(each.spots is not None for each in restored):
-            self._known.add(scene.RESTORED_SPOTS)
+            self._known.add(entities.RESTORED_SPOTS)
 
     @cached_property
     def _ends(self) -> tuple[Exposure, Exposure]:
@@ -302,8 +300,8 @@ class Sender:
             measuring=[name for name in self._names if name in self._measuring],
             density_top=self._top or 1.0,
             truth="truth" in self._known,
-            scenes=list(compress(scene.SCENES, (each in self._known for each in scene.SCENES))),
-            restored_spots=scene.RESTORED_SPOTS in self._known,
+            scenes=list(compress(entities.SCENES, (each in self._known for each in entities.SCENES))),
+            restored_spots=entities.RESTORED_SPOTS in self._known,
             loops=list(self._look.loops),
             topics=frozenset(self._known.intersection(self._shown) if self._finished else self._shown),
             drawn=self._drawing,

@@ -15,20 +15,13 @@ from numpy.typing import NDArray
 
 from aolink.exposure import Exposure
 from aolink.optics.scene import SceneSensor
+from aolink.viewing.entities import RESTORED_SCENE, RESTORED_SPOTS, SCENE, TRUE_SCENE
 from aolink.viewing.palette import MISSING
 from aolink.viewing.series import Drawing
 from aolink.viewing.timebase import Timebase
 
 if TYPE_CHECKING:
     from aolink.restoration import RestoredPictures
-
-
-SCENE = "scene/image"
-TRUE_SCENE = "scene/true"
-RESTORED_SCENE = "restored/image"
-RESTORED_SPOTS = "restored/spot"
-SCENES = (SCENE, RESTORED_SCENE, TRUE_SCENE)
-"""The entities of the scene, in this order."""
 
 
 def log_scenes(drawing: Drawing, sensor: SceneSensor, timebase: Timebase, exposures: Sequence[Exposure]) -> bool:

@@ -8,7 +8,7 @@ import pytest
 
 from aolink.optics.lattice import find_lattice, match
 from aolink.optics.lenslets import Lenslets
-from aolink.optics.wavefront import SpotReconstructor, lenslet_zernike_slopes, modal_reconstructor, residual_rms
+from aolink.optics.wavefront import SpotReconstructor, lenslet_zernike_slopes, modal_reconstructor, wavefront_rms
 from aolink.optics.zernike import zernike, zernike_gradient
 from tests.spot_frames import square_lattice
 
@@ -89,5 +89,5 @@ def test_the_wavefront_comes_back(measured):
     values[lit] = SpotReconstructor(*square_lattice(lit, PITCH))(slopes.reshape(13, 13, 2)[lit])
     points = LENSLETS.centres_m / (DIAMETER / 2)
     path = np.sum([c * zernike(i, points) for i, c in COEFFICIENTS.items()], axis=0).reshape(13, 13)
-    assert residual_rms(values - path) < 0.1 * residual_rms(np.where(lit, path, np.nan))
-    assert residual_rms(values - path) < WAVELENGTH / 60  # of light without it, 99 % is in the image's peak
+    assert wavefront_rms(values - path) < 0.1 * wavefront_rms(np.where(lit, path, np.nan))
+    assert wavefront_rms(values - path) < WAVELENGTH / 60  # of light without it, 99 % is in the image's peak

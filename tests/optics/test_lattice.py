@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from aolink.errors import FrameError
 from aolink.optics.lattice import find_lattice, match
 from aolink.optics.maxima import cut_windows
-from aolink.optics.synthesis import Psi, spot_windows
+from aolink.optics.synthesis import Psi, light_in_windows
 from tests.spot_frames import ANGLES, as_dtype, nodes_and_places, spots_frame
 
 
@@ -103,7 +103,7 @@ def test_lattices_of_diffraction_spots_are_found(kind):
     nodes, places = nodes_and_places(kind, 17, 11, side, 105)
     places = places + side / 2 + rng.normal(0, 0.3, places.shape)
     corners = np.rint(places).astype(int) - half
-    windows = spot_windows(Psi(shape="sinc2", zero_px=3.0), 2 * half + 1, (places - corners)[..., None])
+    windows = light_in_windows(Psi(shape="sinc2", zero_px=3.0), 2 * half + 1, (places - corners)[..., None])
     frame = np.full((side, side), 20.0)
     for window, (x, y) in zip(windows, corners, strict=True):
         frame[y : y + 2 * half + 1, x : x + 2 * half + 1] += 40_000 * window

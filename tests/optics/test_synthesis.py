@@ -7,14 +7,14 @@ from scipy import integrate
 from aolink.errors import FrameError
 from aolink.optics.kernel import pixel_mass
 from aolink.optics.sensor import Kernel
-from aolink.optics.synthesis import Detector, Psi, spot_windows
+from aolink.optics.synthesis import Detector, Psi, light_in_windows
 
 RNG = np.random.default_rng(1)
 PATHS = 5.5 + RNG.uniform(-1.5, 1.5, (20, 2, 1)) + np.cumsum(RNG.normal(0, 0.05, (20, 2, 100)), axis=2)
 
 
 def test_delta_is_the_histogram_of_the_path():
-    windows = spot_windows(Psi(shape="delta"), 12, PATHS)
+    windows = light_in_windows(Psi(shape="delta"), 12, PATHS)
     edges = np.arange(13.0) - 0.5
     for window, (x, y) in zip(windows, PATHS, strict=True):
         np.testing.assert_allclose(window, np.histogram2d(y, x, (edges, edges))[0] / 100, atol=1e-12)
@@ -23,20 +23,20 @@ def test_delta_is_the_histogram_of_the_path():
 def test_diffraction_is_the_integral_of_sinc_squared():
     psi = Psi(shape="sinc2", zero_px=1.7)
     place = np.array([[[5.3], [4.1]]])
-    (window,) = spot_windows(psi, 12, place)
+    (window,) = light_in_windows(psi, 12, place)
     along = [
         [integrate.quad(lambda w, c=c: np.sinc((w - c) / 1.7) ** 2 / 1.7, k - 0.5, k + 0.5)[0] for k in range(12)]
         for c in (5.3, 4.1)
     ]
     np.testing.assert_allclose(window, np.outer(along[1], along[0]), atol=1e-6)
-    wide = spot_windows(psi, 400, np.full((1, 2, 1), 199.5)).sum()
+    wide = light_in_windows(psi, 400, np.full((1, 2, 1), 199.5)).sum()
     assert wide == pytest.approx(1, abs=4 * 1.7 / np.pi**2 / 200)  # tails of 1 / (pi^2 x) to each side
 
 
 def test_a_path_smears_as_the_mean_of_its_steps():
     for psi in (Psi(shape="sinc2", zero_px=1.7), Psi(shape="image", image=RNG.random((5, 7)), finer=3)):
-        whole = spot_windows(psi, 12, PATHS)
-        steps = np.mean([spot_windows(psi, 12, PATHS[..., k : k + 1]) for k in range(100)], axis=0)
+        whole = light_in_windows(psi, 12, PATHS)
+        steps = np.mean([light_in_windows(psi, 12, PATHS[..., k : k + 1]) for k in range(100)], axis=0)
         np.testing.assert_allclose(whole, steps, atol=1e-12)
 
 
@@ -47,13 +47,13 @@ def test_an_image_of_a_gaussian_is_the_gaussian_kernel():
     psi = Psi(shape="image", image=np.outer(gaussian, gaussian), finer=fine)
     kernel, edges = Kernel(shape="gaussian", sigma=sd * np.sqrt(2)), np.arange(13.0) - 0.5
     expected = np.stack([pixel_mass(kernel, edges, p[1]).T @ pixel_mass(kernel, edges, p[0]) / 100 for p in PATHS])
-    assert np.abs(spot_windows(psi, 12, PATHS) - expected).max() < 2e-3 * expected.max()
+    assert np.abs(light_in_windows(psi, 12, PATHS) - expected).max() < 2e-3 * expected.max()
 
 
 def test_an_image_keeps_its_moments_and_its_orientation():
     image = np.zeros((5, 9))
     image[2, 4], image[2, 8], image[0, 4] = 2.0, 1.0, 1.0  # one to the right by 4, one up by 2
-    (window,) = spot_windows(Psi(shape="image", image=image), 16, np.array([[[7.3], [6.2]]]))
+    (window,) = light_in_windows(Psi(shape="image", image=image), 16, np.array([[[7.3], [6.2]]]))
     assert window.sum() == pytest.approx(1)
     y, x = np.mgrid[:16, :16]
     assert (window * x).sum() == pytest.approx(7.3 + 4 / 4)
@@ -67,7 +67,7 @@ def test_an_image_lands_where_each_step_puts_it(finer):
     image, side, steps = rng.random((7, 5)), 6, 20
     paths = rng.uniform(-4, 10, (4, 2, steps))
     paths[3] += 100
-    light = spot_windows(Psi(shape="image", image=image, finer=finer), side, paths)
+    light = light_in_windows(Psi(shape="image", image=image, finer=finer), side, paths)
     n, edge = side * finer, 200
     for spot in range(4):
         fine = np.zeros((n + 2 * edge, n + 2 * edge))
@@ -83,7 +83,7 @@ def test_an_image_lands_where_each_step_puts_it(finer):
 
 def test_light_that_leaves_the_window_is_gone():
     for psi in (Psi(shape="delta"), Psi(shape="image", image=np.ones((3, 3)))):
-        assert spot_windows(psi, 8, np.full((1, 2, 1), 50.0)).sum() == 0
+        assert light_in_windows(psi, 8, np.full((1, 2, 1), 50.0)).sum() == 0
 
 
 @pytest.mark.parametrize(

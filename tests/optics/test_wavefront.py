@@ -11,7 +11,7 @@ from aolink.optics.wavefront import (
     SpotReconstructor,
     lenslet_zernike_slopes,
     modal_reconstructor,
-    residual_rms,
+    wavefront_rms,
     zernike_slopes,
 )
 from aolink.optics.zernike import zernike_gradient
@@ -60,10 +60,10 @@ def test_zonal_finds_turbulence_but_for_what_lenslets_cannot_resolve():
     slopes = (flow.slope_waves(square) @ flow.blown(np.zeros(1))).real.reshape(900, 2)
     true = wavefront(flow, square.centres_m)
     found = SpotReconstructor(*square_lattice(np.ones((30, 30), dtype=bool), pitch))(slopes)
-    unresolved = residual_rms(found - true) * 2 * np.pi / layer.wavelength_m
+    unresolved = wavefront_rms(found - true) * 2 * np.pi / layer.wavelength_m
     # Fitting and aliasing together, some 0.3 to 0.5 (d/r0)^(5/3) rad^2.
     assert unresolved**2 < 0.5 * (pitch / layer.r0_m) ** (5 / 3)
-    assert residual_rms(true) * 2 * np.pi / layer.wavelength_m > 8 * unresolved
+    assert wavefront_rms(true) * 2 * np.pi / layer.wavelength_m > 8 * unresolved
 
 
 def lattice_of(kind, pitch=1.0, radius=8.2, turn=13.0):
@@ -108,7 +108,7 @@ def test_spots_find_a_smooth_wavefront_to_a_thirtieth(kind, seed):
     value, gradient = smooth_waves(seed, shortest=10.0)  # ten lenslets
     slopes = cell_means(gradient, positions, kind, 1.0, 13.0)
     true = value(positions)
-    assert residual_rms(SpotReconstructor(positions, edges)(slopes) - true) < residual_rms(true) / 30
+    assert wavefront_rms(SpotReconstructor(positions, edges)(slopes) - true) < wavefront_rms(true) / 30
 
 
 @pytest.mark.parametrize("kind", ["square", "hexagonal"])
@@ -179,7 +179,7 @@ def test_more_modes_than_slopes_are_refused():
 
 
 def test_points_without_a_value_do_not_count():
-    assert residual_rms(np.array([1.0, 3.0, np.nan])) == 1.0
+    assert wavefront_rms(np.array([1.0, 3.0, np.nan])) == 1.0
 
 
 def test_gradients_of_modes_are_slopes():

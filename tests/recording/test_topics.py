@@ -56,16 +56,17 @@ def test_a_message_of_another_kind_belongs_to_its_time_alone() -> None:
 
 
 def test_topics_are_written_in_the_table_alone() -> None:
-    """Every other module of aolink names them by the table."""
+    """Every other module of aolink names them by the table, with their slashes and, as entities of Rerun, without."""
+    names = {row.name for row in TOPICS}
+    entities = tuple(name.strip("/") for name in names if "/" in name.strip("/"))
     for path in PACKAGE.rglob("*.py"):
         if path.name.endswith("_pb2.py") or path == PACKAGE / "recording" / "topics.py":
             continue
         found = list(ast.walk(ast.parse(path.read_text())))
-        parts = {
-            part for each in found if isinstance(each, ast.JoinedStr) for part in each.values
-        }  # of entities' paths
-        texts = {each.value for each in found if isinstance(each, ast.Constant) and each not in parts}
-        assert not texts & {row.name for row in TOPICS}, path
+        parts = [part for each in found if isinstance(each, ast.JoinedStr) for part in each.values]  # of other paths
+        texts = {each for each in found if isinstance(each, ast.Constant) and isinstance(each.value, str)}
+        assert not {each.value for each in texts - {*parts}} & names, path
+        assert not [each.value for each in texts if str(each.value).startswith(entities)], path
 
 
 def test_the_page_has_the_table() -> None:

@@ -52,8 +52,3 @@ def roughness_matrix(shape: tuple[int, int]) -> FloatArray:
     D = np.zeros((len(pairs), index.size))
     D[np.arange(len(pairs)), pairs[:, 0]], D[np.arange(len(pairs)), pairs[:, 1]] = -1, 1
     return D.T @ D
-
-
-def psnr(found: FloatArray, scene: FloatArray) -> float:
-    """Peak signal to noise, dB, for a peak of one."""
-    return float(-10 * np.log10(np.mean((found - scene) ** 2)))

@@ -11,6 +11,7 @@ from scipy import fft, linalg
 
 from aolink.numerics.arrays import FloatArray
 from aolink.restoration import Psf, block_matching, non_local_means
+from aolink.restoration.deblur import psnr
 from aolink.restoration.markov import (
     DenseSolver,
     IterativeSolver,
@@ -32,7 +33,7 @@ from aolink.restoration.tv import (
     plane_weight,
     total_variation,
 )
-from tests.restoration.scenes import LOPSIDED, UNIFORM, blocks, blur_matrix, blurred, psnr, roughness_matrix
+from tests.restoration.scenes import LOPSIDED, UNIFORM, blocks, blur_matrix, blurred, roughness_matrix
 
 SHAPE = (11, 14)
 CORNER = np.array([[0.0, 0.1, 0.2], [0.1, 0.3, 0.0], [0.25, 0.0, 0.05]])

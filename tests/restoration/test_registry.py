@@ -15,7 +15,8 @@ import pytest
 import aolink.restoration
 from aolink.errors import RestorationError
 from aolink.restoration import METHODS, find_method, restore
-from tests.restoration.scenes import UNIFORM, blocks, blurred, psnr
+from aolink.restoration.deblur import psnr
+from tests.restoration.scenes import UNIFORM, blocks, blurred
 
 Run = Callable[..., "subprocess.CompletedProcess[str]"]
 

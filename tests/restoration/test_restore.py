@@ -12,7 +12,8 @@ from aolink.errors import RestorationError
 from aolink.numerics.arrays import FloatArray
 from aolink.optics.sensor import Kernel
 from aolink.restoration import METHODS, Psf, first_order, from_correlation, measured_correlation, motion_psf, restore
-from tests.restoration.scenes import DECAYING, UNIFORM, blocks, blurred, psnr
+from aolink.restoration.deblur import psnr
+from tests.restoration.scenes import DECAYING, UNIFORM, blocks, blurred
 
 NOISE = 0.005
 ESTIMATES = tuple(m for m in METHODS if m != "inverse")

@@ -27,22 +27,22 @@ def frame_synthesis(effort: Effort) -> Row:
 
 def diffraction_synthesis(effort: Effort) -> Row:
     """Frames of 900 spots whose kernel is a lenslet's diffraction."""
-    from aolink.optics.synthesis import Psi, spot_windows
+    from aolink.optics.synthesis import Psi, light_in_windows
 
     path = 7.5 + np.cumsum(np.random.default_rng(0).normal(0, 0.05, (900, 2, 200)), axis=2)
     psi = Psi(shape="sinc2", zero_px=2.0)
-    spot_windows(psi, 16, path)
-    ours = 1 / median_s(lambda: spot_windows(psi, 16, path), effort.of(5))[0]
+    light_in_windows(psi, 16, path)
+    ours = 1 / median_s(lambda: light_in_windows(psi, 16, path), effort.of(5))[0]
     return Row("frames of 900 diffraction spots", f"{ours:.0f}/s", "20/s", ours / 20, 1)
 
 
 def picture_synthesis(effort: Effort) -> Row:
     """Frames of 900 spots whose kernel is a picture of 33 x 33 points, four of them a pixel."""
-    from aolink.optics.synthesis import Psi, spot_windows
+    from aolink.optics.synthesis import Psi, light_in_windows
 
     path = 7.5 + np.cumsum(np.random.default_rng(0).normal(0, 0.05, (900, 2, 200)), axis=2)
     psi = Psi(shape="image", image=np.random.default_rng(1).random((33, 33)), finer=4)
-    ours = 1 / median_s(lambda: spot_windows(psi, 16, path), effort.of(5))[0]
+    ours = 1 / median_s(lambda: light_in_windows(psi, 16, path), effort.of(5))[0]
     return Row("frames of 900 spots that are a picture", f"{ours:.0f}/s", "20/s", ours / 20, 1)
 
 

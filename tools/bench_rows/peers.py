@@ -12,8 +12,9 @@ from skimage import restoration
 
 from aolink.numerics.arrays import FloatArray
 from aolink.restoration import restore
+from aolink.restoration.deblur import psnr
 from aolink.restoration.markov import line_solver
-from bench_rows.pictures import NOISE_SD, Case, psnr
+from bench_rows.pictures import NOISE_SD, Case
 
 _PAD = 40
 

@@ -12,6 +12,7 @@ from skimage import color, data, transform
 from aolink.numerics.arrays import FloatArray
 from aolink.optics.sensor import Kernel
 from aolink.restoration import Psf, motion_psf
+from aolink.restoration.deblur import psnr
 from aolink.rig import load_rig
 from bench_rows.row import Effort
 
@@ -93,11 +94,6 @@ def cases(names: tuple[str, ...], effort: Effort) -> Iterator[Case]:
 def picture_size(effort: Effort, whole: int = 256) -> int:
     """Rows of a picture, enough for the widest motion."""
     return effort.of(whole, 96)
-
-
-def psnr(found: FloatArray, scene: FloatArray) -> float:
-    """Peak signal-to-noise ratio, dB, for a peak of one."""
-    return float(-10 * np.log10(np.mean((found - scene) ** 2)))
 
 
 @dataclass(frozen=True, kw_only=True)

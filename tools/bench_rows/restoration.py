@@ -7,6 +7,7 @@ from skimage import restoration as peer
 
 from aolink.restoration import METHODS, motion_psf, restore
 from aolink.restoration.banded import smooth_lines
+from aolink.restoration.deblur import psnr
 from aolink.restoration.markov import line_solver, make_solver
 from aolink.restoration.tv import total_variation
 from bench_rows import peers
@@ -20,7 +21,6 @@ from bench_rows.pictures import (
     paths,
     picture_size,
     psfs,
-    psnr,
     quality,
 )
 from bench_rows.row import Effort, Row, median_s

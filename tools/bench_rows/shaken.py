@@ -14,7 +14,8 @@ from scipy import ndimage
 
 from aolink.numerics.arrays import FloatArray
 from aolink.restoration import Psf, restore
-from bench_rows.pictures import NOISE_SD, psnr, wide_scene
+from aolink.restoration.deblur import psnr
+from bench_rows.pictures import NOISE_SD, wide_scene
 from bench_rows.row import Effort, Row
 
 Solve = Callable[["Shaken", float], FloatArray]

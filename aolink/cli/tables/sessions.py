@@ -47,7 +47,7 @@ def session_as_json(report: Report) -> dict[str, Any]:
 
 
 def session(report: Report) -> Table:
-    """Frames, commands, link, clock and latencies of a session."""
+    """Frames, commands, lines, clock and latencies of a session."""
     table = Table(box=None, show_header=False, pad_edge=False)
     table.add_row(
         "frames",
@@ -55,10 +55,9 @@ def session(report: Report) -> Table:
         f" {report.frames_lost} lost whole",
     )
     table.add_row(
-        "link",
-        f"packets discarded: {report.packets_bad_crc} for their checksum, {report.packets_bad_framing} for their"
-        f" framing, {report.packets_bad_payload} for their content; {report.packets_duplicate} duplicates;"
-        f" {report.packets_missing} missing by their sequence numbers",
+        "lines",
+        "discarded: {bad_crc} for their checksum, {bad_framing} for their framing, {bad_payload} for their content;"
+        " {duplicates} duplicates; {sequence_gaps} missing by their sequence numbers".format(**report.line_faults),
     )
     table.add_row(
         "commands",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Literal, Self
+from typing import ClassVar, Literal, Self
 
 from aolink.numerics.arrays import BoolArray, FloatArray, Indices
 
@@ -56,6 +56,8 @@ class Measurement:
 class Densities:
     """Densities of the pixels of each axis."""
 
+    directions: ClassVar[int]
+    """Directions that the pixels of a spot lie along: 1 for a row of pixels, 2 for a window."""
     density: FloatArray
     """(axes, ...)"""
     mask: BoolArray
@@ -77,12 +79,16 @@ class Profile(Densities):
     One over slope units, (axes, pixels); light (axes,).
     """
 
+    directions = 1
+
 
 class SpotWindows(Densities):
     """Densities of the pixels about each spot of each copy of the plant.
 
     One over slope units squared, zero where the mask is, (axes, spots, rows, columns); light (axes, spots).
     """
+
+    directions = 2
 
     def per_light(self, light: FloatArray | None) -> SpotWindows:
         """The same with densities divided by the light of each spot in the rig's order, (axes * spots,)."""

@@ -219,8 +219,8 @@ class PixelView:
         reduced: Reduction, level: int = 0,
     ) -> None:  # fmt: skip
         self.sensor, self.reduced, self.measured = sensor, reduced, measured
-        self.on_line = isinstance(measured, Profile)
-        """Whether it is a line sensor, whose pixels are left to compiled code; spots on a plane are not."""
+        self.on_line = measured.directions == 1
+        """Whether each axis has a row of pixels, which are left to compiled code; spots on a plane are not."""
         self.optics = sensor.profile if self.on_line else sensor
         at = quadrature.quadrature_paths(model, response, reduced.resolution.levels[level])
         self.nodes = replace(at, basis=at.basis @ reduced.expand, widening=0.0)

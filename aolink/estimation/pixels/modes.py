@@ -106,12 +106,8 @@ def find_modes(view: PixelView, prior: Gaussian, starts: FloatArray) -> Modes:
     axes, count, n = starts.shape
     if (line := view.line) is not None:
         return found_compiled(line, prior, starts, np.full(axes, count), 0, 0.0)
-    if prior.mean.ndim == 2:
-        prior = Gaussian(
-            np.repeat(prior.mean[:, None], count, axis=1), np.repeat(prior.covariance[:, None], count, axis=1)
-        )
     rows = view.part(np.repeat(np.arange(axes), count))
-    m, L = prior.mean.reshape(-1, 1, n), cholesky(prior.covariance.reshape(-1, n, n))
+    m, L = np.repeat(prior.mean, count, axis=0)[:, None], cholesky(np.repeat(prior.covariance, count, axis=0))
 
     def at(s: FloatArray, which: Indices) -> Points:
         return _at(rows.part(which), m[which], L[which], s)

@@ -1,0 +1,54 @@
+"""The paths of the entities, each once for the functions that send it and for the layout that shows it.
+
+An entity that shows a topic's messages has the topic's name.
+"""
+
+from __future__ import annotations
+
+from aolink.recording import topics
+
+
+def _of(topic: str) -> str:
+    """The entity of a topic, without the slashes about it."""
+    return topic.strip("/")
+
+
+FRAME = _of(topics.IMAGE)
+SCENE = _of(topics.SCENE)
+TRUE_SCENE = "scene/true"
+RESTORED_SCENE = _of(topics.RESTORED_SCENE)
+RESTORED_SPOTS = _of(topics.RESTORED_SPOTS)
+SCENES = (SCENE, RESTORED_SCENE, TRUE_SCENE)
+"""The entities of the scene, in this order."""
+PAGE = "camera/history"
+CENTROIDS = f"{PAGE}/centroid"
+ROW_NOW = f"{PAGE}/now"
+PROFILE = "profile"
+
+PATH = "path"
+STATE = "state"
+NIS = "nis"
+PATH_ERROR = "error/path"
+RMS_ERROR = "error/path_rms"
+END_ERROR = "error/end"
+RESIDUAL = "residual"
+ESTIMATE = _of(topics.ESTIMATE)
+"""Columns for tables; nothing of them is drawn."""
+PUPIL = "pupil"
+
+COMMAND = _of(topics.COMMAND)
+APPLIED = _of(topics.APPLIED)
+CONTROL = _of(topics.CONTROL)
+LATENCY = _of(topics.LATENCY)
+ESTIMATION = f"{LATENCY}/{_of(topics.ESTIMATION)}"
+LOST = f"{_of(topics.LINK)}/lost"
+FAULTS = f"{_of(topics.LINK)}/faults"
+ROUND_TRIP = f"{_of(topics.LINK)}/round_trip"
+RECEIVED = f"{_of(topics.LINK)}/received"
+CLOCK = _of(topics.CLOCK)
+LOG = _of(topics.LOG)
+STATUS = "status"
+WARNINGS = "warnings"
+SESSION = "session"
+COMPARED = "compared/"
+"""Root of all entities of the recording that is compared."""

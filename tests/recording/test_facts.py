@@ -1,0 +1,23 @@
+"""The summary of a recording."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from aolink.recording.facts import recording_facts
+from aolink.recording.reader import Recording
+from tests.recording.small import write_small
+
+
+def losses(path: Path, **metadata: str) -> dict[str, int]:
+    recording = Recording(path)
+    recording.metadata |= metadata
+    found: dict[str, int] = recording_facts(recording)["losses"]
+    return found
+
+
+def test_faults_of_lines_have_one_name_in_old_recordings_and_new_ones(tmp_path: Path) -> None:
+    path = write_small(tmp_path / "s.mcap", exposures=1)
+    old = losses(path, packets_missing="3", packets_bad_crc="0", packets_bad_payload="2")
+    assert old == {"line_sequence_gaps": 3, "line_bad_payload": 2}
+    assert losses(path, line_sequence_gaps="3", line_bad_crc="0", line_bad_payload="2") == old
