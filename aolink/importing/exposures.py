@@ -18,6 +18,7 @@ from aolink.assembly import Assembler, Frame
 from aolink.errors import ImportingError
 from aolink.exposure import Exposure, Exposures
 from aolink.importing.brightness import brightness_of, change_of
+from aolink.importing.defects import defects_note, find_defects
 from aolink.importing.film import Film
 from aolink.importing.frames import (
     FilmAccount,
@@ -72,6 +73,10 @@ def imported(film: Film, rig: Rig, settings: FilmSettings, account: FilmAccount)
             f" {rows} x {columns}: change its [sensor], or follow objects with --track N"
         )
     light = FilmLight(film, settings)
+    defects = find_defects(film, light, math.sqrt(rig.sensor.kernel.variance) / rig.sensor.pixel_width)
+    if defects.any():
+        account.notes += (defects_note(defects),)
+        light = FilmLight(film, settings, defects)
     offset = rig.sensor.black_level if settings.invert or settings.subtract_median else 0.0
     scale = settings.scale or default_scale(film, rig)
     inputs = _Inputs(film, rig, settings, periods)
