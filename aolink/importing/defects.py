@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from itertools import islice
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -105,7 +106,8 @@ def _stands_out(flat: FloatArray, factors: tuple[float, float], least: float) ->
     ring = np.ones((3, 3), dtype=np.bool_)
     ring[1, 1] = False
     peak, hole = (np.zeros(flat.shape, dtype=np.bool_) for _ in range(2))
-    for number, (factor, mode) in enumerate(zip(factors, ("mirror", "constant"), strict=True), 2):
+    modes: tuple[Literal["mirror"], Literal["constant"]] = ("mirror", "constant")
+    for number, (factor, mode) in enumerate(zip(factors, modes, strict=True), 2):
         brighter = ndimage.rank_filter(flat, -number, footprint=ring, mode=mode, cval=np.inf)
         darker = ndimage.rank_filter(flat, number - 1, footprint=ring, mode=mode, cval=-np.inf)
         peak |= flat > factor * np.maximum(brighter, 0.0) + least
