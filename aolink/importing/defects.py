@@ -106,8 +106,8 @@ def _stands_out(flat: FloatArray, factors: tuple[float, float], least: float) ->
     ring = np.ones((3, 3), dtype=np.bool_)
     ring[1, 1] = False
     peak, hole = (np.zeros(flat.shape, dtype=np.bool_) for _ in range(2))
-    modes: tuple[Literal["mirror"], Literal["constant"]] = ("mirror", "constant")
-    for number, (factor, mode) in enumerate(zip(factors, modes, strict=True), 2):
+    ends: tuple[tuple[float, Literal["mirror", "constant"]], ...] = ((factors[0], "mirror"), (factors[1], "constant"))
+    for number, (factor, mode) in enumerate(ends, 2):
         brighter = ndimage.rank_filter(flat, -number, footprint=ring, mode=mode, cval=np.inf)
         darker = ndimage.rank_filter(flat, number - 1, footprint=ring, mode=mode, cval=-np.inf)
         peak |= flat > factor * np.maximum(brighter, 0.0) + least
