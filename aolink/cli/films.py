@@ -1,6 +1,7 @@
 """Commands that bring other people's data in: import, and the film options that `aolink rig --from` shares."""
 
 import json
+import math
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -46,14 +47,16 @@ def film_settings(
     """The options of a command as settings. Raises ImportingError for an invalid place."""
     from aolink.importing.frames import FilmSettings
 
-    if rate is not None and rate <= 0:
-        raise ImportingError(f"--rate {rate:g} must be above 0")
+    if rate is not None and not 0 < rate < math.inf:
+        raise ImportingError(f"--rate {rate:g} must be above 0{' and finite' if rate > 0 else ''}")
     places = []
     for text in at or []:
         try:
             x, y = (float(part) for part in text.split(","))
         except ValueError:
-            raise ImportingError(f"--at {text} is no place: give X,Y in pixels, such as --at 12.5,40") from None
+            x = y = math.nan
+        if not math.isfinite(x + y):
+            raise ImportingError(f"--at {text} is no place: give X,Y in pixels, such as --at 12.5,40")
         places.append((x, y))
     return FilmSettings(
         rate_hz=rate, frames_per_exposure=frames, track=track or len(places), places=tuple(places), invert=invert,
@@ -117,6 +120,8 @@ def import_(
         except ValueError:
             raise ImportingError(f"--start {start} is no date: give one such as 2026-11-22T09:30:00") from None
         start_ns = round((moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp() * 1e6) * 1000
+    if scale is not None and not 0 < abs(scale) < math.inf:
+        raise ImportingError(f"--scale {scale:g} must be a finite number other than 0")
     settings = film_settings(
         rate, frames, track, at, invert, gamma, exposure_s=exposure or None, start_ns=start_ns,
         subtract_median=background, scale=scale,

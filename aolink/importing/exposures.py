@@ -18,6 +18,7 @@ from aolink.assembly import Assembler, Frame
 from aolink.errors import ImportingError
 from aolink.exposure import Exposure, Exposures
 from aolink.importing.brightness import brightness_of, change_of
+from aolink.importing.defects import defects_note, find_defects
 from aolink.importing.film import Film
 from aolink.importing.frames import (
     FilmAccount,
@@ -41,6 +42,8 @@ _FASTER = 0.75
 """Commands at a shorter distance than this part of a fast step are too many for the rig."""
 _WEIGHT = 2.5
 """Standard deviation of the weight under which a spot's light is measured, in those of the kernel."""
+_LATEST_NS = 2**63
+"""Nanoseconds since 1970 that a recording can hold."""
 _FEWEST = 10
 """Number of exposures from which on it can be seen that light fades."""
 
@@ -54,12 +57,18 @@ def imported(film: Film, rig: Rig, settings: FilmSettings, account: FilmAccount)
         The film does not fit the rig file.
     """
     periods, notes = frame_times(film, rig, settings)
+    end = (int(periods[-1]) + 1) * rig.timing.frame_period_steps * rig.timing.fast_step_ns
+    start = settings.start_ns if settings.start_ns is not None else film.start_ns or 0
+    if not 0 <= start < _LATEST_NS - end:
+        raise ImportingError(f"{film.name} has a start or an end that is not from 1970 to 2262: give the right --start")
     account.notes = (*film.notes, *notes, *(() if settings.invert else film.saturation_notes))
     if film.nonlinear and settings.gamma == 1.0:
         account.notes += (nonlinear_note(film),)
     if film.slopes:
         yield from _of_slopes(film, rig, settings, periods, account)
         return
+    if settings.scale is not None and settings.scale < 0:
+        raise ImportingError(f"--scale {settings.scale:g} must be above 0 for pictures: dark objects need --invert")
     if settings.track:
         from aolink.importing.tracking import tracked
 
@@ -72,6 +81,10 @@ def imported(film: Film, rig: Rig, settings: FilmSettings, account: FilmAccount)
             f" {rows} x {columns}: change its [sensor], or follow objects with --track N"
         )
     light = FilmLight(film, settings)
+    defects = find_defects(film, light, math.sqrt(rig.sensor.kernel.variance) / rig.sensor.pixel_width)
+    if defects.any():
+        account.notes += (defects_note(defects),)
+        light = FilmLight(film, settings, defects)
     offset = rig.sensor.black_level if settings.invert or settings.subtract_median else 0.0
     scale = settings.scale or default_scale(film, rig)
     inputs = _Inputs(film, rig, settings, periods)

@@ -22,6 +22,8 @@ _COUNTS = 62_000
 """Counts of the brightest pixel of a resting spot with its noise; there are 65,535."""
 _NOISE_SDS = 6
 """Standard deviations of a pixel's noise that fit below black and above the brightest pixel."""
+_LONGEST_NS = 10**15
+"""Longest frame period, ns: a week and a half."""
 _LEAST_WINDOW = 12
 _ANYWHERE = 0.1
 """Variance of the place of an object in its window before it is seen, slope units squared."""
@@ -53,6 +55,8 @@ def first_rig(film: Film, settings: FilmSettings, name: str, progress: Callable[
     periods, rate, said = film_rate(film, settings)
     if rate is None:
         raise ImportingError(f"it is not known how many frames a second {film.name} has: give --rate")
+    if not 1 <= round(1e9 / rate) <= _LONGEST_NS:
+        raise ImportingError(f"{rate:g} frames/s are no rate of a film: give the right --rate")
     if film.nonlinear and settings.gamma == 1.0:
         said.append(nonlinear_note(film))
     objects = find_objects(film, settings)

@@ -58,8 +58,8 @@ def open_film(source: str | Path, topic: str | None = None) -> Film:
     path = Path(source)
     if not path.exists():
         raise ImportingError(f"cannot read {path}: there is no such file or folder")
-    suffix = "".join(path.suffixes[-2:]) if path.suffix == ".gz" else path.suffix
-    suffix = suffix.lower().removesuffix(".gz")
+    ends = path.suffix.lower()
+    suffix = Path(path.stem).suffix.lower() if ends in (".gz", ".fz") else ends
     with _one_error(path):
         if path.is_dir():
             film = _bag(path, topic) if (path / "metadata.yaml").exists() else _folder(path)
@@ -302,12 +302,15 @@ def _fits(path: Path) -> Film:
         raise ImportingError(f"{path}: {error}") from None
     if "AOT-VERS" in header:
         return _aot(path)
-    if stored.ndim == 2 and (more := sum(each[1].shape == stored.shape for each in arrays)):
+    more = sum(each[1].shape == stored.shape for each in arrays)
+    if stored.ndim == 2 and more:
         raise ImportingError(
             f"{path} holds {more + 1} arrays of shape {stored.shape}, and which of them are frames is not known: stack"
             " the frames in one array (frames, rows, columns)"
         )
     cube = stored[None] if stored.ndim == 2 else stored
+    while cube.ndim > 3 and len(cube) == 1:  # as cameras with several windows write it
+        cube = cube[0]
     if cube.ndim != 3:
         raise ImportingError(f"{path} holds an array of shape {stored.shape}, expected (frames, rows, columns)")
     numbers = {key: _float(header.get(key)) for key in ("EXPTIME", "EXPOSURE", "FRATE", "FRAMRATE", "KINTIME")}
@@ -318,6 +321,7 @@ def _fits(path: Path) -> Film:
         frames=lambda: (_values(frame, scale, zero) for frame in cube),
         rate_hz=numbers["FRATE"] or numbers["FRAMRATE"] or (1 / cycle if cycle else None),
         exposure_s=numbers["EXPTIME"] or numbers["EXPOSURE"], start_ns=_date(header.get("DATE-OBS")),
+        notes=(f"{path.name} holds {more + 1} cubes: the first is taken",) if more else (),
     )  # fmt: skip
 
 

@@ -12,6 +12,7 @@ from scipy import ndimage, optimize
 from aolink.errors import ImportingError
 from aolink.importing.accuracy import pixel_noise, tracker_errors
 from aolink.importing.brightness import brightness_of, change_of
+from aolink.importing.defects import FEWEST, defects_note
 from aolink.importing.film import Film
 from aolink.importing.frames import FilmLight, FilmSettings
 from aolink.importing.shapes import axis_ratios, motion_within
@@ -35,10 +36,6 @@ _REST = 2.5
 to other objects."""
 _FARTHEST = 4.0
 """Largest reach; light of others is searched for so far from an object."""
-
-
-_SHOWN = 3
-"""Hot and dead pixels of which a note has the places."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,10 +92,9 @@ class Survey:
         """A note on hot and dead pixels, on each pair of objects that came together, and on each object that is not
         round or has other light beside it."""
         if self.defects is not None:
-            rows, columns = np.nonzero(self.defects)
-            some = ", ".join(f"{x},{y}" for x, y in zip(columns[:_SHOWN], rows[:_SHOWN], strict=True))
-            what = "hot or dead pixel is" if len(rows) == 1 else "hot or dead pixels are"
-            yield f"{len(rows)} {what} left out, at {some}{' and others' if len(rows) > _SHOWN else ''}"
+            yield defects_note(self.defects)
+        elif len(self.places) < FEWEST:
+            yield f"{len(self.places)} frames are too few to find hot and dead pixels: {FEWEST} are needed"
         for a, b in np.argwhere(np.triu(self.together.any(axis=0))):
             frames = _stretches(np.flatnonzero(self.together[:, a, b]), 1, len(self.together))
             yield (

@@ -231,6 +231,10 @@ def find_objects(film: Film, settings: FilmSettings) -> Objects:
     """
     if settings.places and len(settings.places) != settings.track:
         raise ImportingError(f"{len(settings.places)} places are given for --track {settings.track}: give one for each")
+    rows, columns = film.shape
+    for x, y in settings.places:
+        if not (-0.5 <= x <= columns - 0.5 and -0.5 <= y <= rows - 0.5):
+            raise ImportingError(f"{film.name}: --at {x:g},{y:g} is outside its pictures of {columns} x {rows} pixels")
     light = FilmLight(film, settings)
     objects = _found(film, settings, light)
     if not (wrong := find_defects(film, light, objects.sd)).any():

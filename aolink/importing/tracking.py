@@ -58,6 +58,8 @@ def tracked(
         )
     known = survey(film, settings, find_objects(film, settings))
     account.notes += tuple(known.notes())
+    if settings.scale is not None:
+        account.notes += ("--scale is not used: with --track the objects have the light that the rig file gives them",)
     windows = _Windows(rig, sensor, known)
     far, spread = windows.reach, spread_in(known, settings.frames_per_exposure)
     light, step, area = FilmLight(film, settings, known.defects), 0, sensor.pixel_size

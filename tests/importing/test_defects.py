@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from aolink.estimation import run
 from aolink.importing.film import array_film
 from aolink.importing.first_rig import first_rig
 from aolink.importing.frames import FilmSettings
@@ -17,7 +19,8 @@ from aolink.importing.survey import survey
 from aolink.importing.tracker import find_objects
 from aolink.numerics.arrays import FloatArray
 from aolink.recording.reader import Recording
-from aolink.rig import parse_rig
+from aolink.rig import load_rig, parse_rig
+from aolink.simulation.model import simulate
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
 from paper_report.spot_films import SpotFilm, random_walk, resonance, spot_film
@@ -27,6 +30,9 @@ SETTINGS = FilmSettings(rate_hz=100.0, subtract_median=True, track=2, places=tup
 FRAMES = 96
 AT = ((26, 35), (27, 35), (50, 10), (0, 60), (95, 63))
 """Pixels (x, y) that are made hot: a pair beside an object, one on the ground, one at an edge, one in a corner."""
+THREE = ((10, 10), (11, 10), (12, 10), (50, 10), (50, 11), (51, 11), (71, 34), (72, 34), (72, 35))
+"""Three in a row, and three about a corner: on the ground, and in light."""
+NOTE = "1 hot or dead pixel is left out, at 31,30"
 
 
 def still(rng: np.random.Generator) -> FloatArray:
@@ -61,9 +67,9 @@ def test_a_film_without_hot_pixels_has_none(motion, sd):
         assert found.defects is None
 
 
-def with_hot(film: SpotFilm, by: float) -> NDArray[np.uint16]:
+def with_hot(film: SpotFilm, by: float, at: Sequence[tuple[int, int]] = AT) -> NDArray[np.uint16]:
     frames = film.frames.astype(np.float64)
-    for x, y in AT:
+    for x, y in at:
         frames[:, y, x] += by
     return np.asarray(frames.clip(0).round().astype(np.uint16))
 
@@ -76,6 +82,41 @@ def test_hot_and_dead_pixels_are_found_where_they_are(motion, by):
     found = find_objects(film, SETTINGS)
     assert found.defects is not None
     assert {(int(x), int(y)) for y, x in np.argwhere(found.defects)} == set(AT)
+
+
+@pytest.mark.parametrize("motion", [still, walk, vibration])
+def test_three_hot_pixels_beside_each_other_are_found(motion):
+    rng = np.random.default_rng(15)
+    film = array_film(with_hot(spot_film(rng, motion(rng), MIDDLES), 3000.0, THREE), "film")
+    found = find_objects(film, SETTINGS)
+    assert found.defects is not None
+    assert {(int(x), int(y)) for y, x in np.argwhere(found.defects)} == set(THREE)
+
+
+def test_a_hot_pixel_of_a_film_that_nothing_is_followed_in(tmp_path):
+    """It is masked, and estimates are as in the same film without it."""
+    rig = load_rig("sh-4x4")
+    clean = np.array([each.pixels for each in simulate(rig, 12, seed=16)])
+    hot = clean.copy()
+    hot[:, 30, 31] += 5000
+    paths = []
+    for name, counts, notes, masked in (("clean", clean, (), set()), ("hot", hot, (NOTE,), {(30, 31)})):
+        target = tmp_path / f"{name}.mcap"
+        account = import_film(array_film(counts, name), rig, FilmSettings(), target)
+        assert tuple(note for note in account.notes if "hot" in note) == notes
+        exposures = list(Recording(target).exposures())
+        assert {tuple(at) for each in exposures for at in np.argwhere(~each.mask).tolist()} == masked
+        paths.append(np.array([each.path for each in run(rig, exposures, ["profile"])["profile"]]))
+    assert np.abs(paths[1] - paths[0]).max() < 0.02
+
+
+@pytest.mark.parametrize("frames", [8, 9])
+def test_a_film_too_short_to_find_hot_pixels_says_so(frames):
+    film = array_film(
+        spot_film(np.random.default_rng(17), still(np.random.default_rng())[:frames], MIDDLES).frames, "film"
+    )
+    notes = list(survey(film, SETTINGS, find_objects(film, SETTINGS)).notes())
+    assert ("8 frames are too few to find hot and dead pixels: 9 are needed" in notes) == (frames == 8)
 
 
 def test_a_hot_pixel_is_masked_in_a_window_that_moves_over_it(tmp_path):

@@ -283,6 +283,24 @@ def test_a_fits_image_is_a_film_of_one_frame(tmp_path):
     check(open_film(others.write_fits(tmp_path / "a.fits", frames[0])), frames)
 
 
+def test_a_fits_cube_with_an_axis_of_length_one(tmp_path):
+    frames = numbers(np.uint16)
+    check(open_film(others.write_fits(tmp_path / "a.fits", frames[None])), frames)
+
+
+def test_of_several_fits_cubes_the_first_is_taken_and_said(tmp_path):
+    frames = numbers(np.int16)
+    fits.HDUList([fits.PrimaryHDU(frames), fits.ImageHDU(frames + 1)]).writeto(tmp_path / "a.fits")
+    film = open_film(tmp_path / "a.fits")
+    check(film, frames)
+    assert film.notes == ("a.fits holds 2 cubes: the first is taken",)
+
+
+def test_a_fits_cube_compressed_in_tiles_is_refused_with_what_to_do(tmp_path):
+    fits.HDUList([fits.PrimaryHDU(), fits.CompImageHDU(numbers(np.int16))]).writeto(tmp_path / "a.fits.fz")
+    assert "unpack it first, with funpack" in refused(tmp_path / "a.fits.fz")
+
+
 def test_fits_numbers_with_a_scale(tmp_path):
     frames = numbers(np.int16)
     primary = fits.PrimaryHDU(frames)

@@ -2,8 +2,8 @@
 
 Six spots walk at random, or shake with a resonance that has about a period in an exposure. The rig file is that of
 `aolink rig --from`; for a resonance, its fitted [plant] is replaced by the one that the film was made with, so that
-the figures are the estimators' and not the fit's. Errors are against the path that the film was made with, not the
-tracker's.
+the figures are the estimators' and not the fit's. A second table has films, also of Ornstein-Uhlenbeck processes, with
+the fitted [plant]. Errors are against the path that the film was made with, not the tracker's.
 """
 
 import re
@@ -27,7 +27,7 @@ from paper_report.blocks import Block, Heading, Table, Text
 from paper_report.ensemble import IntervalEstimate, mean, ratio
 from paper_report.numbers import Effort
 from paper_report.spheres import centroids
-from paper_report.spot_films import random_walk, resonance, spot_film
+from paper_report.spot_films import ornstein_uhlenbeck, random_walk, resonance, spot_film
 
 _SPOTS, _PITCH = 6, 48
 _WALK, _SHAKE = 0.45, 1.5
@@ -38,6 +38,8 @@ _SKIP_WALK, _SKIP_SHAKE = 2, 4
 """Exposures that are not scored, because the motion before is not known."""
 _FIRST_SEED = 11
 """First seed used; earlier ones were used while the importer was changed."""
+_FIRST_FITTED_SEED = 51
+"""First seed of the films with a fitted [plant]."""
 NAMES = ("o1", "profile", "sampled")
 
 
@@ -51,25 +53,45 @@ class Kind:
     """Periods of the vibration in an exposure; 0: a random walk."""
     lasts: float = 0.0
     """Periods until the vibration's amplitude is forgotten."""
+    forgets: float = 0.0
+    """Frames until an Ornstein-Uhlenbeck process has forgotten its place; 0: another motion."""
+    fitted: bool = False
+    """The [plant] is the fitted one, also for a vibration."""
 
     def __str__(self) -> str:
+        if self.forgets:
+            return f"Ornstein-Uhlenbeck process, forgets in {self.forgets:g} frames, {self.frames} frames"
         if not self.periods:
             return f"walk, {self.frames} frames"
+        if self.fitted:
+            return f"vibration of {self.frames / self.periods:.2g} frames, {self.frames} frames"
         return f"resonance, {self.periods:g} periods in {self.frames} frames, lasts {self.lasts:g}"
 
 
 WALKS = (Kind(8), Kind(12), Kind(24))
 SHAKES = tuple(Kind(12, periods, lasts) for lasts in (50.0, 10.0) for periods in (0.6, 1.0, 1.6, 2.5))
+_VIBRATIONS = ((3.7, 12), (5.3, 8), (5.3, 10), (7, 12), (12, 12), (30, 12))
+"""Period of a vibration and length of an exposure, frames."""
+_FORGETS = ((10, 8), (10, 12), (20, 8), (20, 12), (35, 8), (35, 12), (50, 12))
+"""Memory of an Ornstein-Uhlenbeck process and length of an exposure, frames."""
+FITTED = (
+    *(Kind(frames, frames / period, 50.0, fitted=True) for period, frames in _VIBRATIONS),
+    *(Kind(frames, fitted=True) for frames in (8, 24)),
+    *(Kind(frames, forgets=forgets, fitted=True) for forgets, frames in _FORGETS),
+)
 
 
 def made(kind: Kind, seed: int, exposures: int) -> tuple[Rig, list[Exposure], FloatArray]:
     """Rig, exposures and true paths, (exposures, outputs, frames), slope units, of one film."""
-    rng = np.random.default_rng([seed, kind.frames, round(10 * kind.periods), round(kind.lasts)])
+    of_kind = [kind.frames, round(10 * kind.periods), round(kind.lasts), round(kind.forgets)]
+    rng = np.random.default_rng([seed, *(of_kind if kind.forgets else of_kind[:3])])
     K, count = kind.frames, exposures * kind.frames
     middles = np.array([[(k + 0.5) * _PITCH, _PITCH / 2] for k in range(_SPOTS)])
     if kind.periods:
         period = K / kind.periods
         motion, light = resonance(rng, count, _SPOTS, _SHAKE, period, kind.lasts), _LIGHT["shake"]
+    elif kind.forgets:
+        motion, light = ornstein_uhlenbeck(rng, count, _SPOTS, _WALK, kind.forgets), _LIGHT["walk"]
     else:
         motion, light = random_walk(rng, count, _SPOTS, _WALK), _LIGHT["walk"]
         motion -= motion.mean(axis=(0, 1))
@@ -80,7 +102,7 @@ def made(kind: Kind, seed: int, exposures: int) -> tuple[Rig, list[Exposure], Fl
     settings = FilmSettings(rate_hz=100.0, subtract_median=True, track=_SPOTS, frames_per_exposure=K, places=places)
     source = array_film(film.frames, "film")
     text = first_rig(source, settings, "film").text
-    if kind.periods:
+    if kind.periods and not kind.fitted:
         text = _with_resonance(text, K / kind.periods, kind.lasts)
     rig = parse_rig(text)
     with tempfile.TemporaryDirectory() as folder:
@@ -164,6 +186,33 @@ def made_films(effort: Effort) -> list[MadeFilm]:
     seeds = range(_FIRST_SEED, _FIRST_SEED + effort.made_seeds)
     kinds = (WALKS + SHAKES)[slice(*effort.made_kinds)]
     return [made_film(kind, NAMES, seeds, effort.made_exposures, effort.particles) for kind in kinds]
+
+
+def fitted_films(effort: Effort) -> list[MadeFilm]:
+    """Films with the rig file that is fitted to them, of other seeds."""
+    seeds = range(_FIRST_FITTED_SEED, _FIRST_FITTED_SEED + effort.fitted_seeds)
+    kinds = FITTED[: effort.fitted_kinds]
+    return [made_film(kind, ("profile",), seeds, effort.fitted_exposures) for kind in kinds]
+
+
+def fitted_section(found: Sequence[MadeFilm], effort: Effort) -> list[Block]:
+    """A row for each kind of film."""
+    return [
+        Text(
+            f"The same for `profile` with the rig file of `aolink rig --from` as it is, {effort.fitted_seeds} other"
+            f" seeds of {effort.fitted_exposures} exposures; vibrations last 50 periods:"
+        ),
+        Table(
+            ["film", "over held", "smoothed, over interpolated", "inside"],
+            [
+                [
+                    str(each.kind),
+                    *(of["profile"].interval for of in (each.over_held, each.over_interpolated, each.coverage)),
+                ]
+                for each in found
+            ],
+        ),
+    ]
 
 
 def made_section(found: Sequence[MadeFilm], effort: Effort) -> list[Block]:

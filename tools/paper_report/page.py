@@ -18,7 +18,7 @@ from paper_report.ensemble import Cell, IntervalEstimate
 from paper_report.judge import Row as JudgedRow
 from paper_report.limit import Scene, against_o1_section, limit_section
 from paper_report.loop import loop_section
-from paper_report.made_films import MadeFilm, made_section
+from paper_report.made_films import MadeFilm, fitted_section, made_section
 from paper_report.numbers import (
     Effort,
     ErrorRow,
@@ -58,6 +58,8 @@ class Results:
     over_o1: list[tuple[str, dict[str, IntervalEstimate]]]
     film: list[Film]
     made: list[MadeFilm]
+    fitted: list[MadeFilm]
+    """With the rig file that is fitted to them."""
     family: list[JudgedRow]
     loops: list[ClosedLoops]
     cells: list[Cell]
@@ -101,6 +103,7 @@ def build(results: Results) -> list[Block]:
         *family_section(results.family, _picture("family.png")),
         *film_section(results.film),
         *made_section(results.made, results.effort),
+        *fitted_section(results.fitted, results.effort),
         *loop_section(results.loops),
     ]
 
