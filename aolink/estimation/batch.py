@@ -32,8 +32,7 @@ class Batch:
             return
         ((n_steps, offset, _),) = kinds
         # One exposure of many axes is megabytes, and not copied.
-        series = [each.inputs for each in exposures]
-        inputs = series[0][None] if len(series) == 1 else np.concatenate(series).reshape(len(series), *series[0].shape)
+        inputs = exposures[0].inputs[None] if len(exposures) == 1 else np.array([each.inputs for each in exposures])
         self.finite = [True] * len(exposures)
         self.model = exposure_model(rig.plant, n_steps, offset)
         with np.errstate(invalid="ignore"):
