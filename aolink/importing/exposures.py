@@ -57,7 +57,8 @@ def imported(film: Film, rig: Rig, settings: FilmSettings, account: FilmAccount)
         The film does not fit the rig file.
     """
     periods, notes = frame_times(film, rig, settings)
-    end = (int(periods[-1]) + 1) * rig.timing.frame_period_steps * rig.timing.fast_step_ns
+    frame_ns = rig.timing.frame_period_steps * rig.timing.fast_step_ns
+    end = (int(periods[-1]) // settings.frames_per_exposure + 1) * frame_ns
     start = settings.start_ns if settings.start_ns is not None else film.start_ns or 0
     if not 0 <= start < _LATEST_NS - end:
         raise ImportingError(f"{film.name} has a start or an end that is not from 1970 to 2262: give the right --start")
@@ -67,13 +68,13 @@ def imported(film: Film, rig: Rig, settings: FilmSettings, account: FilmAccount)
     if film.slopes:
         yield from _of_slopes(film, rig, settings, periods, account)
         return
-    if settings.scale is not None and settings.scale < 0:
-        raise ImportingError(f"--scale {settings.scale:g} must be above 0 for pictures: dark objects need --invert")
     if settings.track:
         from aolink.importing.tracking import tracked
 
         yield from tracked(film, rig, settings, periods, account)
         return
+    if settings.scale is not None and settings.scale < 0:
+        raise ImportingError(f"--scale {settings.scale:g} must be above 0 for pictures: dark objects need --invert")
     if film.shape != rig.sensor.shape:
         rows, columns = rig.sensor.shape
         raise ImportingError(

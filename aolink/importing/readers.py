@@ -302,7 +302,14 @@ def _fits(path: Path) -> Film:
         raise ImportingError(f"{path}: {error}") from None
     if "AOT-VERS" in header:
         return _aot(path)
-    more = sum(each[1].shape == stored.shape for each in arrays)
+    more, damaged = 0, ""
+    try:
+        for each in arrays:
+            more += each[1].ndim > 2 if stored.ndim > 2 else each[1].shape == stored.shape
+    except FrameError as error:
+        if stored.ndim == 2:
+            raise ImportingError(f"{path}: {error}") from None
+        damaged = f"{path.name}: what follows the first cube cannot be read ({error})"
     if stored.ndim == 2 and more:
         raise ImportingError(
             f"{path} holds {more + 1} arrays of shape {stored.shape}, and which of them are frames is not known: stack"
@@ -313,6 +320,7 @@ def _fits(path: Path) -> Film:
         cube = cube[0]
     if cube.ndim != 3:
         raise ImportingError(f"{path} holds an array of shape {stored.shape}, expected (frames, rows, columns)")
+    several = f"{path.name} holds {more + 1} cubes: the first is taken" if more else ""
     numbers = {key: _float(header.get(key)) for key in ("EXPTIME", "EXPOSURE", "FRATE", "FRAMRATE", "KINTIME")}
     cycle = numbers["KINTIME"]
     sample = _values(cube[:1, :1, :1], scale, zero)
@@ -321,7 +329,7 @@ def _fits(path: Path) -> Film:
         frames=lambda: (_values(frame, scale, zero) for frame in cube),
         rate_hz=numbers["FRATE"] or numbers["FRAMRATE"] or (1 / cycle if cycle else None),
         exposure_s=numbers["EXPTIME"] or numbers["EXPOSURE"], start_ns=_date(header.get("DATE-OBS")),
-        notes=(f"{path.name} holds {more + 1} cubes: the first is taken",) if more else (),
+        notes=tuple(filter(None, (several, damaged))),
     )  # fmt: skip
 
 

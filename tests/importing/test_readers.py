@@ -296,6 +296,25 @@ def test_of_several_fits_cubes_the_first_is_taken_and_said(tmp_path):
     assert film.notes == ("a.fits holds 2 cubes: the first is taken",)
 
 
+def test_cubes_of_other_shapes_are_counted_as_well(tmp_path):
+    frames = numbers(np.int16)
+    fits.HDUList([fits.PrimaryHDU(frames), fits.ImageHDU(frames[:3])]).writeto(tmp_path / "a.fits")
+    assert open_film(tmp_path / "a.fits").notes == ("a.fits holds 2 cubes: the first is taken",)
+
+
+@pytest.mark.parametrize("kept", [100, 2880, -100])
+def test_a_whole_cube_is_read_whatever_follows_it(tmp_path, kept):
+    """Zeros after its end, or a second cube that is cut off."""
+    frames = numbers(np.int16)
+    fits.PrimaryHDU(frames).writeto(tmp_path / "a.fits")
+    fits.HDUList([fits.PrimaryHDU(frames), fits.ImageHDU(frames)]).writeto(tmp_path / "two.fits")
+    whole, two = (tmp_path / "a.fits").read_bytes(), (tmp_path / "two.fits").read_bytes()
+    (tmp_path / "a.fits").write_bytes(whole + bytes(kept) if kept > 0 else two[: len(whole) + 2880 + 100])
+    film = open_film(tmp_path / "a.fits")
+    check(film, frames)
+    assert "what follows the first cube cannot be read" in film.notes[0]
+
+
 def test_a_fits_cube_compressed_in_tiles_is_refused_with_what_to_do(tmp_path):
     fits.HDUList([fits.PrimaryHDU(), fits.CompImageHDU(numbers(np.int16))]).writeto(tmp_path / "a.fits.fz")
     assert "unpack it first, with funpack" in refused(tmp_path / "a.fits.fz")
