@@ -11,7 +11,8 @@ from aolink.exporting.table import to_pandas
 from aolink.exposure import Exposure
 from aolink.plotting.overview import need_exposures, overview
 from aolink.plotting.session import plot_blur, plot_nis
-from aolink.recording.reader import Recording, RecordingSlice
+from aolink.recording.reader import Recording
+from aolink.recording.slices import RecordingSlice
 from aolink.series import Series
 
 if TYPE_CHECKING:

@@ -16,17 +16,17 @@ from aolink.recording.schemas_pb2 import Estimate as EstimateMessage
 from aolink.recording.schemas_pb2 import ExposureInfo
 
 _LOSSES = (
-    "frames_lost", "frames_incomplete", "scenes_lost", "scenes_incomplete", "line_sequence_gaps", "line_bad_crc",
-    "line_bad_framing", "line_bad_payload", "chunks_refused", "steps_late", "steps_refused", "steps_not_reported",
-    "steps_clipped", "steps_parked", "ports_vanished", "control_open_exposures", "control_late_exposures",
-    "control_misfit_exposures", "control_fall_back_exposures",
+    "frames_lost", "frames_incomplete", "scenes_lost", "scenes_incomplete", "connection_sequence_gaps",
+    "connection_bad_crc", "connection_bad_framing", "connection_bad_payload", "chunks_refused", "steps_late",
+    "steps_refused", "steps_not_reported", "steps_clipped", "steps_parked", "ports_vanished",
+    "control_open_exposures", "control_late_exposures", "control_misfit_exposures", "control_fall_back_exposures",
 )  # fmt: skip
 """A session's counts of losses and faults."""
 _FORMERLY = {
-    "line_sequence_gaps": "packets_missing",
-    "line_bad_crc": "packets_bad_crc",
-    "line_bad_framing": "packets_bad_framing",
-    "line_bad_payload": "packets_bad_payload",
+    "connection_sequence_gaps": "packets_missing",
+    "connection_bad_crc": "packets_bad_crc",
+    "connection_bad_framing": "packets_bad_framing",
+    "connection_bad_payload": "packets_bad_payload",
 }
 """Their names in older recordings."""
 _ENDS = ("commanded", "applied", "superseded", "late", "refused", "not_reported")

@@ -26,9 +26,9 @@ from aolink.recording.messages import END_OF_TIME, RawMessage, RecordedMessage, 
 from aolink.recording.remote import Url, only_paths
 from aolink.recording.scan import Loss
 from aolink.recording.side_files import check_is_side_of
+from aolink.recording.slices import NumberedSeries, RecordingSlice
 from aolink.recording.sound import what_is_wrong
 from aolink.rig import Rig, parse_rig
-from aolink.series import Series
 from aolink.wire.messages_pb2 import Applied, CommandBlock
 from aolink.wire.runs_pb2 import Run
 
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from aolink.restoration import RestoredPictures
 
 
-class Recording(RecordedMessages, Series):
+class Recording(RecordedMessages, NumberedSeries):
     """A recording on disk, read piece by piece, so files may be larger than the memory.
 
     It is a series of exposures: a loop over it gives them, and so do its length, numbers and slices. The numbers are
@@ -370,59 +370,6 @@ class Recording(RecordedMessages, Series):
             self.schemas = each.schemas | self.schemas
             self.encodings |= each.encodings
         self.rig, self.rig_is_recorded = self._side[0].rig, True
-
-
-class RecordingSlice(Series):
-    """The result of ``recording[10:20]``: these exposures and their estimates, as in the whole recording, bit for bit.
-
-    From a file with an index little more is read than they need. Estimators that are run on a slice begin anew there.
-    """
-
-    def __init__(self, recording: Recording, numbers: range) -> None:
-        if numbers.step < 0:
-            raise ValueError("a recording is read forwards: take a slice with a positive step, and turn its list round")
-        self.recording, self.numbers = recording, numbers
-        self.rig, self.path, self.metadata = recording.rig, recording.path, recording.metadata
-
-    @property
-    def estimators(self) -> list[str]:
-        return self.recording.estimators
-
-    @property
-    def has_truth(self) -> bool:
-        return self.recording.has_truth
-
-    def exposures(self) -> Iterator[Exposure]:
-        for start, stop in self._runs():
-            yield from self.recording.exposures(start, stop)
-
-    def iter_estimates(self, name: str) -> Iterator[Estimate]:
-        for start, stop in self._runs():
-            yield from self.recording.iter_estimates(name, start, stop)
-
-    def _runs(self) -> Iterator[tuple[int, int]]:
-        """First number and end of each run of consecutive numbers."""
-        if self.numbers.step == 1:
-            yield self.numbers.start, self.numbers.stop
-        else:
-            yield from ((number, number + 1) for number in self.numbers)
-
-    def __len__(self) -> int:
-        return len(self.numbers)
-
-    @overload
-    def __getitem__(self, index: int) -> Exposure: ...
-    @overload
-    def __getitem__(self, index: slice) -> RecordingSlice: ...
-    def __getitem__(self, index: int | slice) -> Exposure | RecordingSlice:
-        if isinstance(index, slice):
-            return RecordingSlice(self.recording, self.numbers[index])
-        return self.recording[self.numbers[index]]
-
-    def title(self) -> str:
-        numbers = self.numbers
-        step = f":{numbers.step}" if numbers.step > 1 else ""
-        return f"Recording {self.path.name}[{numbers.start}:{numbers.stop}{step}]"
 
 
 @lru_cache(maxsize=8)

@@ -34,9 +34,9 @@ CLOCK = "/clock"
 LOG = "/log"
 
 
-LINE_FAULTS = ("bad_crc", "bad_framing", "bad_payload", "sequence_gaps", "duplicates")
-"""Fields of ``LinkStatistics`` that count what goes wrong on a device's line. The metadata at the end of a recording
-have the sums over the devices, with ``line_`` before the names."""
+CONNECTION_FAULTS = ("bad_crc", "bad_framing", "bad_payload", "sequence_gaps", "duplicates")
+"""Fields of ``LinkStatistics`` that count what goes wrong on the connection to a device. The metadata at the end of a
+recording have the sums over the devices, with ``connection_`` before the names."""
 
 
 @dataclass(frozen=True, kw_only=True)

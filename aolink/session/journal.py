@@ -1,5 +1,5 @@
 """The journal of a session: the messages that it records, and among them its log and facts about the devices' clocks
-and lines."""
+and connections."""
 
 from __future__ import annotations
 
@@ -65,10 +65,10 @@ class Journal:
             )
 
     def statistics(self, devices: Sequence[Camera | Mirror], now: int) -> None:
-        """Record the counts of each device's line."""
+        """Record what each connection has counted."""
         counts = {device.name: device.statistics() for device in devices}
-        for fault in topics.LINE_FAULTS:
-            self.report.line_faults[fault] = sum(each.get(fault, 0) for each in counts.values())
+        for fault in topics.CONNECTION_FAULTS:
+            self.report.connection_faults[fault] = sum(each.get(fault, 0) for each in counts.values())
         for name, each in counts.items():
             if each:
                 self.record(topics.LINK, pb.LinkStatistics(device=name, **each), now)

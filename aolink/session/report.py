@@ -10,7 +10,7 @@ from typing import Any
 
 from aolink.control import Act, State
 from aolink.recording import schemas_pb2 as pb
-from aolink.recording.topics import LINE_FAULTS
+from aolink.recording.topics import CONNECTION_FAULTS
 from aolink.session.estimating import Outcome
 from aolink.wire import messages_pb2 as wire
 
@@ -115,8 +115,8 @@ class Report:
     """The counts of complete, incomplete and lost frames for the picture sensor."""
     scenes_incomplete: int = 0
     scenes_lost: int = 0
-    line_faults: dict[str, int] = field(default_factory=lambda: dict.fromkeys(LINE_FAULTS, 0))
-    """What went wrong on the devices' lines, by the names of `LINE_FAULTS`; both devices together."""
+    connection_faults: dict[str, int] = field(default_factory=lambda: dict.fromkeys(CONNECTION_FAULTS, 0))
+    """What went wrong on the connections to the devices, by the names of `CONNECTION_FAULTS`; both devices together."""
     chunks_refused: int = 0
     """Invalid chunks of frames."""
     steps_commanded: int = 0
@@ -167,7 +167,7 @@ class Report:
         facts = asdict(replace(self, control=None))
         for name in ("latencies", "warnings", "files", "estimation", "unwatched", "control"):
             del facts[name]
-        facts |= {f"line_{name}": count for name, count in facts.pop("line_faults").items()}
+        facts |= {f"connection_{name}": count for name, count in facts.pop("connection_faults").items()}
         for name, each in self.estimation.items():
             facts[f"skipped_{name}"] = each.skipped
             if each.took_ms:

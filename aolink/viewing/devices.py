@@ -18,7 +18,7 @@ from aolink.viewing.series import Drawing, Style, send_axes, send_line, send_sta
 from aolink.viewing.timebase import Timebase
 from aolink.wire.messages_pb2 import Applied
 
-LINK_COUNTS = (*topics.LINE_FAULTS, "retransmits", "reports_asked")
+LINK_COUNTS = (*topics.CONNECTION_FAULTS, "retransmits", "reports_asked")
 """Fields of LinkStatistics that count faults."""
 
 _MOST_INPUTS = 2

@@ -1,4 +1,4 @@
-"""The paths of the entities, each once for the functions that send it and for the layout that shows it.
+"""The roots of the entities' paths, for the functions that send entities and for the layout that shows them.
 
 An entity that shows a topic's messages has the topic's name.
 """

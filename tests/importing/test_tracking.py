@@ -196,6 +196,13 @@ def test_an_object_that_leaves_is_said_and_its_window_left_out(walkers: SpotFilm
     assert all(each.mask[:, columns:].any() == (k < 20) for k, each in enumerate(exposures))
 
 
+def test_a_scale_is_said_not_to_be_used(walkers: SpotFilm, tmp_path: Path) -> None:
+    source = array_film(walkers.frames[:80], "film")
+    rig = parse_rig(first_rig(source, SETTINGS, "film").text)
+    account = import_film(source, rig, replace(SETTINGS, scale=2.0), tmp_path / "a.mcap")
+    assert "--scale is not used" in account.notes[-1]
+
+
 def test_a_drift_of_all_objects_is_said() -> None:
     rng = np.random.default_rng(2)
     motion = random_walk(rng, 160, 2, 0.1)

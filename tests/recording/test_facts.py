@@ -16,8 +16,8 @@ def losses(path: Path, **metadata: str) -> dict[str, int]:
     return found
 
 
-def test_faults_of_lines_have_one_name_in_old_recordings_and_new_ones(tmp_path: Path) -> None:
+def test_faults_of_connections_have_one_name_in_old_recordings_and_new_ones(tmp_path: Path) -> None:
     path = write_small(tmp_path / "s.mcap", exposures=1)
     old = losses(path, packets_missing="3", packets_bad_crc="0", packets_bad_payload="2")
-    assert old == {"line_sequence_gaps": 3, "line_bad_payload": 2}
-    assert losses(path, line_sequence_gaps="3", line_bad_crc="0", line_bad_payload="2") == old
+    assert old == {"connection_sequence_gaps": 3, "connection_bad_payload": 2}
+    assert losses(path, connection_sequence_gaps="3", connection_bad_crc="0", connection_bad_payload="2") == old

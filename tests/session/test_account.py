@@ -108,7 +108,9 @@ def test_every_commanded_step_ends_once_at_every_error_rate(
     if max(faults.values(), default=0) <= 1e-4:  # then nothing is lost for good
         assert run.error is None
         assert run.report.steps_commanded == run.report.steps_applied == 4000
-        assert (run.report.reports_asked > 0) == (run.report.line_faults["sequence_gaps"] > run.report.frames_lost)
+        assert (run.report.reports_asked > 0) == (
+            run.report.connection_faults["sequence_gaps"] > run.report.frames_lost
+        )
         check_inputs_are_what_was_applied(run, rig)
 
 

@@ -57,8 +57,8 @@ def test_a_signed_session_over_a_bad_line_loses_no_command(tmp_path: Path) -> No
     ) as ports:
         report = record(signed(RIG, *ports, key), None, None, tmp_path / "a.mcap", exposures=20)
     assert (report.ended, report.steps_applied) == ("complete", 4000)
-    assert report.line_faults["bad_crc"] > 0
-    assert report.line_faults["bad_payload"] > 0
+    assert report.connection_faults["bad_crc"] > 0
+    assert report.connection_faults["bad_payload"] > 0
 
 
 @pytest.mark.long

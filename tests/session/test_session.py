@@ -35,7 +35,7 @@ def test_everything_is_received_and_recorded(recorded: Session) -> None:
     report, recording = recorded.report, Recording(recorded.path)
     assert (report.ended, report.exposures, report.frames_received) == ("complete", EXPOSURES, EXPOSURES)
     assert report.frames_lost == report.frames_incomplete == report.blocks_retransmitted == 0
-    assert not any(report.line_faults.values())
+    assert not any(report.connection_faults.values())
     assert report.steps_commanded == report.steps_applied == 200 * EXPOSURES
     assert report.steps_late == report.steps_parked == 0
     assert recording.complete
@@ -200,10 +200,10 @@ def test_a_bad_link_loses_frames_and_nothing_else(tmp_path: Path) -> None:
     assert report.ended == "complete"
     assert 0 < report.frames_lost < 15
     assert report.frames_received == 60 - report.frames_lost == report.exposures
-    assert report.line_faults["bad_crc"] + report.line_faults["bad_framing"] > 0
-    assert report.line_faults["sequence_gaps"] > 0
+    assert report.connection_faults["bad_crc"] + report.connection_faults["bad_framing"] > 0
+    assert report.connection_faults["sequence_gaps"] > 0
     said = recording_facts(Recording(paths[0]))["losses"]
-    assert said["line_sequence_gaps"] == report.line_faults["sequence_gaps"]
+    assert said["connection_sequence_gaps"] == report.connection_faults["sequence_gaps"]
     assert report.blocks_retransmitted > 0
     # Every step was commanded and applied, and what was not reported was asked for again.
     assert report.steps_commanded == report.steps_applied == 60 * 200

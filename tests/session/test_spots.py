@@ -38,7 +38,7 @@ def test_every_frame_survives_the_wire_as_the_model_made_it(spots: Session) -> N
     report, recording = spots.report, Recording(spots.path)
     assert (report.ended, report.exposures, report.frames_received) == ("complete", EXPOSURES, EXPOSURES)
     assert report.frames_lost == report.frames_incomplete == report.blocks_retransmitted == 0
-    assert not any(report.line_faults.values())
+    assert not any(report.connection_faults.values())
     simulated = aolink.simulate(recording.rig, EXPOSURES)
     for ours, theirs in zip(recording.exposures(), simulated, strict=True):
         assert ours.pixels.shape == recording.rig.sensor.shape

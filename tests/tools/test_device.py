@@ -71,7 +71,7 @@ def test_a_signed_session(tmp_path: Path) -> None:
         finally:
             process.terminate()
     assert [(report.ended, report.exposures) for report in reports] == [("complete", 3)] * 2
-    assert reports[0].line_faults["bad_payload"] == 0
+    assert reports[0].connection_faults["bad_payload"] == 0
 
 
 def test_it_allocates_nothing() -> None:

@@ -47,7 +47,7 @@ def session_as_json(report: Report) -> dict[str, Any]:
 
 
 def session(report: Report) -> Table:
-    """Frames, commands, lines, clock and latencies of a session."""
+    """Frames, commands, connections, clock and latencies of a session."""
     table = Table(box=None, show_header=False, pad_edge=False)
     table.add_row(
         "frames",
@@ -55,9 +55,11 @@ def session(report: Report) -> Table:
         f" {report.frames_lost} lost whole",
     )
     table.add_row(
-        "lines",
+        "connections",
         "discarded: {bad_crc} for their checksum, {bad_framing} for their framing, {bad_payload} for their content;"
-        " {duplicates} duplicates; {sequence_gaps} missing by their sequence numbers".format(**report.line_faults),
+        " {duplicates} duplicates; {sequence_gaps} missing by their sequence numbers".format_map(
+            report.connection_faults
+        ),
     )
     table.add_row(
         "commands",

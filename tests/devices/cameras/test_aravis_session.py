@@ -52,7 +52,7 @@ def test_a_session_is_recorded_estimated_and_replayed(
     assert recording.metadata["camera_lacks"] == lacks
     link = messages_of(LinkStatistics, recording, topics.LINK)[-1]
     chunks_lost = sum(each.chunks_lost for each in messages_of(ExposureInfo, recording, topics.EXPOSURE))
-    assert (link.device, report.line_faults["sequence_gaps"]) == ("camera", link.sequence_gaps)
+    assert (link.device, report.connection_faults["sequence_gaps"]) == ("camera", link.sequence_gaps)
     assert link.sequence_gaps >= chunks_lost
 
     exposures, estimates = list(recording.exposures()), list(estimate(recording, "o3"))
