@@ -37,7 +37,11 @@ GammaOption = Annotated[
     float, typer.Option("--gamma", min=0.1, max=10.0, help="Undo a gamma curve; most JPEG and video have 2.2.")
 ]
 TopicOption = Annotated[
-    str | None, typer.Option("--topic", help="Channel with the pictures, where an MCAP file or a bag has several.")
+    str | None,
+    typer.Option(
+        "--topic",
+        help="Channel of an MCAP file or a bag that has several with pictures; wavefront sensor of AO telemetry.",
+    ),
 ]
 
 
@@ -82,7 +86,7 @@ def import_(
     rig: Annotated[str, typer.Option(metavar="RIG.toml", help="What camera and plant the film shows.")],
     rate: RateOption = None,
     exposure: Annotated[
-        float | None, typer.Option(metavar="S", min=0.0, help="Exposure time of a frame, s, where the film lacks it.")
+        float | None, typer.Option(metavar="S", help="Exposure time of a frame, s, where the film lacks it.")
     ] = None,
     start: Annotated[
         str | None, typer.Option(metavar="DATE", help="Start of the film, such as 2026-11-22T09:30, in UTC.")
@@ -120,10 +124,12 @@ def import_(
         except ValueError:
             raise ImportingError(f"--start {start} is no date: give one such as 2026-11-22T09:30:00") from None
         start_ns = round((moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp() * 1e6) * 1000
+    if exposure is not None and not 0 < exposure < math.inf:
+        raise ImportingError(f"--exposure {exposure:g} must be above 0{' and finite' if exposure > 0 else ''}")
     if scale is not None and not 0 < abs(scale) < math.inf:
         raise ImportingError(f"--scale {scale:g} must be a finite number other than 0")
     settings = film_settings(
-        rate, frames, track, at, invert, gamma, exposure_s=exposure or None, start_ns=start_ns,
+        rate, frames, track, at, invert, gamma, exposure_s=exposure, start_ns=start_ns,
         subtract_median=background, scale=scale,
     )  # fmt: skip
     loaded = load_rig(rig)

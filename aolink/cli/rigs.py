@@ -50,6 +50,7 @@ if TYPE_CHECKING:
     "  |  aolink rig my.toml --from film.tif --rate 500 --track 3 --sum 8 (writes my.toml)"
 )
 def rig(
+    context: typer.Context,
     rig: RigArgument = "",
     check: Annotated[bool, typer.Option("--check", help="Check the rig file, print the findings, and end.")] = False,
     exposure_scan: Annotated[
@@ -102,6 +103,7 @@ def rig(
     """Run a simulated rig: print its two ports and serve them until stopped (Ctrl-C)."""
     from aolink.rig import load_rig, parse_light, with_faults
 
+    _check_goes_with(context, film)
     if film is not None:
         path = Path(rig or f"{film.stem}.toml")
         _write_first_rig(path, film, topic, film_settings(rate, frames, track, at, invert, gamma), overwrite)
@@ -155,6 +157,22 @@ def rig(
         for stream in streams.values():
             stream.close()
     stop.raise_if_asked()
+
+
+_OF_FILMS = frozenset(("rate", "frames", "track", "at", "invert", "gamma", "topic", "overwrite"))
+"""Parameters of `rig` that go with --from only, where no others but the rig's name go with it."""
+
+
+def _check_goes_with(context: typer.Context, film: Path | None) -> None:
+    """Refuse options that would have no effect."""
+    for each in context.command.params:
+        name = each.name or ""
+        source = context.get_parameter_source(name)
+        if source is None or source.name != "COMMANDLINE" or name in ("rig", "film"):
+            continue
+        if (name in _OF_FILMS) != (film is not None):
+            without = "needs --from FILM" if film is None else "makes no sense with --from, which writes a rig file"
+            raise typer.BadParameter(f"{each.opts[0]} {without}")
 
 
 def _write_first_rig(path: Path, source: Path, topic: str | None, settings: "FilmSettings", overwrite: bool) -> None:

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
-from mcap.reader import make_reader
+from mcap.reader import McapReader, NonSeekingReader, make_reader
+from mcap.records import Channel, Schema
+from PIL import UnidentifiedImageError
 
 from aolink.errors import ImportingError
 from aolink.extensions import needs_extra
@@ -24,6 +26,8 @@ _ENCODINGS = {
     "rgb8": "u1", "bgr8": "u1", "8uc3": "u1", "rgba8": "u1", "bgra8": "u1",
 }  # fmt: skip
 _COLOURS = {"rgb8": 3, "bgr8": 3, "8uc3": 3, "rgba8": 4, "bgra8": 4}
+_MAGIC = b"\x89MCAP0\r\n"
+_LOSSLESS = ("PNG", "BMP", "TIFF", "PPM")
 _LOSSY = "the pictures are compressed with JPEG, after a gamma curve"
 
 
@@ -42,28 +46,51 @@ class _Stamped:
 def mcap_film(path: Path, topic: str | None) -> Film:
     """The pictures on one channel of an MCAP file. Raises ImportingError."""
 
-    def channels() -> dict[str, str]:
-        with path.open("rb") as file:
-            summary = make_reader(file, validate_crcs=True).get_summary()
-        if summary is None:
-            raise ImportingError(f"{path} has no index: `aolink recover` or `mcap recover` makes one")
-        schemas = summary.schemas
-        return {
-            each.topic: f"{schemas[each.schema_id].name} in {each.message_encoding}"
-            for each in summary.channels.values()
-            if each.schema_id in schemas
-        }
-
-    kinds = channels()
-    chosen = _chosen(kinds, topic, path)
-    read = _DECODERS[kinds[chosen]]
+    with path.open("rb") as file:
+        if _is_cut_off(file):
+            raise ImportingError(
+                f"{path} has no end: it was cut off, or is still being written. `mcap recover` saves what is whole"
+                " of it (`aolink recover`, where it is a recording of aolink)"
+            )
+        summary = make_reader(file, validate_crcs=True).get_summary()
+        pairs: Iterable[tuple[Schema | None, Channel]]
+        indexed = summary is not None and bool(summary.channels)
+        if indexed and summary is not None:
+            pairs = [(summary.schemas.get(each.schema_id), each) for each in summary.channels.values()]
+            indexed = all(schema or not each.schema_id for schema, each in pairs)
+        if not indexed:  # the summary is optional, and so are the channels and the schemas in it
+            pairs = ((schema, each) for schema, each, _ in _linear(file).iter_messages(log_time_order=False))
+        found = {(each.topic, kind) for schema, each in pairs if (kind := _kind(schema, each))}
+    chosen = _chosen(dict(sorted(found, key=lambda one: one[1] in _DECODERS)), topic, path)  # a picture's kind wins
 
     def messages() -> Iterator[_Stamped]:
         with path.open("rb") as file:
-            for _, _, message in make_reader(file, validate_crcs=True).iter_messages(topics=[chosen]):
-                yield read(message.data, message.publish_time or message.log_time)
+            reader = make_reader(file, validate_crcs=True) if indexed else _linear(file)
+            for schema, channel, message in reader.iter_messages(topics=[chosen]):
+                if read := _DECODERS.get(_kind(schema, channel)):
+                    yield read(message.data, message.publish_time or message.log_time)
 
     return _film(path, chosen, messages)
+
+
+def _is_cut_off(file: IO[bytes]) -> bool:
+    """Whether an MCAP file begins as one and does not end as one."""
+    begins = file.read(len(_MAGIC)) == _MAGIC
+    file.seek(-min(len(_MAGIC), file.seek(0, io.SEEK_END)), io.SEEK_END)
+    ends = file.read() == _MAGIC
+    file.seek(0)
+    return begins and not ends
+
+
+def _linear(file: IO[bytes]) -> McapReader:
+    """A reader that needs no summary."""
+    file.seek(0)
+    return NonSeekingReader(file, validate_crcs=True)
+
+
+def _kind(schema: Schema | None, channel: Channel) -> str:
+    """Schema and encoding of a channel's messages; empty where it has no schema."""
+    return f"{schema.name} in {channel.message_encoding}" if schema else ""
 
 
 def ros_film(path: Path, topic: str | None) -> Film:
@@ -94,11 +121,12 @@ def _chosen(types: dict[str, str], topic: str | None, path: Path) -> str:
     pictures = [name for name, kind in types.items() if kind in _DECODERS]
     if topic is not None and topic in pictures:
         return topic
-    have = ", ".join(f"{name} ({kind})" for name, kind in types.items()) or "nothing"
+    have = ", ".join(f"{name} ({kind})" for name, kind in sorted(types.items())) or "no messages"
     if topic is not None or not pictures:
-        raise ImportingError(f"{path} has no pictures on {topic or 'any topic'}: it has {have}")
+        where = "that can be read on any topic" if topic is None else f"on {topic or 'a topic without a name'}"
+        raise ImportingError(f"{path} has no pictures {where}: it has {have}")
     if len(pictures) > 1:
-        raise ImportingError(f"{path} has pictures on {', '.join(pictures)}: say which with --topic")
+        raise ImportingError(f"{path} has pictures on {', '.join(sorted(pictures))}: say which with --topic")
     return pictures[0]
 
 
@@ -118,13 +146,16 @@ def _film(path: Path, topic: str, messages: Callable[[], Iterator[_Stamped]]) ->
     if first is None:
         raise ImportingError(f"{path} has no picture on {topic}")
     stamped = all(stamps) and len(set(stamps)) == len(stamps)
+    why = "the pictures have no times of their own"
+    if any(stamps):
+        why = "some pictures have no time of their own" if not all(stamps) else "pictures share a time of their own"
     times = np.array(stamps if stamped else arrivals, dtype=np.int64)
     return Film(
         name=f"{path.name}:{topic}", shape=(int(first.shape[0]), int(first.shape[1])), dtype=first.dtype,
         count=len(times), frames=lambda: (grey(each.picture, path) for each in messages()), start_ns=int(times[0]),
         times_ns=times,
         nonlinear=_LOSSY if lossy else "",
-        notes=() if stamped else ("the pictures have no times of their own: those of their arrival are used",),
+        notes=() if stamped else (f"{why}: those of their arrival are used",),
     )  # fmt: skip
 
 
@@ -146,9 +177,16 @@ def raw_picture(data: bytes, encoding: str, height: int, width: int, step: int, 
 
 
 def compressed_picture(data: bytes) -> tuple[FilmFrame, bool]:
-    """Pixels of a JPEG or PNG, (rows, columns) or (rows, columns, 3 or 4), and whether it is lossy."""
-    with opened_image(io.BytesIO(data), ImportingError) as image:
-        return image_pixels(image), image.format != "PNG"
+    """Pixels of a JPEG or PNG, (rows, columns) or (rows, columns, 3 or 4), and whether it is lossy.
+
+    Raises ImportingError.
+    """
+    try:
+        with opened_image(io.BytesIO(data), ImportingError) as image:
+            return image_pixels(image), image.format not in _LOSSLESS
+    except OSError as error:
+        said = "their format is not known" if isinstance(error, UnidentifiedImageError) else str(error)
+        raise ImportingError(f"compressed pictures cannot be read ({said}): JPEG and PNG can") from None
 
 
 def _foxglove_raw(data: bytes, arrival_ns: int) -> _Stamped:

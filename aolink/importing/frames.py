@@ -151,6 +151,11 @@ def frame_times(film: Film, rig: Rig, settings: FilmSettings) -> tuple[NDArray[n
             f" {timing.frame_period_steps * timing.fast_step_s:.6g} s, {own:.6g} frames/s: {summed}change its"
             " [timing], or give the right --rate"
         )
+    if K > 1 and settings.exposure_s is not None:
+        raise ImportingError(
+            f"--exposure {settings.exposure_s:g} is not used with --sum {K}, where each frame is a whole fast step:"
+            " leave it out"
+        )
     if K > 1 and (timing.exposure_steps, timing.frame_period_steps) != (K, K):
         raise ImportingError(
             f"--sum {K} makes exposures of {K} fast steps without dead time: set timing.exposure_steps = {K} and"
@@ -168,7 +173,13 @@ def frame_times(film: Film, rig: Rig, settings: FilmSettings) -> tuple[NDArray[n
                 f"{film.name} was exposed for {exposure_s:.6g} s a frame, the rig file {rig.name} says {own_s:.6g} s:"
                 " change timing.exposure_steps, or give the right --exposure"
             )
+    if None not in (settings.start_ns, film.start_ns) and settings.start_ns != film.start_ns:
+        notes.append(f"the film says that it starts at {_date(film.start_ns)}; {_date(settings.start_ns)} is taken")
     return periods, notes
+
+
+def _date(time_ns: int | None) -> str:
+    return f"{np.datetime64(time_ns or 0, 'ns')}"
 
 
 def nonlinear_note(film: Film) -> str:

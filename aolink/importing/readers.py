@@ -48,7 +48,7 @@ def open_film(source: str | Path, topic: str | None = None) -> Film:
         .npy, .npz, .tif, .fits, a video, .mcap, a ROS bag (.bag, or a folder with metadata.yaml), AO telemetry (AOT, a
         .fits file), or a folder of pictures.
     topic:
-        The channel with the pictures, where an MCAP file or a bag has several.
+        The channel with the pictures, where an MCAP file or a bag has several; of AO telemetry the wavefront sensor.
 
     Raises
     ------
@@ -62,19 +62,31 @@ def open_film(source: str | Path, topic: str | None = None) -> Film:
     suffix = Path(path.stem).suffix.lower() if ends in (".gz", ".fz") else ends
     with _one_error(path):
         if path.is_dir():
-            film = _bag(path, topic) if (path / "metadata.yaml").exists() else _folder(path)
+            film = _bag(path, topic) if (path / "metadata.yaml").exists() else _without_topic(path, topic, _folder)
+        elif suffix in (".fits", ".fit"):
+            film = _fits(path, topic)
         elif suffix in _READERS:
-            film = _READERS[suffix](path)
+            film = _without_topic(path, topic, _READERS[suffix])
         elif suffix in (".mcap", ".bag"):
             film = _mcap(path, topic) if suffix == ".mcap" else _bag(path, topic)
         elif suffix in _VIDEOS:
-            film = _video(path)
+            film = _without_topic(path, topic, _video)
         elif suffix == ".db3":
             raise ImportingError(f"{path} is a part of a ROS 2 bag: give the bag's folder, which has metadata.yaml")
         else:
-            known = ", ".join([*_READERS, ".mcap", ".bag", *_VIDEOS])
+            known = ", ".join([*_READERS, ".fits", ".fit", ".mcap", ".bag", *_VIDEOS])
             raise ImportingError(f"{path} is no kind of film that is known: give {known} or a folder of pictures")
     return replace(film, frames=lambda: _checked(film, path))
+
+
+def _without_topic(path: Path, topic: str | None, read: Callable[[Path], Film]) -> Film:
+    """The film of a source that has one film only, so that a topic makes no sense."""
+    if topic is not None:
+        raise ImportingError(
+            f"{path} has no topics: --topic {topic} says which channel of an MCAP file or a bag, or which wavefront"
+            " sensor of AO telemetry, is imported; leave it out"
+        )
+    return read(path)
 
 
 @contextmanager
@@ -287,7 +299,7 @@ def _values(stored: NDArray[Any], scale: float, zero: float) -> NDArray[Any]:
     return stored if (scale, zero) == (1.0, 0.0) else stored * scale + zero
 
 
-def _fits(path: Path) -> Film:
+def _fits(path: Path, topic: str | None) -> Film:
     with path.open("rb") as file:
         packed = file.read(2) == b"\x1f\x8b"
         file.seek(0)
@@ -298,10 +310,17 @@ def _fits(path: Path) -> Film:
         header, stored, scale, zero = next(arrays)
     except FrameError as error:
         if b"AOT-VERS" in data[: 100 * 2880]:
-            return _aot(path)
+            return _aot(path, topic)
         raise ImportingError(f"{path}: {error}") from None
     if "AOT-VERS" in header:
-        return _aot(path)
+        return _aot(path, topic)
+    return _without_topic(path, topic, lambda path: _cube(path, header, stored, scale, zero, arrays))
+
+
+def _cube(
+    path: Path, header: dict[str, str], stored: NDArray[Any], scale: float, zero: float, arrays: Iterator[Any]
+) -> Film:
+    """The film of the first array of a FITS file, whose other ones are still in ``arrays``."""
     more, damaged = 0, ""
     try:
         for each in arrays:
@@ -388,12 +407,12 @@ def _bag(path: Path, topic: str | None) -> Film:
     return bags.ros_film(path, topic)
 
 
-def _aot(path: Path) -> Film:
+def _aot(path: Path, topic: str | None) -> Film:
     from aolink.importing import telemetry
 
-    return telemetry.aot_film(path)
+    return telemetry.aot_film(path, topic)
 
 
 _READERS: dict[str, Callable[[Path], Film]] = {
-    ".npy": _npy, ".npz": _npz, ".tif": _tiff, ".tiff": _tiff, ".fits": _fits, ".fit": _fits,
+    ".npy": _npy, ".npz": _npz, ".tif": _tiff, ".tiff": _tiff,
 }  # fmt: skip

@@ -13,12 +13,16 @@ from aolink.extensions import needs_extra
 from aolink.importing.film import Film, array_film
 from aolink.numerics.arrays import FloatArray
 
+_NOT_APPLIED = ("dark", "flat_field", "sky_background", "bad_pixel_map", "weight_map")
+"""What a detector may have that is not applied to its pictures."""
 
-def aot_film(path: Path) -> Film:
-    """The pictures of the first wavefront sensor that has them, with the commands of its loops.
+
+def aot_film(path: Path, uid: str | None = None) -> Film:
+    """The pictures of the wavefront sensor ``uid``, or of the first one that has them, with the commands of its loops.
 
     Where none has pictures, the result is the slopes of the first sensor that has them. A command is held until the
-    next one of its loop: by the times of both, otherwise by the loop's rate, otherwise one for each frame.
+    next one of its loop: by the times of both, otherwise by the loop's rate, otherwise one for each frame, after the
+    loop's delay.
 
     Raises
     ------
@@ -31,14 +35,28 @@ def aot_film(path: Path) -> Film:
         warnings.filterwarnings("ignore", r".*HDU '\S+' is not an AOT binary table nor an image")
         system = aotpy.AOSystem.read_from_file(path)
     sensors = system.wavefront_sensors
+    if uid is not None:
+        have = ", ".join(str(each.uid) for each in sensors) or "none"
+        sensors = [each for each in sensors if each.uid == uid]
+        if not sensors:
+            raise ImportingError(f"{path} has no wavefront sensor {uid!r}: it has {have}")
     pictured = [each for each in sensors if each.detector and each.detector.pixel_intensities]
-    sensor = next(iter(pictured or [each for each in sensors if each.measurements]), None)
+    usable = pictured or [each for each in sensors if each.measurements]
+    sensor = next(iter(usable), None)
     if sensor is None:
-        raise ImportingError(f"{path} has neither pictures nor slopes of a wavefront sensor")
+        raise ImportingError(f"{path} has neither pictures nor slopes of {_which(uid)}")
     detector = sensor.detector
+    others = [str(each.uid) for each in usable[1:]]
+    more = [f"{path.name} has those of {', '.join(others)} too: say which with --topic"] if others else []
     if pictured:
         series, what = detector.pixel_intensities, f"pictures of the wavefront sensor {sensor.uid}"
         frames = np.asarray(series.data)
+        if frames.ndim != 3:
+            raise ImportingError(
+                f"{path} has pictures of shape {frames.shape} of {_which(sensor.uid)}, expected (frames, rows, columns)"
+            )
+        if left := [each.replace("_", " ") for each in _NOT_APPLIED if getattr(detector, each) is not None]:
+            more.append(f"not applied to the pictures: the detector's {', '.join(left)}")
     else:
         series = sensor.measurements
         what = (
@@ -51,6 +69,10 @@ def aot_film(path: Path) -> Film:
     if detector:
         known |= {"rate_hz": detector.frame_rate, "exposure_s": detector.integration_time}
     times = _times(series.time, len(frames))
+    if times is not None and not np.isfinite(times).all():
+        raise ImportingError(f"{path}: some times of {_which(sensor.uid)} are no numbers")
+    if times is None and series.time is not None:
+        more += _by_numbers(series.time, len(frames), known)
     if times is not None:
         known |= {"times_ns": np.round((times - times[0]) * 1e9).astype(np.int64), "start_ns": round(times[0] * 1e9)}
     elif system.date_beginning is not None:
@@ -60,14 +82,32 @@ def aot_film(path: Path) -> Film:
         for each in system.loops
         if isinstance(each, aotpy.ControlLoop) and each.input_sensor is sensor and each.commands is not None
     ]
-    notes = [what, *_commands(loops, known, len(frames), None if times is None else times[0])]
+    notes = [what, *more, *_commands(loops, known, len(frames), None if times is None else times[0])]
     return array_film(frames, path.name, notes=tuple(notes), **known)
+
+
+def _which(uid: str | None) -> str:
+    return "a wavefront sensor" if uid is None else f"the wavefront sensor {uid}"
+
+
+def _by_numbers(time: Any, count: int, known: dict[str, Any]) -> list[str]:
+    """Add times by the frames' numbers to the ``known`` facts where frames are missing; notes say what is not used."""
+    numbers = np.asarray(time.frame_numbers, dtype=np.float64)
+    if len(numbers) != count:
+        stamps = len(time.timestamps)
+        return [f"not used: {stamps} times and {len(numbers)} frame numbers for {count} frames"]
+    if (np.diff(numbers) == 1).all():
+        return []
+    if not known.get("rate_hz") or not np.isfinite(numbers).all():
+        return ["by their numbers frames are missing, which without a frame rate or times in the file is not used"]
+    known["times_ns"] = np.round((numbers - numbers[0]) * 1e9 / known["rate_hz"]).astype(np.int64)
+    return ["frames are missing by their numbers"]
 
 
 def _slopes(found: FloatArray, path: Path) -> FloatArray:
     """Measurements (frames, directions, spots) as rows of slopes, spot after spot, (frames, 1, slopes)."""
-    if found.ndim != 3 or found.size == 0:
-        raise ImportingError(f"{path} has slopes of shape {found.shape}, expected (frames, directions, subapertures)")
+    if found.ndim != 3 or found.size == 0 or found.shape[1] > 2:
+        raise ImportingError(f"{path} has slopes of shape {found.shape}, expected (frames, 2 directions, subapertures)")
     measured = [d for d in range(found.shape[1]) if not np.isnan(found[:, d]).all()]  # a line sensor has one
     if not measured:
         raise ImportingError(f"{path} has no pictures, and its slopes are all NaN: there is nothing to import")
@@ -95,7 +135,7 @@ def _commands(loops: list[Any], known: dict[str, Any], count: int, start_s: floa
     first = of_loop[0]
     if len({None if each is None else each.tobytes() for each in of_loop}) > 1:
         return [f"the loops {names} command at unlike times: their commands are left out, the mirror counts as parked"]
-    rate = loops[0].framerate
+    rate, delay = loops[0].framerate, loops[0].delay
     if first is not None and start_s is not None:
         if (late := np.flatnonzero(np.diff(first) <= 0)).size:
             raise ImportingError(
@@ -106,6 +146,10 @@ def _commands(loops: list[Any], known: dict[str, Any], count: int, start_s: floa
     elif n != count and rate:
         known["input_times_ns"] = np.round(np.arange(n) * 1e9 / rate).astype(np.int64)
         how = f"at the loop's {rate:g} commands/s, from the first exposure on"
+    elif n == count and delay and (frame_rate := known.get("rate_hz") or rate):
+        # From the middle of an exposure to the middle of its command, which is held for a frame as well.
+        known["input_times_ns"] = np.round((np.arange(n) + delay) * 1e9 / frame_rate).astype(np.int64)
+        how = f"from {delay:g} frames after its picture on, as the loop's delay says"
     elif n == count:
         how = "from its picture on"
     else:

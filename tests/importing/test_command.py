@@ -154,6 +154,10 @@ def missing(folder: Path) -> Path:
         (good, ["--rate", "nan"], 11, "--rate nan must be above 0"),
         (good, ["--rate", "50", "--scale", "0"], 11, "--scale 0 must be a finite number other than 0"),
         (good, ["--rate", "50", "--scale", "-2"], 11, "--scale -2 must be above 0 for pictures"),
+        (good, ["--topic", "/camera"], 11, "has no topics: --topic /camera says which"),
+        (good, ["--exposure", "0"], 11, "--exposure 0 must be above 0"),
+        (good, ["--exposure", "nan"], 11, "--exposure nan must be above 0"),
+        (good, ["--exposure", "0.01", "--rate", "100", "--sum", "2"], 11, "--exposure 0.01 is not used with --sum 2"),
         (good, ["--start", "yesterday"], 11, "--start yesterday is no date: give one such as"),
         (good, ["--rate", "50", "--start", "2500-01-01"], 11, "a start or an end that is not from 1970 to 2262"),
         (good, ["--rate", "50", "--start", "1600-01-01"], 11, "a start or an end that is not from 1970 to 2262"),
@@ -211,3 +215,26 @@ def test_a_first_rig_file_of_a_url_is_refused(aolink):
     refused = aolink("rig", "a.toml", "--from", "s3://films/a.npz", "--track", "1")
     assert refused.returncode == 2
     assert "is a URL" in " ".join(refused.stderr.split())
+
+
+def test_a_start_other_than_the_films_is_noted(aolink, rig, tmp_path):
+    source = others.write_fits(tmp_path / "a.fits", FRAMES, DATE_OBS="2026-09-21T10:30:00")
+    made = aolink("import", source, "-o", "a.mcap", "--rig", rig, "--rate", "50", "--start", "2026-09-22")
+    assert "starts at 2026-09-21T10:30:00.000000000; 2026-09-22T00:00:00.000000000 is taken" in made.stdout
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        (["rig.toml", "--track", "2"], "--track needs --from FILM"),
+        (["rig.toml", "--check", "--topic", "/camera"], "--topic needs --from FILM"),
+        (["a.toml", "--from", "film.npy", "--track", "1", "--seed", "3"], "--seed makes no sense with --from"),
+        (["a.toml", "--from", "film.npy", "--track", "1", "--json"], "--json makes no sense with --from"),
+    ],
+)
+def test_options_without_effect_are_refused(options, says, aolink, rig, tmp_path):
+    others.written_npy(tmp_path, FRAMES)
+    refused = aolink("rig", *options)
+    assert refused.returncode == 2
+    assert says in " ".join(refused.stderr.replace("│", " ").split())
+    assert not (tmp_path / "a.toml").exists()

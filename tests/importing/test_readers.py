@@ -4,11 +4,17 @@ from __future__ import annotations
 
 from typing import Any
 
+import aotpy
 import imageio.v3 as iio
 import numpy as np
 import pytest
 import tifffile
 from astropy.io import fits
+from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
+from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
+from mcap.writer import IndexType
+from mcap.writer import Writer as McapWriter
+from mcap_protobuf.schema import build_file_descriptor_set
 from numpy.typing import NDArray
 from PIL import Image
 
@@ -484,7 +490,7 @@ def test_of_two_topics_with_pictures_one_is_chosen(kind, tmp_path):
 
 def test_a_file_without_pictures_says_what_it_has(tmp_path):
     path = others.write_ros1(tmp_path / "a.bag", {"/said": [ROS1.types["std_msgs/msg/String"](data="hello")]})
-    assert "no pictures on any topic: it has /said (std_msgs/String" in refused(path)
+    assert "no pictures that can be read on any topic: it has /said (std_msgs/String" in refused(path)
 
 
 @pytest.mark.long
@@ -526,3 +532,141 @@ def test_commands_of_loops_that_do_not_command_together_are_left_out_and_said(tm
 def test_telemetry_with_neither_pictures_nor_slopes_is_refused(tmp_path):
     text = refused(others.write_aot(tmp_path / "a.fits", None, slopes=np.full((7, 2, 1), np.nan)))
     assert "has no pictures, and its slopes are all NaN" in text
+
+
+@pytest.mark.parametrize("kind", ["npy", "npz", "TIFF", "pictures", "FITS", "packed FITS"])
+def test_a_topic_of_a_file_without_topics_is_refused(kind, tmp_path):
+    text = refused(KINDS[kind](tmp_path, numbers(np.uint8)), "/camera")
+    assert "has no topics: --topic /camera says which channel of an MCAP file or a bag" in text
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"index_types": IndexType.NONE, "repeat_channels": False, "repeat_schemas": False, "use_statistics": False,
+         "use_summary_offsets": False},
+        {"repeat_channels": False, "repeat_schemas": False},
+        {"repeat_schemas": False},
+        {"use_chunking": False, "index_types": IndexType.NONE},
+    ],
+)  # fmt: skip
+def test_an_mcap_file_with_a_small_summary_or_none_is_read(options, tmp_path):
+    frames = numbers(np.uint8)
+    with (tmp_path / "a.mcap").open("wb") as file:
+        writer = McapWriter(file, **options)
+        writer.start()
+        definition = build_file_descriptor_set(RawImage).SerializeToString()
+        schema = writer.register_schema("foxglove.RawImage", "protobuf", definition)
+        channel = writer.register_channel("/camera", "protobuf", schema)
+        for k in (3, 1, 0, 2, 6, 5, 4):  # messages need not be in order
+            message = others.foxglove_raw(frames[k], "mono8", int(STAMPS[k]))
+            writer.add_message(channel, int(STAMPS[k]), message.SerializeToString(), int(STAMPS[k]))
+        writer.finish()
+    film = open_film(tmp_path / "a.mcap")
+    check(film, frames)
+    np.testing.assert_array_equal(film.times_ns, STAMPS)
+
+
+def test_raw_and_compressed_pictures_on_one_topic_are_one_film(tmp_path):
+    frames = numbers(np.uint8)
+    raw = [others.foxglove_raw(f, "mono8", int(t)) for f, t in zip(frames, STAMPS, strict=True)]
+    packed = [others.foxglove_compressed(f, "PNG", int(t)) for f, t in zip(frames, STAMPS, strict=True)]
+    mixed = [*raw[:3], *packed[3:]]
+    with (tmp_path / "a.mcap").open("wb") as file:
+        writer = McapWriter(file)
+        writer.start()
+        channels = {}
+        for kind in (RawImage, CompressedImage):
+            definition = build_file_descriptor_set(kind).SerializeToString()
+            schema = writer.register_schema(kind.DESCRIPTOR.full_name, "protobuf", definition)
+            channels[kind] = writer.register_channel("/camera", "protobuf", schema)
+        for message, time_ns in zip(mixed, STAMPS.tolist(), strict=True):
+            writer.add_message(channels[type(message)], time_ns, message.SerializeToString(), time_ns)
+        writer.finish()
+    check(open_film(tmp_path / "a.mcap"), frames)
+
+
+def test_an_mcap_file_that_was_cut_off_is_refused_with_what_to_do(tmp_path):
+    path = others.written_mcap(tmp_path, numbers(np.uint8))
+    path.write_bytes(path.read_bytes()[:-20])
+    assert "has no end: it was cut off, or is still being written. `mcap recover` saves" in refused(path)
+
+
+def test_compressed_pictures_of_another_format_are_refused(tmp_path):
+    messages = [CompressedImage(data=b"a part of a video", format="h264")]
+    path = others.write_mcap(tmp_path / "a.mcap", {"/camera": messages})
+    assert "compressed pictures cannot be read (their format is not known): JPEG and PNG can" in refused(path)
+
+
+def test_pictures_some_of_which_have_no_stamp_have_the_times_of_their_arrival(tmp_path):
+    stamps = [0, *STAMPS[1:].tolist()]
+    messages = [others.foxglove_raw(f, "mono8", t) for f, t in zip(numbers(np.uint8), stamps, strict=True)]
+    film = open_film(others.write_mcap(tmp_path / "a.mcap", {"/camera": messages}))
+    assert film.notes == ("some pictures have no time of their own: those of their arrival are used",)
+
+
+@pytest.fixture
+def two_sensors(tmp_path):
+    """Telemetry of two wavefront sensors, and the frames of each."""
+    frames = [numbers(np.float32, seed=k) for k in (1, 2)]
+    sensors = [
+        aotpy.Pyramid(
+            uid=uid, source=aotpy.NaturalGuideStar(uid=f"star of {uid}"), n_valid_subapertures=1, n_sides=4,
+            subaperture_mask=aotpy.Image(name=f"mask of {uid}", data=np.zeros((1, 1))),
+            detector=aotpy.Detector(
+                uid=f"camera of {uid}", pixel_intensities=aotpy.Image(name=f"pixels of {uid}", data=each)
+            ),
+        )
+        for uid, each in zip(("low", "high"), frames, strict=True)
+    ]  # fmt: skip
+    sensors[0].detector.dark = aotpy.Image(name="dark", data=np.ones((6, 9), np.float32))
+    telescope = aotpy.MainTelescope(uid="telescope")
+    mirror = aotpy.TipTiltMirror(uid="mirror", telescope=telescope)
+    aotpy.AOSystem(
+        ao_mode="SCAO", main_telescope=telescope, sources=[each.source for each in sensors], wavefront_sensors=sensors,
+        wavefront_correctors=[mirror],
+        loops=[aotpy.ControlLoop(uid="loop", commanded_corrector=mirror, input_sensor=sensors[1])],
+    ).write_to_file(str(tmp_path / "a.fits"))  # fmt: skip
+    return tmp_path / "a.fits", frames
+
+
+def test_of_two_wavefront_sensors_one_is_chosen(two_sensors):
+    path, (low, high) = two_sensors
+    first = open_film(path)
+    check(first, low)
+    assert "a.fits has those of high too: say which with --topic" in first.notes
+    assert "not applied to the pictures: the detector's dark" in first.notes
+    check(open_film(path, "low"), low)
+    second = open_film(path, "high")
+    check(second, high)
+    assert second.notes == ("pictures of the wavefront sensor high",)
+    assert "has no wavefront sensor 'other': it has low, high" in refused(path, "other")
+
+
+def test_telemetry_whose_times_are_not_those_of_its_frames(tmp_path):
+    frames = numbers(np.float32)
+    short = open_film(others.write_aot(tmp_path / "a.fits", frames, times_s=[0.0, 0.02]))
+    assert short.times_ns is None
+    assert "not used: 2 times and 0 frame numbers for 7 frames" in short.notes
+    path = others.write_aot(tmp_path / "b.fits", frames, times_s=[float("nan"), *np.arange(6) / 50])
+    assert "some times of the wavefront sensor SH are no numbers" in refused(path)
+
+
+def test_frames_of_telemetry_that_are_missing_by_their_numbers(tmp_path):
+    path = others.write_aot(tmp_path / "a.fits", numbers(np.float32), times_s=[0.0])
+    system = aotpy.AOSystem.read_from_file(path)
+    time = system.wavefront_sensors[0].detector.pixel_intensities.time
+    time.timestamps, time.frame_numbers = [], [4, 5, 6, 8, 9, 10, 11]
+    system.write_to_file(str(tmp_path / "b.fits"))
+    film = open_film(tmp_path / "b.fits")
+    np.testing.assert_array_equal(film.times_ns, np.array([0, 1, 2, 4, 5, 6, 7]) * 20_000_000)
+    assert "frames are missing by their numbers" in film.notes
+
+
+@pytest.mark.parametrize("shape", [(7, 4, 2), (7, 2)])
+def test_slopes_in_another_order_are_refused(shape, tmp_path):
+    telemetry = others.write_aot(tmp_path / "a.fits", None, slopes=np.zeros((7, 2, 1), np.float32))
+    system = aotpy.AOSystem.read_from_file(telemetry)
+    system.wavefront_sensors[0].measurements.data = np.zeros(shape, np.float32)
+    system.write_to_file(str(tmp_path / "b.fits"))
+    assert f"has slopes of shape {shape}, expected (frames, 2 directions" in refused(tmp_path / "b.fits")

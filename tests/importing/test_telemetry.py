@@ -213,3 +213,17 @@ def test_commands_faster_than_the_rigs_steps_are_refused(tmp_path: Path) -> None
         ImportingError, match=r"has a command every 0\.0005 s, the rig file .* a fast step every 0\.001 s"
     ):
         imported(path, small_rig(20, 20))
+
+
+def test_commands_wait_for_their_loops_delay(tmp_path: Path) -> None:
+    commands = np.arange(14.0).reshape(7, 2)
+    others.write_aot(tmp_path / "b.fits", FRAMES, commands=commands)
+    system = aotpy.AOSystem.read_from_file(tmp_path / "b.fits")
+    system.loops[0].delay = 1.5
+    system.write_to_file(str(tmp_path / "a.fits"))
+    rig = small_rig(20, 20)
+    recording, account = imported(tmp_path / "a.fits", rig)
+    inputs = np.concatenate([each.inputs for each in recording.exposures()])
+    np.testing.assert_array_equal(inputs[:30], np.tile(rig.mirror.park, (30, 1)))
+    np.testing.assert_array_equal(inputs[30:], np.repeat(commands, 20, axis=0)[:110])
+    assert any("from 1.5 frames after its picture on" in note for note in account.notes)
