@@ -33,8 +33,10 @@ def export(
     """
     from aolink.exporting.files import export as export_series
     from aolink.recording.remote import location
+    from aolink.recording.side_files import check_stands_alone
 
     recording = open_recording(location(file))
+    check_stands_alone(recording)
     known = recording.damage
     with progress("export", recording.n_frames) as tell:
         export_series(recording, output, estimator, overwrite=overwrite, progress=tell)

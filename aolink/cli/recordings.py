@@ -127,6 +127,8 @@ def estimate(
         raise typer.BadParameter("--side needs -o DIR, and goes with --table X.parquet, not with --only or --parquet")
     if not side and (table or shard or scheduler):
         raise typer.BadParameter("--table, --shard and --scheduler are for side files: give --side too")
+    if scheduler and jobs > 1:
+        raise typer.BadParameter("--jobs is for this machine: with --scheduler its workers do the work")
     if only and output is None:
         raise typer.BadParameter("--only is for the copy that -o writes: give -o too")
     models = batch_models(rig, settings)
@@ -155,7 +157,7 @@ def estimate(
         )
         part = f"-{shard.replace('/', '-of-')}" if shard else ""
         results = table.with_stem(table.stem + part) if table else output / f"results{part}.csv"
-        _estimate_many(todo, output, results, jobs, scheduler, side=True, as_json=as_json)
+        _estimate_many(todo, output, results, jobs, scheduler, side=True, overwrite=overwrite, as_json=as_json)
         return
     if urls := [each for each in map(location, files) if not isinstance(each, Path)]:
         raise typer.BadParameter(f"{urls[0]} is a URL: of many recordings behind URLs --side makes side files")
@@ -163,7 +165,7 @@ def estimate(
         [*map(Path, files)], models, estimator or [], output, engine.value, only=only, overwrite=overwrite
     )  # fmt: skip
     name = "results.parquet" if parquet else "results.csv"
-    _estimate_many(todo, output, output / name, jobs, None, side=False, as_json=as_json)
+    _estimate_many(todo, output, output / name, jobs, None, side=False, overwrite=overwrite, as_json=as_json)
 
 
 def batch_models(rig: str | None, settings: Sequence[str] | None) -> "list[Model]":
@@ -176,11 +178,16 @@ def batch_models(rig: str | None, settings: Sequence[str] | None) -> "list[Model
 
 def _estimate_many(
     todo: "Sequence[Job | SideJob]", folder: Path, table: Path, workers: int, scheduler: str | None, *, side: bool,
-    as_json: bool,
+    overwrite: bool, as_json: bool,
 ) -> None:  # fmt: skip
     from aolink.cli.tables import recordings as tables
     from aolink.jobs import batch
-    from aolink.jobs.tables import fill_table, join_tables, table_beside
+    from aolink.jobs.tables import check_table, fill_table, join_tables, table_beside
+
+    of_exposures = table.with_suffix(".exposures.parquet") if side and table.suffix == ".parquet" else None
+    for each in (table, of_exposures):
+        if each is not None and not overwrite:
+            check_table(each)
 
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -197,9 +204,9 @@ def _estimate_many(
                 done = _printed(batch.run_here(todo, workers, stop=stop, progress=tell))
         rows = batch.table_rows(done, None if side else folder)
         fill_table(partial, rows, table.suffix)
-        if side and table.suffix == ".parquet":
+        if of_exposures is not None:
             parts = [table_beside(each.job.output) for each in done if not each.error]
-            join_tables(sorted(parts), table.with_suffix(".exposures.parquet"))
+            join_tables(sorted(parts), of_exposures)
     if as_json:
         print(json.dumps(rows, allow_nan=False))
     else:

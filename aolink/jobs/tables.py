@@ -22,6 +22,8 @@ EXPOSURE_COLUMNS = (
     "path_rms", "path_sd", "path_rmse", "start_rmse", "end_rmse",
 )  # fmt: skip
 """Columns of the table of exposures."""
+_KEYS = ("recording", "model", "estimator")
+"""Columns that both tables have."""
 _TEXTS = {
     "recording", "model", "estimator", "status", "reason", "nothing_measured", "output", "damage", "error"
 }  # fmt: skip
@@ -100,6 +102,24 @@ def join_tables(parts: Sequence[Path], path: Path) -> None:
 def table_beside(side: Path) -> Path:
     """The table of exposures that belongs to a side file."""
     return side.with_suffix(".parquet")
+
+
+def check_table(path: Path) -> None:
+    """Raise RecordingError where a file of a table's name is there that is no table of a batch."""
+    if not path.is_file():
+        return
+    try:
+        if path.suffix == ".parquet":
+            found = parquet()[1].read_schema(path).names
+        else:
+            with path.open(newline="") as file:
+                found = next(csv.reader(file), [])
+    except (OSError, ValueError, csv.Error):
+        found = []
+    if not {*_KEYS} <= {*found}:
+        raise RecordingError(
+            f"{path} exists and is no table of a batch: give another name, or --overwrite to replace it"
+        )
 
 
 def is_table_of(path: Path, job: str) -> bool:

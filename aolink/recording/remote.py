@@ -151,6 +151,8 @@ class Url:
             denied = isinstance(error, PermissionError) or getattr(cause, "status", 0) in (401, 403)
             if denied or type(error).__name__ in ("NoCredentialsError", "PartialCredentialsError"):
                 why = "no right to read it; give the credentials that its server wants, as AWS_PROFILE for s3"
+            elif getattr(cause, "status", 0) >= 500:
+                why = f"its server has an error ({self._hidden(cause)})"
             elif isinstance(cause, OSError) and not isinstance(cause, FileNotFoundError):
                 why = f"its server does not answer ({self._hidden(cause)})"
             elif isinstance(error, FileNotFoundError):

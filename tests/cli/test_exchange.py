@@ -10,8 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from aolink.batch import Settings, estimate_file
 from aolink.errors import ExportError, RecordingError
 from aolink.recording.reader import Recording
+from tests.recording.small import write_small
 
 Run = Callable[..., subprocess.CompletedProcess[str]]
 
@@ -73,3 +75,14 @@ def test_a_damaged_recording_gives_what_is_whole_and_says_so(aolink: Run, lively
     assert done.stderr.startswith("aolink: warning: broken.mcap: ")
     with np.load(tmp_path / "out.npz") as found:
         assert 0 < len(found["time"]) < len(lively)
+
+
+def test_a_side_file_alone_is_refused(aolink: Run, tmp_path: Path) -> None:
+    source = write_small(tmp_path / "a.mcap", 2)
+    estimate_file(source, tmp_path / "a.o1.mcap", Settings(estimator="o1"))
+    done = aolink("export", "a.mcap", "-o", "out.npz")
+    assert done.returncode == 0, done.stderr
+    done = aolink("export", "a.o1.mcap", "-o", "side.npz")
+    assert done.returncode == RecordingError.exit_code
+    assert "is a side file with the estimates of a.mcap alone" in done.stderr
+    assert not (tmp_path / "side.npz").exists()

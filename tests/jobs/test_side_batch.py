@@ -116,6 +116,30 @@ def test_a_part_that_is_started_twice_is_one_clear_line(aolink: Run, tmp_path: P
 
 
 @pytest.mark.parametrize(
+    ("name", "arguments"),
+    [
+        ("t.parquet", ["--side", "--table", "t.parquet"]),
+        ("t.exposures.parquet", ["--side", "--table", "t.parquet"]),
+        ("out/results.csv", ["--side"]),
+        ("out/results.csv", []),
+    ],
+)
+def test_a_table_takes_the_place_of_a_table_only(aolink: Run, tmp_path: Path, name: str, arguments: list[str]) -> None:
+    write_small(tmp_path / "a.mcap", 1)
+    (tmp_path / "out").mkdir()
+    (tmp_path / name).write_text("name,mass\nmine,3\n")
+    command = ("estimate", "a.mcap", "-e", "o1", *arguments, "-o", "out/")
+    refused = aolink(*command)
+    assert refused.stderr.startswith(f"aolink: {name} exists and is no table of a batch: give another name, or --over")
+    assert refused.stderr.count("\n") == 1
+    assert (tmp_path / name).read_text() == "name,mass\nmine,3\n"
+    assert not [*(tmp_path / "out").glob("*.mcap")]
+    for more in (["--overwrite"], []):  # and then the table is one of ours
+        done = aolink(*command, *more)
+        assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize(
     ("arguments", "message"),
     [
         (["--side"], "--side needs -o DIR"),
@@ -124,6 +148,7 @@ def test_a_part_that_is_started_twice_is_one_clear_line(aolink: Run, tmp_path: P
         (["--table", "t.parquet", "-o", "out"], "are for side files: give --side too"),
         (["--side", "-o", "out", "--table", "t.csv"], "give a name that ends with .parquet"),
         (["--side", "-o", "out", "--shard", "3/2"], "I/N is needed"),
+        (["--side", "-o", "out", "--scheduler", "tcp://127.0.0.1:1", "--jobs", "2"], "--jobs is for this machine"),
     ],
 )
 def test_options_that_do_not_go_together(aolink: Run, tmp_path: Path, arguments: list[str], message: str) -> None:

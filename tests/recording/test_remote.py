@@ -46,7 +46,7 @@ def s3(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[S3Server]:
 
 
 class _Ranges(BaseHTTPRequestHandler):
-    """What a web server does: files of one folder, ranges of them, and one that nobody may read."""
+    """What a web server does: files of one folder, ranges of them, one that nobody may read and one that it fails at."""
 
     folder: Path
     gives_ranges = True
@@ -60,8 +60,8 @@ class _Ranges(BaseHTTPRequestHandler):
 
     def _answer(self) -> bytes | None:
         name = self.path.strip("/").partition("?")[0]
-        if name == "secret.mcap":
-            self.send_error(403)
+        if refusal := {"secret.mcap": 403, "broken.mcap": 500}.get(name):
+            self.send_error(refusal)
             return None
         if not (self.folder / name).is_file():
             self.send_error(404)
@@ -169,6 +169,7 @@ def test_nobody_may_read_it_or_it_is_not_there(
         ("s3://none/s.mcap", "there is no such file"),
         (f"{web[0]}/none.mcap", "there is no such file"),
         (f"{web[0]}/secret.mcap", "no right to read it"),
+        (f"{web[0]}/broken.mcap", "its server has an error"),
         ("http://127.0.0.1:1/s.mcap", "Cannot connect to host"),
         ("ftpx://lab/s.mcap", "Protocol not known"),
         ("memory://none.mcap", "there is no such file"),
