@@ -33,6 +33,9 @@ def aot_film(path: Path, uid: str | None = None) -> Film:
         import aotpy
     with warnings.catch_warnings():  # that it keeps other tables as they are, such as those of `aolink export`
         warnings.filterwarnings("ignore", r".*HDU '\S+' is not an AOT binary table nor an image")
+        warnings.filterwarnings(
+            "ignore", r"\[.*\(Error level: "
+        )  # about parts that are not read; worse ones are raised
         system = aotpy.AOSystem.read_from_file(path)
     sensors = system.wavefront_sensors
     if uid is not None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from typing import Any
 
 import aotpy
@@ -575,13 +576,13 @@ def test_raw_and_compressed_pictures_on_one_topic_are_one_film(tmp_path):
     with (tmp_path / "a.mcap").open("wb") as file:
         writer = McapWriter(file)
         writer.start()
-        channels = {}
+        channels: dict[str, int] = {}
         for kind in (RawImage, CompressedImage):
             definition = build_file_descriptor_set(kind).SerializeToString()
             schema = writer.register_schema(kind.DESCRIPTOR.full_name, "protobuf", definition)
-            channels[kind] = writer.register_channel("/camera", "protobuf", schema)
+            channels[kind.DESCRIPTOR.name] = writer.register_channel("/camera", "protobuf", schema)
         for message, time_ns in zip(mixed, STAMPS.tolist(), strict=True):
-            writer.add_message(channels[type(message)], time_ns, message.SerializeToString(), time_ns)
+            writer.add_message(channels[message.DESCRIPTOR.name], time_ns, message.SerializeToString(), time_ns)
         writer.finish()
     check(open_film(tmp_path / "a.mcap"), frames)
 
@@ -670,3 +671,13 @@ def test_slopes_in_another_order_are_refused(shape, tmp_path):
     system.wavefront_sensors[0].measurements.data = np.zeros(shape, np.float32)
     system.write_to_file(str(tmp_path / "b.fits"))
     assert f"has slopes of shape {shape}, expected (frames, 2 directions" in refused(tmp_path / "b.fits")
+
+
+def test_telemetry_without_loops_is_read_without_complaint(two_sensors, tmp_path):
+    path, (low, _) = two_sensors
+    system = aotpy.AOSystem.read_from_file(path)
+    system.loops = []
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        system.write_to_file(str(tmp_path / "b.fits"))
+    check(open_film(tmp_path / "b.fits"), low)  # pytest makes errors of warnings

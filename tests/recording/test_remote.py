@@ -46,7 +46,7 @@ def s3(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[S3Server]:
 
 
 class _Ranges(BaseHTTPRequestHandler):
-    """What a web server does: files of one folder, ranges of them, one that nobody may read and one that it fails at."""
+    """What a web server does: files of one folder, ranges of them, one that nobody may read, one that it fails at."""
 
     folder: Path
     gives_ranges = True
