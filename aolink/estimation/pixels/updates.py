@@ -141,8 +141,8 @@ class ImportanceUpdater:
         return MixtureUpdate(after, after.gaussian, carried, new, modes.total_evidence, has_several(modes), poor)
 
 
-PROFILE = ImportanceUpdater(carried=6, free=0.01, share=0.25, points=600)
-MIXTURE = ImportanceUpdater(carried=6, free=1e-3, share=1.0, points=1200)
+PROFILE = ImportanceUpdater(carried=12, free=0.01, share=0.25, points=600)
+MIXTURE = ImportanceUpdater(carried=12, free=1e-3, share=1.0, points=1200)
 
 
 def has_several(modes: Modes, least: float = _LEAST_SHARE) -> BoolArray:
