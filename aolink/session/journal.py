@@ -71,4 +71,4 @@ class Journal:
             self.report.connection_faults[fault] = sum(each.get(fault, 0) for each in counts.values())
         for name, each in counts.items():
             if each:
-                self.record(topics.LINK, pb.LinkStatistics(device=name, **each), now)
+                self.record(topics.CONNECTION, pb.ConnectionStatistics(device=name, **each), now)

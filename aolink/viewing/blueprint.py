@@ -265,11 +265,11 @@ def _devices(contents: Contents) -> list[rrb.Container | rrb.View]:
     if topics.LATENCY in contents.topics:
         views.append(_lines(contents, "Latency since exposure end (ms)", [f"{entities.LATENCY}/**"], legend=True))
     health = [_lines(contents, "Lost since start (count)", [f"{entities.LOST}/**"], legend=True)]
-    if topics.LINK in contents.topics:
+    if topics.CONNECTION in contents.topics:
         lost = [f"{entities.LOST}/**", f"{entities.FAULTS}/camera", f"{entities.FAULTS}/mirror"]
         health = [
             _lines(contents, "Lost and faulty since start (count)", lost, legend=True),
-            _lines(contents, "Link faults by cause (count)", [f"{entities.FAULTS}/**"], legend=True),
+            _lines(contents, "Connection faults by cause (count)", [f"{entities.FAULTS}/**"], legend=True),
             _lines(contents, "Command round trip (ms)", [f"{entities.ROUND_TRIP}/**"], legend=True),
             _lines(contents, "Received (kB/s)", [f"{entities.RECEIVED}/**"], legend=True),
         ]
