@@ -18,6 +18,7 @@ from aolink.recording.reader import Recording
 from aolink.recording.topics import present_names
 from aolink.viewing.save import save_rrd
 from tests.conftest import Session
+from tests.kinds import messages_of
 from tests.viewing.rrd import read_rrd
 
 OLD = Path(__file__).parents[2] / "recordings" / "section-vi.mcap"
@@ -34,9 +35,7 @@ def names_in(path: Path) -> set[tuple[str, str]]:
 
 
 def counted(recording: Recording) -> list[pb.ConnectionStatistics]:
-    found = [each.message for each in recording.messages(topics.CONNECTION)]
-    assert all(isinstance(each, pb.ConnectionStatistics) for each in found)
-    return found
+    return messages_of(pb.ConnectionStatistics, recording, topics.CONNECTION)
 
 
 def test_a_new_recording_has_the_present_names(recorded: Session) -> None:
