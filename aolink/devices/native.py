@@ -65,7 +65,8 @@ class _NativeDevice:
         return self.steps.host_ns(device_ns, since_zero_ns, now_ns)
 
     def statistics(self) -> dict[str, Any]:
-        return asdict(self.link.counts)
+        counts = asdict(self.link.counts)
+        return {name.replace("packets", "messages"): number for name, number in counts.items()}
 
     def query_clock(self, now_ns: int) -> None:
         query_id = next(self._query_ids)

@@ -54,7 +54,7 @@ class SimpleCamera(Protocol):
 
     It raises `aolink.errors.DeviceError`, with the reason, where the device cannot do what the rig file says. A class
     attribute ``lacks`` may list what the device cannot do, some of `Lacks`. A method ``statistics`` may give the counts
-    of its line by the fields of the recording's ``LinkStatistics``; they are recorded once a second.
+    of its connection by the fields of the recording's ``ConnectionStatistics``; they are recorded once a second.
 
     A camera whose clock takes long to ask has a method ``ask_time``, which queries it without waiting (False where
     there is no clock), and a method ``time_answers``, which gives the `ClockAnswer`s since its last call. During a

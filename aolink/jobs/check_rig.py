@@ -318,7 +318,7 @@ def _check_mirror(rig: Rig) -> Iterator[Finding]:
     yield _info(
         "mirror",
         f"commands in blocks of {mirror.block_steps} steps, {with_unit(block_s, 's')}; the device queues"
-        f" {with_unit(queue_s, 's')} of them and parks {with_unit(mirror.watchdog_s, 's')} after the last packet",
+        f" {with_unit(queue_s, 's')} of them and parks {with_unit(mirror.watchdog_s, 's')} after the last message",
     )
     if queue_s < _LEAST_QUEUE_S:
         yield _warning(
@@ -329,7 +329,7 @@ def _check_mirror(rig: Rig) -> Iterator[Finding]:
     if mirror.watchdog_s < 2 * block_s:
         yield _warning(
             "mirror.watchdog_s",
-            f"the mirror parks after {with_unit(mirror.watchdog_s, 's')} without a packet, but a block of commands"
+            f"the mirror parks after {with_unit(mirror.watchdog_s, 's')} without a message, but a block of commands"
             f" lasts {with_unit(block_s, 's')}: shorten mirror.block_steps, or lengthen the watchdog",
         )
     if mirror.watchdog_s > _LONGEST_WATCHDOG_S:

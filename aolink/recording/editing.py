@@ -178,7 +178,7 @@ def merge(
     recordings = sorted((Recording(source) for source in sources), key=lambda each: each.start_ns)
     first = recordings[0]
     for other in recordings[1:]:
-        if _identity(other) != _identity(first):
+        if _session_of(other) != _session_of(first):
             raise RecordingError(
                 f"{other.path} is not of the same session as {first.path}: only parts of one session can be merged"
             )
@@ -193,7 +193,7 @@ def _begun(recording: Recording) -> dict[str, str]:
     return {name: value for name, value in recording.metadata.items() if name not in later}
 
 
-def _identity(recording: Recording) -> tuple[str, str]:
+def _session_of(recording: Recording) -> tuple[str, str]:
     return recording.rig.digest, recording.metadata.get("session", "")
 
 

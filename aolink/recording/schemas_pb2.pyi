@@ -67,12 +67,12 @@ class ClockSample(_message.Message):
     sigma_ns: float
     def __init__(self, device: _Optional[str] = ..., host_send_ns: _Optional[int] = ..., device_receive_ns: _Optional[int] = ..., device_send_ns: _Optional[int] = ..., host_receive_ns: _Optional[int] = ..., round_trip_ns: _Optional[int] = ..., accepted: _Optional[bool] = ..., offset_ns: _Optional[float] = ..., frequency_ppm: _Optional[float] = ..., sigma_ns: _Optional[float] = ...) -> None: ...
 
-class LinkStatistics(_message.Message):
-    __slots__ = ("device", "packets_received", "bytes_received", "packets_sent", "bytes_sent", "bad_crc", "bad_framing", "bad_payload", "sequence_gaps", "duplicates", "retransmits", "commands_in_flight", "round_trip_s", "queue_end_step", "reports_asked")
+class ConnectionStatistics(_message.Message):
+    __slots__ = ("device", "messages_received", "bytes_received", "messages_sent", "bytes_sent", "bad_crc", "bad_framing", "bad_payload", "sequence_gaps", "duplicates", "retransmits", "commands_in_flight", "round_trip_s", "queue_end_step", "reports_asked")
     DEVICE_FIELD_NUMBER: _ClassVar[int]
-    PACKETS_RECEIVED_FIELD_NUMBER: _ClassVar[int]
+    MESSAGES_RECEIVED_FIELD_NUMBER: _ClassVar[int]
     BYTES_RECEIVED_FIELD_NUMBER: _ClassVar[int]
-    PACKETS_SENT_FIELD_NUMBER: _ClassVar[int]
+    MESSAGES_SENT_FIELD_NUMBER: _ClassVar[int]
     BYTES_SENT_FIELD_NUMBER: _ClassVar[int]
     BAD_CRC_FIELD_NUMBER: _ClassVar[int]
     BAD_FRAMING_FIELD_NUMBER: _ClassVar[int]
@@ -85,9 +85,9 @@ class LinkStatistics(_message.Message):
     QUEUE_END_STEP_FIELD_NUMBER: _ClassVar[int]
     REPORTS_ASKED_FIELD_NUMBER: _ClassVar[int]
     device: str
-    packets_received: int
+    messages_received: int
     bytes_received: int
-    packets_sent: int
+    messages_sent: int
     bytes_sent: int
     bad_crc: int
     bad_framing: int
@@ -99,7 +99,7 @@ class LinkStatistics(_message.Message):
     round_trip_s: float
     queue_end_step: int
     reports_asked: int
-    def __init__(self, device: _Optional[str] = ..., packets_received: _Optional[int] = ..., bytes_received: _Optional[int] = ..., packets_sent: _Optional[int] = ..., bytes_sent: _Optional[int] = ..., bad_crc: _Optional[int] = ..., bad_framing: _Optional[int] = ..., bad_payload: _Optional[int] = ..., sequence_gaps: _Optional[int] = ..., duplicates: _Optional[int] = ..., retransmits: _Optional[int] = ..., commands_in_flight: _Optional[int] = ..., round_trip_s: _Optional[float] = ..., queue_end_step: _Optional[int] = ..., reports_asked: _Optional[int] = ...) -> None: ...
+    def __init__(self, device: _Optional[str] = ..., messages_received: _Optional[int] = ..., bytes_received: _Optional[int] = ..., messages_sent: _Optional[int] = ..., bytes_sent: _Optional[int] = ..., bad_crc: _Optional[int] = ..., bad_framing: _Optional[int] = ..., bad_payload: _Optional[int] = ..., sequence_gaps: _Optional[int] = ..., duplicates: _Optional[int] = ..., retransmits: _Optional[int] = ..., commands_in_flight: _Optional[int] = ..., round_trip_s: _Optional[float] = ..., queue_end_step: _Optional[int] = ..., reports_asked: _Optional[int] = ...) -> None: ...
 
 class Latency(_message.Message):
     __slots__ = ("frame_id", "exposure_end_ns", "first_byte_ns", "complete_ns", "estimated_ns", "command_sent_ns", "command_acknowledged_ns", "command_applied_ns")

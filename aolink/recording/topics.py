@@ -29,14 +29,14 @@ RESTORED_SCENE = RESTORED + "image"
 RESTORED_SPOTS = RESTORED + "spot"
 CONTROL = "/control"
 LATENCY = "/latency"
-LINK = "/link"
+CONNECTION = "/connection"
 CLOCK = "/clock"
 LOG = "/log"
 
 
 CONNECTION_FAULTS = ("bad_crc", "bad_framing", "bad_payload", "sequence_gaps", "duplicates")
-"""Fields of ``LinkStatistics`` that count what goes wrong on the connection to a device. The metadata at the end of a
-recording have the sums over the devices, with ``connection_`` before the names."""
+"""Fields of ``ConnectionStatistics`` that count what goes wrong on the connection to a device. The metadata at
+the end of a recording have the sums over the devices, with ``connection_`` before the names."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,7 +88,7 @@ TOPICS = (
     ),
     Topic(name=CONTROL, message=pb.Control, belongs_to="exposure", shown_by="devices.log_control"),
     Topic(name=LATENCY, message=pb.Latency, belongs_to="exposure", shown_by="devices.log_latency"),
-    Topic(name=LINK, message=pb.LinkStatistics, shown_by="devices.log_link"),
+    Topic(name=CONNECTION, message=pb.ConnectionStatistics, shown_by="devices.log_connection"),
     Topic(name=CLOCK, message=pb.ClockSample, shown_by="devices.log_clock"),
     Topic(name=LOG, message=Log, shown_by="devices.log_log"),
 )
@@ -101,11 +101,24 @@ RUNS = {row.name: row.message.DESCRIPTOR.full_name for row in TOPICS if row.belo
 """The topics with runs of steps, and their schemas."""
 _UNKNOWN = Topic(name="", message=Message)
 
+_FORMER_TOPICS = {"/link": CONNECTION}
+_FORMER_SCHEMAS = {"aolink.recording.LinkStatistics": pb.ConnectionStatistics.DESCRIPTOR.full_name}
+"""Names in older recordings, and what they are called now. A message keeps the numbers of its fields, so its bytes stay
+what they were."""
+
 
 def find(name: str, message: Message | None) -> Topic:
     """The row of a message; where the topic does not hold such messages, a row that belongs to its time only."""
     row = named(name)
     return row if isinstance(message, row.message) else _UNKNOWN
+
+
+def present_names(topic: str, schema: str) -> tuple[str, str]:
+    """The topic and the schema of a file's channel by their present names. A topic that other software gave one of the
+    former names, with messages of its own, keeps it."""
+    schema = _FORMER_SCHEMAS.get(schema, schema)
+    renamed = _FORMER_TOPICS.get(topic, topic)
+    return (renamed if named(renamed).message is SCHEMAS.get(schema) else topic), schema
 
 
 @lru_cache(maxsize=256)

@@ -13,6 +13,9 @@ from aolink.recording import topics
 from aolink.recording.writer import RecordingWriter
 from aolink.session.report import Report
 
+_COUNTS = {each.name for each in pb.ConnectionStatistics.DESCRIPTOR.fields} - {"device"}
+"""What a device may count."""
+
 
 class Journal:
     """Writes a session's messages into its recording, and notes warnings and counts in its `Report`."""
@@ -70,5 +73,9 @@ class Journal:
         for fault in topics.CONNECTION_FAULTS:
             self.report.connection_faults[fault] = sum(each.get(fault, 0) for each in counts.values())
         for name, each in counts.items():
-            if each:
-                self.record(topics.LINK, pb.LinkStatistics(device=name, **each), now)
+            if unknown := sorted(each.keys() - _COUNTS):
+                text = f"the {name} counts {', '.join(unknown)}, which recordings have no field for: not recorded"
+                if text not in self.report.warnings:
+                    self.warn(text)
+            if known := {count: number for count, number in each.items() if count in _COUNTS}:
+                self.record(topics.CONNECTION, pb.ConnectionStatistics(device=name, **known), now)

@@ -29,9 +29,9 @@ class DisturbancePlayer:
         self._step_s = rig.timing.fast_step_s
         self._still = np.zeros(rig.n_outputs)
         directions = np.tile(np.eye(2), (-(-rig.n_outputs // 2), 1))[: rig.n_outputs]
-        self._lines = [
-            (line.frequency_hz, rng.uniform(0, 2 * math.pi), directions @ line.amplitude)
-            for line in disturbance.vibrations
+        self._vibrations = [
+            (vibration.frequency_hz, rng.uniform(0, 2 * math.pi), directions @ vibration.amplitude)
+            for vibration in disturbance.vibrations
         ]
         self._layers: list[tuple[FrozenFlow, FloatArray]] = []
         optics = rig.optics
@@ -61,7 +61,7 @@ class DisturbancePlayer:
         steps = np.arange(block * _BLOCK, (block + 1) * _BLOCK)
         times = self._step_s * steps.astype(np.float64)
         slopes = np.tile(self._still, (_BLOCK, 1))
-        for frequency, phase, amplitude in self._lines:
+        for frequency, phase, amplitude in self._vibrations:
             slopes += np.sin(2 * math.pi * frequency * times + phase)[:, None] * amplitude
         for flow, waves in self._layers:
             blown = flow.blown(times)

@@ -166,7 +166,7 @@ def _paths(contents: Contents) -> rrb.Container | rrb.View:
     tabs = [
         _lines(
             contents, f"Path, {name} ± {BAND:g} sd (slope units{what})",
-            [*truth, *_path(contents, name), f"{entities.PATH}/{name}/band"], window=not contents.alone,
+            [*truth, *_path(contents, name), entities.band(f"{entities.PATH}/{name}")], window=not contents.alone,
         )
         for name in reversed(names)
     ]  # fmt: skip
@@ -179,11 +179,11 @@ def _paths(contents: Contents) -> rrb.Container | rrb.View:
 
 def _path(contents: Contents, name: str, what: str = entities.PATH) -> list[str]:
     """A path's line with its percentiles, or its range."""
-    root = f"{what}/{name}"
-    if contents.drawn.swinging.get(root):
-        return [f"{root}/range"]
-    line = root if name == "truth" or what != entities.PATH else f"{root}/mean"
-    return [line, f"{line}/axes"]
+    path = f"{what}/{name}"
+    if contents.drawn.swinging.get(path):
+        return [entities.extremes(path)]
+    has_band = what == entities.PATH and name != "truth"
+    return entities.with_percentiles([entities.mean(path) if has_band else path])
 
 
 def _errors(contents: Contents) -> list[rrb.Container | rrb.View]:
@@ -193,12 +193,12 @@ def _errors(contents: Contents) -> list[rrb.Container | rrb.View]:
     every_step = [path for n in names for path in _path(contents, n, entities.PATH_ERROR)]
     rms = [f"{entities.RMS_ERROR}/{n}" for n in names]
     views = [
-        _lines(contents, "Path error, RMS an exposure (slope units)", _with_axes(rms)),
+        _lines(contents, "Path error, RMS an exposure (slope units)", entities.with_percentiles(rms)),
         _lines(contents, "Path error at fast steps (slope units)", every_step, window=True),
         *[
             _lines(
                 contents, f"End state x{i + 1} error (plant's units)",
-                _with_axes(f"{entities.END_ERROR}/x{i + 1}/{n}" for n in names),
+                entities.with_percentiles(entities.end_error(i, n) for n in names),
             )
             for i in range(_states_of(contents))
         ],
@@ -207,8 +207,8 @@ def _errors(contents: Contents) -> list[rrb.Container | rrb.View]:
 
 
 def _nis(contents: Contents) -> list[rrb.View]:
-    roots = [f"{entities.NIS}/{name}" for name in contents.measuring]
-    shown = [path for root in roots for path in (f"{root}/value", f"{root}/value/axes", f"{root}/bounds")]
+    names = contents.measuring
+    shown = [*entities.with_percentiles(map(entities.nis_values, names)), *map(entities.nis_bounds, names)]
     return [_lines(contents, f"NIS (no unit) with its {NIS_COVERAGE:.0%} bounds", shown)] if shown else []
 
 
@@ -217,10 +217,11 @@ def _states(contents: Contents) -> list[rrb.Container]:
     tabs = []
     for where in ("end", "start"):
         for i in range(_states_of(contents) if names else 0):
-            root = f"{entities.STATE}/{where}/x{i + 1}"
-            shown = [f"{root}/truth"] if contents.truth else []
-            shown += [f"{root}/{n}/mean" for n in names]
-            shown = [*_with_axes(shown), f"{root}/{contents.focus}/band"]
+            shown = [entities.state(where, i, "truth")] if contents.truth else []
+            shown += [entities.mean(entities.state(where, i, n)) for n in names]
+            shown = entities.with_percentiles(shown)
+            if contents.focus is not None:
+                shown.append(entities.band(entities.state(where, i, contents.focus)))
             tabs.append(_lines(contents, f"{where.capitalize()} state x{i + 1} (plant's units)", shown))
     return [rrb.Tabs(contents=tabs, active_tab=0)] if tabs else []
 
@@ -253,7 +254,7 @@ def _devices(contents: Contents) -> list[rrb.Container | rrb.View]:
             path for topic, path in ((topics.COMMAND, entities.COMMAND), (topics.APPLIED, entities.APPLIED))
             if topic in contents.topics
         ]  # fmt: skip
-        views.append(_lines(contents, "Mirror input (mirror's units)", _with_axes(shown), legend=True))
+        views.append(_lines(contents, "Mirror input (mirror's units)", entities.with_percentiles(shown), legend=True))
     if topics.CONTROL in contents.topics:
         loop = [
             ("Loop: residual (slope units)", [f"{entities.CONTROL}/slope_rms", f"{entities.CONTROL}/path_rms"]),
@@ -265,11 +266,11 @@ def _devices(contents: Contents) -> list[rrb.Container | rrb.View]:
     if topics.LATENCY in contents.topics:
         views.append(_lines(contents, "Latency since exposure end (ms)", [f"{entities.LATENCY}/**"], legend=True))
     health = [_lines(contents, "Lost since start (count)", [f"{entities.LOST}/**"], legend=True)]
-    if topics.LINK in contents.topics:
+    if topics.CONNECTION in contents.topics:
         lost = [f"{entities.LOST}/**", f"{entities.FAULTS}/camera", f"{entities.FAULTS}/mirror"]
         health = [
             _lines(contents, "Lost and faulty since start (count)", lost, legend=True),
-            _lines(contents, "Link faults by cause (count)", [f"{entities.FAULTS}/**"], legend=True),
+            _lines(contents, "Connection faults by cause (count)", [f"{entities.FAULTS}/**"], legend=True),
             _lines(contents, "Command round trip (ms)", [f"{entities.ROUND_TRIP}/**"], legend=True),
             _lines(contents, "Received (kB/s)", [f"{entities.RECEIVED}/**"], legend=True),
         ]
@@ -351,8 +352,3 @@ def _with_compared(contents: Contents, paths: Iterable[str]) -> list[str]:
         there, root = contents.compared.drawn.extents, contents.compared.drawn.root
         every += [root + path for path in paths if any(_names(path, each) for each in there)]
     return every
-
-
-def _with_axes(paths: Iterable[str]) -> list[str]:
-    """The paths and, where there are many axes, their percentiles."""
-    return [p for path in paths for p in (path, f"{path}/axes")]

@@ -1,4 +1,4 @@
-"""Series of devices and links: commands, latency, drops, clock, log."""
+"""Series of devices and their connections: commands, latency, drops, clock, log."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from aolink.viewing.series import Drawing, Style, send_axes, send_line, send_sta
 from aolink.viewing.timebase import Timebase
 from aolink.wire.messages_pb2 import Applied
 
-LINK_COUNTS = (*topics.CONNECTION_FAULTS, "retransmits", "reports_asked")
-"""Fields of LinkStatistics that count faults."""
+CONNECTION_COUNTS = (*topics.CONNECTION_FAULTS, "retransmits", "reports_asked")
+"""Fields of ConnectionStatistics that count faults."""
 
 _MOST_INPUTS = 2
 """Most inputs with lines of their own; where there are more, the first ones have them, and percentiles show all."""
@@ -82,7 +82,7 @@ def log_estimation(drawing: Drawing, timebase: Timebase, records: Sequence[Timed
 
 
 def log_drops(drawing: Drawing, timebase: Timebase, records: Sequence[Timed]) -> None:
-    """Frames and chunks lost since the start, from ExposureInfo: ``/link/lost/frames``, ``/link/lost/chunks``."""
+    """Frames and chunks lost since the start: ``/connection/lost/frames``, ``/connection/lost/chunks``."""
     infos = [r.message for r in records]
     times = timebase.at_steps([m.first_step for m in infos], [m.frame_id for m in infos])
     frames = np.cumsum([m.frames_lost_before for m in infos])
@@ -91,20 +91,24 @@ def log_drops(drawing: Drawing, timebase: Timebase, records: Sequence[Timed]) ->
     send_line(drawing, f"{LOST}/chunks", times, chunks, Style("chunks lost", (250, 170, 90), steps=True))
 
 
-def log_link(drawing: Drawing, timebase: Timebase, records: Sequence[Timed]) -> None:
-    """Health of each device's link: faults by cause, command round trip and traffic.
+def log_connection(drawing: Drawing, timebase: Timebase, records: Sequence[Timed]) -> None:
+    """Health of the connection to each device: faults by cause, command round trip and traffic.
 
-    ``/link/faults/DEVICE`` and, for causes that occurred, ``/link/faults/DEVICE/CAUSE`` (since the start),
-    ``/link/round_trip/DEVICE`` (ms), ``/link/received/DEVICE`` (kB/s).
+    ``/connection/faults/DEVICE`` and, for causes that occurred, ``/connection/faults/DEVICE/CAUSE`` (since the start),
+    ``/connection/round_trip/DEVICE`` (ms), ``/connection/received/DEVICE`` (kB/s).
     """
     for d, (device, samples) in enumerate(_by_device(records).items()):
         host = np.array([r.log_time_ns for r in samples], dtype=np.int64)
         times = timebase.at_host(host)
-        total = [sum(getattr(r.message, field) for field in LINK_COUNTS) for r in samples]
+        total = [sum(getattr(r.message, field) for field in CONNECTION_COUNTS) for r in samples]
         send_line(
-            drawing, f"{FAULTS}/{device}", times, total, Style(f"{device} link faults", series_colour(d), steps=True)
+            drawing,
+            f"{FAULTS}/{device}",
+            times,
+            total,
+            Style(f"{device} connection faults", series_colour(d), steps=True),
         )
-        for i, field in enumerate(LINK_COUNTS):
+        for i, field in enumerate(CONNECTION_COUNTS):
             counts = [getattr(r.message, field) for r in samples]
             if not any(counts):
                 continue

@@ -16,7 +16,8 @@ from aolink.exposure import Exposure, Truth, residual_rms
 from aolink.numerics.arrays import FloatArray
 from aolink.plotting.overview import NIS_COVERAGE, nis_bounds
 from aolink.plotting.style import BAND, extremes, hides_swings
-from aolink.viewing.entities import END_ERROR, ESTIMATE, NIS, PATH, PATH_ERROR, RESIDUAL, RMS_ERROR, STATE
+from aolink.viewing import entities
+from aolink.viewing.entities import ESTIMATE, PATH, PATH_ERROR, RESIDUAL, RMS_ERROR
 from aolink.viewing.palette import TRUTH
 from aolink.viewing.series import Drawing, Style, send_axes, send_line
 from aolink.viewing.timebase import Timebase
@@ -41,7 +42,7 @@ def log_truth(drawing: Drawing, timebase: Timebase, exposures: Sequence[Exposure
     ):
         times = timebase.at_steps(at, frames)
         for i in range(min(states.shape[2], MOST_STATES)):
-            _send_state(drawing, f"{STATE}/{where}/x{i + 1}/truth", times, states[:, :, i], style)
+            _send_state(drawing, entities.state(where, i, "truth"), times, states[:, :, i], style)
 
 
 def log_estimates(drawing: Drawing, timebase: Timebase, estimates: Sequence[Estimate]) -> None:
@@ -73,9 +74,10 @@ def log_estimates(drawing: Drawing, timebase: Timebase, estimates: Sequence[Esti
         every = np.array(states)
         deviation = np.sqrt(np.diagonal(np.array(covariances), axis1=2, axis2=3))
         for i in range(min(every.shape[2], MOST_STATES)):
-            _send_state(drawing, f"{STATE}/{where}/x{i + 1}/{name}/mean", times, every[:, :, i], line)
+            path = entities.state(where, i, name)
+            _send_state(drawing, entities.mean(path), times, every[:, :, i], line)
             limits = _about(every[:, axes, i], BAND * deviation[:, :, i])
-            send_line(drawing, f"{STATE}/{where}/x{i + 1}/{name}/band", times, limits, band)
+            send_line(drawing, entities.band(path), times, limits, band)
     _log_nis(drawing, timebase, estimates)
     _send_table(drawing, f"{ESTIMATE}/{name}", timebase.at_steps(starts, frames), estimates)
 
@@ -106,7 +108,7 @@ def log_errors(
     ends = timebase.at_steps(starts + [e.n_steps for e, _ in known], frames)
     ended = np.array([e.end_state - truth.end_state for e, truth in known])
     for i in range(min(ended.shape[2], MOST_STATES)):
-        _send_state(drawing, f"{END_ERROR}/x{i + 1}/{name}", ends, ended[:, :, i], style)
+        _send_state(drawing, entities.end_error(i, name), ends, ended[:, :, i], style)
 
 
 def log_residual(
@@ -145,13 +147,13 @@ def _log_nis(drawing: Drawing, timebase: Timebase, estimates: Sequence[Estimate]
     times = timebase.at_steps([e.first_step for e in measured], [e.frame_id for e in measured])
     line = Style(name, estimator_colour(name))
     values = np.array([e.nis for e in measured])
-    _send_state(drawing, f"{NIS}/{name}/value", times, values, line)
+    _send_state(drawing, entities.nis_values(name), times, values, line)
     bounds = np.array([nis_bounds(e.innovation.shape[1]) for e in measured])
     # A constant is a line between its ends.
     kept = [0, *range(len(bounds) - 1, 0, -1)[:1]] if (bounds == bounds[0]).all() else list(range(len(bounds)))
     ends = timebase.at_steps([measured[k].first_step for k in kept], [measured[k].frame_id for k in kept])
     label = f"{name}, {NIS_COVERAGE:.0%} bounds"
-    send_line(drawing, f"{NIS}/{name}/bounds", ends, bounds[kept], Style(label, line.colour, width=1.0, alpha=140))
+    send_line(drawing, entities.nis_bounds(name), ends, bounds[kept], Style(label, line.colour, width=1.0, alpha=140))
 
 
 def _band_style(name: str) -> Style:
@@ -190,12 +192,11 @@ def _send_path(
     times, values = timebase.every_step(np.concatenate(steps)), np.concatenate(lines)
     if swings:
         labels = [f"{label}, {end}" for label in chosen.labels for end in ("highest", "lowest")]
-        send_line(drawing, f"{path}/range", times, values, replace(style, width=1.2), labels)
+        send_line(drawing, entities.extremes(path), times, values, replace(style, width=1.2), labels)
     else:
-        mean = f"{path}/mean" if band else path
-        send_axes(drawing, mean, times, values, style, outputs, chosen.labels)
+        send_axes(drawing, entities.mean(path) if band else path, times, values, style, outputs, chosen.labels)
     if band:
-        send_line(drawing, f"{path}/band", times, np.concatenate(limits), band)
+        send_line(drawing, entities.band(path), times, np.concatenate(limits), band)
 
 
 def _line(

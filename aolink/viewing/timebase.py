@@ -1,7 +1,7 @@
 """The three timelines of every view: seconds since the first exposure began, fast step and frame number.
 
 The devices count fast steps, so the time on their clock and the frame number follow from them exactly; messages with a
-host time only (the log, the link) are placed on the devices' clock by the exposures, which have both times.
+host time only (the log, a connection) are placed on the devices' clock by the exposures, which have both times.
 """
 
 from __future__ import annotations

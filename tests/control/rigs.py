@@ -32,7 +32,7 @@ watchdog_s = 2.0
 seed = 3
 """
 DRIFT = '[[disturbance.model]]\nkind = "ornstein-uhlenbeck"\ncorrelation_s = 0.5\nsd = 0.15\n'
-LINE = '[[disturbance.model]]\nkind = "resonance"\nfrequency_hz = 15.0\ndamping = 0.002\nsd = 0.1\n'
+VIBRATION = '[[disturbance.model]]\nkind = "resonance"\nfrequency_hz = 15.0\ndamping = 0.002\nsd = 0.1\n'
 
 
 def small_rig(*parts: str, **changes: str) -> Rig:

@@ -7,7 +7,7 @@ from aolink.control.drift import WINDOW
 from aolink.estimation import make_estimator
 from aolink.rig import Rig
 from aolink.simulation.model import simulate
-from tests.control.rigs import DRIFT, LINE, small_rig
+from tests.control.rigs import DRIFT, VIBRATION, small_rig
 
 
 def fit_of(believed: Rig, true: Rig, seed: int, estimator: str = "moments") -> Fit | None:
@@ -19,7 +19,7 @@ def fit_of(believed: Rig, true: Rig, seed: int, estimator: str = "moments") -> F
 
 
 def test_a_right_model_fits() -> None:
-    rig = small_rig(DRIFT, LINE)
+    rig = small_rig(DRIFT, VIBRATION)
     for seed in range(5):
         fit = fit_of(rig, rig, seed)
         assert fit is not None

@@ -17,7 +17,7 @@ from aolink.exposure import residual_rms
 from aolink.jobs.closed_loop import Closed, closed_loop
 from aolink.numerics.arrays import FloatArray
 from aolink.rig import Rig, load_rig
-from tests.control.rigs import DRIFT, LINE, small_rig
+from tests.control.rigs import DRIFT, VIBRATION, small_rig
 
 STEPS = 40
 """Fast steps of an exposure."""
@@ -32,7 +32,7 @@ def played(folder: Path, slopes: FloatArray, *parts: str, **changes: str) -> Rig
     return load_rig(path)
 
 
-def line(frequency_hz: float, exposures: int, amplitude: float = 0.14) -> FloatArray:
+def vibration(frequency_hz: float, exposures: int, amplitude: float = 0.14) -> FloatArray:
     """A vibration, slope units at each fast step."""
     return np.asarray(amplitude * np.sin(2 * math.pi * frequency_hz * 0.001 * np.arange(exposures * STEPS) + 1))
 
@@ -76,15 +76,15 @@ def test_what_the_integrator_would_have_left_is_what_it_leaves() -> None:
 
 @pytest.mark.parametrize("seed", range(2))
 def test_a_model_that_is_right_never_falls_back(seed: int) -> None:
-    rig = small_rig(DRIFT, LINE)
+    rig = small_rig(DRIFT, VIBRATION)
     watched, alone = run(rig, 90, seed=seed), run(rig, 90, fall_back=False, seed=seed)
     assert set(acting(watched)) == {"lqg"}
     for ours, theirs in zip(watched, alone, strict=True):
         assert np.array_equal(ours.exposure.inputs, theirs.exposure.inputs)
 
 
-def test_a_line_at_another_frequency_than_the_model_has_it_is_left_alone(tmp_path: Path) -> None:
-    rig = played(tmp_path, line(10.5, 120), DRIFT, LINE)
+def test_a_vibration_at_another_frequency_than_the_model_has_it_is_left_alone(tmp_path: Path) -> None:
+    rig = played(tmp_path, vibration(10.5, 120), DRIFT, VIBRATION)
     series, alone = run(rig, 120), run(rig, 120, fall_back=False)
     which = acting(series)
     assert which[:20] == ["lqg"] * 20
@@ -102,16 +102,16 @@ def test_a_line_at_another_frequency_than_the_model_has_it_is_left_alone(tmp_pat
 def test_a_model_that_is_known_to_be_wrong_need_not_be_worse_beyond_chance(seed: int, tmp_path: Path) -> None:
     """The disturbance is faster than the model has it, and innovations show that within 60 exposures. What the others
     gain is as large, but not significant until 137 exposures or later. Between the two others chance still counts."""
-    which = acting(run(played(tmp_path, wandering(125, seed), DRIFT, LINE), 125))
+    which = acting(run(played(tmp_path, wandering(125, seed), DRIFT, VIBRATION), 125))
     assert which[:50] == ["lqg"] * 50
     assert which[80] != "lqg"
     assert set(which[80:]) == {which[80]}
 
 
 def test_a_controller_whose_model_fits_again_acts_again(tmp_path: Path) -> None:
-    """The line is elsewhere for a while, and comes back to where the model has it."""
-    slopes = np.concatenate([line(10.5, 70), line(15.0, 190)])
-    rig = played(tmp_path, slopes, DRIFT, LINE)
+    """The vibration is elsewhere for a while, and comes back to where the model has it."""
+    slopes = np.concatenate([vibration(10.5, 70), vibration(15.0, 190)])
+    rig = played(tmp_path, slopes, DRIFT, VIBRATION)
     which = acting(run(rig, 260))
     assert "lqg" not in which[60:70]
     assert which[-1] == "lqg"

@@ -16,7 +16,7 @@ from aolink.jobs.closed_loop import Closed, closed_loop
 from aolink.numerics.arrays import FloatArray
 from aolink.rig import Rig
 from aolink.simulation.model import simulate
-from tests.control.rigs import DRIFT, LINE, small_rig
+from tests.control.rigs import DRIFT, VIBRATION, small_rig
 
 
 def residual(series: list[Closed]) -> float:
@@ -44,9 +44,9 @@ def test_a_controller_may_be_given_by_its_row() -> None:
     assert ours[-1].act.acting == "mine"
 
 
-def test_lqg_takes_off_a_line_that_the_integrator_makes_worse() -> None:
+def test_lqg_takes_off_a_vibration_that_the_integrator_makes_worse() -> None:
     """At 0.6 of the frame rate a centroid comes too late for an integrator; the model knows what comes next."""
-    rig = small_rig(LINE)
+    rig = small_rig(VIBRATION)
     still = residual(run(rig, ""))
     assert residual(run(rig, "integrator")) > still
     assert residual(run(rig, "lqg", "o1")) < 0.5 * still
@@ -158,14 +158,14 @@ def test_an_estimator_that_has_lost_itself_opens_the_loop_at_once(status: Status
 
 def test_without_any_exposure_the_prediction_runs_on_and_then_the_mirror_holds() -> None:
     """Frames lost, or an estimator that is too late."""
-    rig = small_rig(LINE)
+    rig = small_rig(VIBRATION)
     loop, estimator = ControlLoop(rig, "lqg"), make_estimator(rig, "o1")
     for exposure in simulate(rig, 5):
         loop.see(exposure, estimator.step(exposure), exposure.first_step + 40)
     u = loop.inputs(200, 800)[:, 0]
     patience = (BLIND_EXPOSURES + 1) * 40 + loop.delay_steps
     predicted, then = u[:patience], u[patience + 1 :]
-    assert np.ptp(predicted) > 0.05  # it swings on with the line
+    assert np.ptp(predicted) > 0.05  # it swings on with the vibration
     assert (then == then[0]).all()
     (late,) = simulate(rig, 1)
     late = replace(late, first_step=800, frame_id=21)

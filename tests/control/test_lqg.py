@@ -16,7 +16,7 @@ from aolink.errors import ControlError
 from aolink.numerics.arrays import FloatArray
 from aolink.rig import Plant, load_rig, parse_rig
 
-LINE = '[[disturbance.model]]\nkind = "resonance"\nfrequency_hz = 12.0\ndamping = 0.05\nsd = 0.2\n'
+VIBRATION = '[[disturbance.model]]\nkind = "resonance"\nfrequency_hz = 12.0\ndamping = 0.05\nsd = 0.2\n'
 WALK = '[[disturbance.model]]\nkind = "random-walk"\nstep_sd = 0.001\n'
 
 
@@ -26,7 +26,7 @@ def plant_with(model: str) -> Plant:
 
 def test_the_gain_is_that_of_the_whole_riccati_equation() -> None:
     """For a disturbance that dies out, the Riccati equation of the whole state has a solution: SciPy's."""
-    plant = plant_with(LINE)
+    plant = plant_with(VIBRATION)
     rho = 1e-3 * float(response_at_rest(plant, 1)[0, 0] ** 2)
     P = linalg.solve_discrete_are(plant.A, plant.B, plant.C.T @ plant.C, rho * np.eye(1))
     K = np.linalg.solve(rho + plant.B.T @ P @ plant.B, plant.B.T @ P @ plant.A)
@@ -54,7 +54,7 @@ def cost(plant: Plant, K: FloatArray, rho: float, start: FloatArray) -> float:
 
 
 def test_no_other_gain_costs_less() -> None:
-    plant = plant_with(LINE)
+    plant = plant_with(VIBRATION)
     rho = 1e-2 * float(response_at_rest(plant, 1)[0, 0] ** 2)
     K, rng = lqr_gain(plant, 1e-2, 1), np.random.default_rng(1)
     start = np.array([0.1, 0.0, 0.2, 0.0])
@@ -65,7 +65,7 @@ def test_no_other_gain_costs_less() -> None:
 
 def test_it_predicts_with_what_the_mirror_holds() -> None:
     """After the delay its state is the plant's, whatever was held meanwhile, wanted or not."""
-    rig = parse_rig(f"{load_rig('section-vi').toml}\n{LINE}")
+    rig = parse_rig(f"{load_rig('section-vi').toml}\n{VIBRATION}")
     plant, controller, rng = rig.plant, LQG(rig), np.random.default_rng(2)
     x, K = rng.standard_normal(4), lqr_gain(rig.plant, rig.control.effort, 200)
     held = rng.uniform(-0.05, 0.05, (30, 1))

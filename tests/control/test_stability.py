@@ -11,7 +11,7 @@ from aolink.control import check_stable, stability
 from aolink.errors import ControlError
 from aolink.jobs.closed_loop import closed_loop
 from aolink.rig import Rig
-from tests.control.rigs import DRIFT, LINE, small_rig
+from tests.control.rigs import DRIFT, VIBRATION, small_rig
 
 
 def instant(gain: float) -> Rig:
@@ -48,7 +48,7 @@ def test_the_margin_is_one_that_a_loop_really_has() -> None:
 
 
 def test_a_stable_loop_of_lqg_has_a_margin() -> None:
-    found = stability(small_rig(LINE), "lqg")
+    found = stability(small_rig(VIBRATION), "lqg")
     assert found.stable
     assert found.gain_margin > 1.3
 

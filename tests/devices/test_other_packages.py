@@ -65,7 +65,7 @@ def test_a_session_with_devices_of_another_package(aolink: Run, installed: dict[
     recording = Recording(tmp_path / "a.mcap")
     assert (recording.metadata["camera"], recording.metadata["mirror"]) == ("example camera", "example mirror")
     assert recording.counts[topics.TRUTH] == recording.counts[topics.IMAGE] == 6
-    assert topics.LINK not in recording.counts
+    assert topics.CONNECTION not in recording.counts
     reported = messages_of(Applied, recording, topics.APPLIED)
     steps = [k for m in reported for k in range(m.first_step, m.first_step + m.n_steps)]
     assert steps == list(range(steps[0], steps[0] + len(steps)))  # each once, in order

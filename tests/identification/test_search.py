@@ -19,8 +19,8 @@ from bench_rows.loop_worth import Cell
 
 
 @pytest.mark.long
-def test_a_sharp_line_beside_a_drift_is_found_although_only_an_alias_is_found_at_first():
-    """The line is at 14.4 Hz; the best that the grid and its aliases lead to is at 34.4 Hz, 20 nats below."""
+def test_a_sharp_vibration_beside_a_drift_is_found_although_only_an_alias_is_found_at_first():
+    """The vibration is at 14.4 Hz; the best that the grid and its aliases lead to is at 34.4 Hz, 20 nats below."""
     rig = load_rig("loop")
     seen = [readings(rig, changed(DisturbanceChange("", frequency=1.2), 180, 30_001)[84:])]
     kinds = ("ornstein-uhlenbeck", "resonance")
@@ -35,9 +35,9 @@ def test_a_sharp_line_beside_a_drift_is_found_although_only_an_alias_is_found_at
 @pytest.mark.parametrize(
     ("cycles", "seed"), [(2.4, 703), (2.7, 705)], ids=["between the points of the grid", "an alias of the second best"]
 )
-def test_a_sharp_line_in_turbulence_is_among_the_maxima(cycles, seed, tmp_path):
-    """In the first recording the grid and its aliases alone lead to 0.856, 26 nats below; in the second the line is an
-    alias of the highest maximum that is no alias of the highest of all."""
+def test_a_sharp_vibration_in_turbulence_is_among_the_maxima(cycles, seed, tmp_path):
+    """In the first recording the grid and its aliases alone lead to 0.856, 26 nats below; in the second the
+    vibration is an alias of the highest maximum that is no alias of the highest of all."""
     cell, past = Cell("own", cycles), 200
     run = cell.disturbance((past + 101) * cell.steps, past * cell.steps, seed)
     np.save(tmp_path / "path.npy", run.slopes[: past * cell.steps, None])

@@ -24,8 +24,8 @@ from aolink.rig import Rig, load_rig, parse_rig
 from aolink.session import Report, record
 from aolink.session.replay import would_command
 from aolink.wire import messages_pb2 as wire
-from tests.control.rigs import DRIFT, LINE, small_rig
-from tests.control.test_fall_back import line, played
+from tests.control.rigs import DRIFT, VIBRATION, small_rig
+from tests.control.test_fall_back import played, vibration
 from tests.kinds import messages_of, must_be
 from tests.session.simulated_time import Run, SimulatedTimeHub, run_session
 
@@ -62,7 +62,7 @@ def acts(folder: Path) -> list[pb.Control]:
 def test_on_virtual_time_the_session_is_the_loop_in_memory_bit_for_bit(
     tmp_path: Path, controller: str, estimator: str
 ) -> None:
-    path = rig_file(tmp_path, small_rig(DRIFT, LINE))
+    path = rig_file(tmp_path, small_rig(DRIFT, VIBRATION))
     report = close(path, tmp_path, controller, *([estimator] if estimator else []))
     assert report.ended == "complete"
     assert report.steps_commanded == report.steps_applied == 40 * 40
@@ -118,7 +118,7 @@ def test_the_recording_says_who_closed_the_loop_and_how(tmp_path: Path) -> None:
 
 
 def test_estimates_of_a_closed_loop_are_the_same_offline(tmp_path: Path) -> None:
-    path = rig_file(tmp_path, small_rig(LINE))
+    path = rig_file(tmp_path, small_rig(VIBRATION))
     close(path, tmp_path, "lqg", "o1")
     recording = Recording(tmp_path / "a.mcap")
     assert first_difference(recording.estimates("o1"), reestimate(recording, ["o1"])["o1"]) is None
@@ -127,7 +127,7 @@ def test_estimates_of_a_closed_loop_are_the_same_offline(tmp_path: Path) -> None
 @pytest.mark.long
 def test_faults_on_the_wire_leave_the_loop_closed_and_every_step_accounted_for(tmp_path: Path) -> None:
     """Frames are lost, commands and reports come again; and the same seed gives the same bytes."""
-    path = rig_file(tmp_path, small_rig(LINE), FAULTS)
+    path = rig_file(tmp_path, small_rig(VIBRATION), FAULTS)
     first = close(path, tmp_path, "lqg", "o1")
     bytes_of_first = (tmp_path / "a.mcap").read_bytes()
     report = close(path, tmp_path, "lqg", "o1")
@@ -196,7 +196,7 @@ def test_a_light_that_goes_out_opens_the_loop(tmp_path: Path, when_lost: str, st
 def lost_and_found(folder: Path, when_lost: str, away: float, gone: range, estimator: str) -> tuple[Report, list[int]]:
     """A session of 40 exposures whose disturbance is farther away by so many slope units in some of them; and its
     states. All that must hold whatever befalls a loop is asserted: limits, each step accounted for, the open loop."""
-    slopes = line(0.5, 40, 0.1)
+    slopes = vibration(0.5, 40, 0.1)
     slopes[gone.start * 40 : gone.stop * 40] += away
     played(folder, slopes, DRIFT, control=f'when_lost = "{when_lost}"')
     report = close(folder / "played.toml", folder, "lqg", estimator)
@@ -262,8 +262,8 @@ def test_a_model_that_no_longer_fits_is_said(tmp_path: Path) -> None:
 
 
 def test_a_controller_that_does_not_pay_is_left_and_the_recording_says_so(tmp_path: Path) -> None:
-    """The line is not where the model has it; and the same is decided offline."""
-    rig = played(tmp_path, line(10.5, 50), DRIFT, LINE)
+    """The vibration is not where the model has it; and the same is decided offline."""
+    rig = played(tmp_path, vibration(10.5, 50), DRIFT, VIBRATION)
     with simulated_rig(tmp_path / "played.toml") as ports:
         report = record(rig, *ports, tmp_path / "a.mcap", estimators=["o1"], exposures=50, control="lqg")
     acting = [act.acting for act in acts(tmp_path)]
@@ -324,7 +324,7 @@ def test_several_spots_and_a_mirror_of_many_actuators_run_in_a_closed_loop(tmp_p
 
 def test_a_controller_asked_offline_says_what_it_commanded_in_the_session(tmp_path: Path) -> None:
     """And for a simulated rig, what came of it: the same numbers as in the session, from the same seed."""
-    path = rig_file(tmp_path, small_rig(LINE))
+    path = rig_file(tmp_path, small_rig(VIBRATION))
     close(path, tmp_path, "lqg", "o1")
     recording = Recording(tmp_path / "a.mcap")
     for each in would_command(recording, "lqg", "o1"):
@@ -352,7 +352,7 @@ def on_simulated_time(tmp_path: Path, rig: Rig, exposures: int = 40) -> Run:
 
 def test_with_a_queue_the_loop_is_as_good_as_its_delay(tmp_path: Path) -> None:
     """Three blocks of lead, which are longer than a frame, delay nothing: each exposure acts after 10 ms, as asked."""
-    rig = small_rig(LINE)
+    rig = small_rig(VIBRATION)
     run = on_simulated_time(tmp_path, rig)
     assert run.error is None
     report = run.report
@@ -367,7 +367,9 @@ def test_with_a_queue_the_loop_is_as_good_as_its_delay(tmp_path: Path) -> None:
 
 @pytest.mark.long
 def test_commands_that_are_lost_while_others_replace_them_are_accounted_for(tmp_path: Path) -> None:
-    rig = parse_rig(small_rig(LINE).toml + "[simulation.faults]\ncommand_loss_rate = 0.2\npacket_loss_rate = 0.05\n")
+    rig = parse_rig(
+        small_rig(VIBRATION).toml + "[simulation.faults]\ncommand_loss_rate = 0.2\npacket_loss_rate = 0.05\n"
+    )
     run = on_simulated_time(tmp_path, rig)
     assert run.error is None
     report = run.report

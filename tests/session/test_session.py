@@ -43,7 +43,7 @@ def test_everything_is_received_and_recorded(recorded: Session) -> None:
         assert recording.counts[topic] == EXPOSURES
     assert recording.counts[topics.COMMAND] == recording.counts[topics.APPLIED] == 4 * EXPOSURES
     assert recording.counts[topics.CLOCK] >= 16
-    assert recording.counts[topics.LINK] >= 2
+    assert recording.counts[topics.CONNECTION] >= 2
 
 
 def test_the_wire_gives_what_the_model_gives_in_memory(recorded: Session) -> None:

@@ -45,10 +45,10 @@ def series(rig: Rig, controller: str | ControllerRow, exposures: int = 30) -> li
     return [each.exposure for each in closed_loop(rig, controller, "", exposures, seed=3)]
 
 
-def test_a_line_has_the_sd_and_the_frequency_that_it_is_asked_for() -> None:
-    from bench_rows.disturbances import line
+def test_a_vibration_has_the_sd_and_the_frequency_that_it_is_asked_for() -> None:
+    from bench_rows.disturbances import vibration
 
-    slopes = np.array([line(48.0, 0.1, 4000, seed).slopes for seed in range(40)])
+    slopes = np.array([vibration(48.0, 0.1, 4000, seed).slopes for seed in range(40)])
     # Its energy is exponentially distributed from seed to seed, as it remembers it for longer than the run.
     assert np.sqrt(np.mean(slopes**2)) == pytest.approx(0.1, rel=4 * 0.5 / math.sqrt(40))
     spectrum = (np.abs(np.fft.rfft(slopes, axis=1)) ** 2).sum(axis=0)
@@ -60,10 +60,10 @@ def test_turbulence_is_foretold_by_what_is_known_of_it(kind: str) -> None:
     """The state holds the slopes, and its model foretells those that it was not fitted to better than the last one."""
     if kind == "hcipy":
         needed("hcipy")
-    from bench_rows.disturbances import line, together, turbulence
+    from bench_rows.disturbances import together, turbulence, vibration
 
     steps, past, ahead = 3000, 2000, 8
-    known = together([turbulence(kind, 0.1, steps, past, 5), line(24.0, 0.1, steps, 5)])
+    known = together([turbulence(kind, 0.1, steps, past, 5), vibration(24.0, 0.1, steps, 5)])
     np.testing.assert_allclose(known.states @ known.C[0], known.slopes, atol=1e-12)
     foretold = (known.states @ (known.C @ np.linalg.matrix_power(known.A, ahead))[0])[past:-ahead]
     truth = known.slopes[past + ahead :]
@@ -91,12 +91,12 @@ def test_the_likeliest_model_of_a_process_of_second_order_has_its_spectrum() -> 
 
 def test_a_predictor_is_shown_the_disturbance_as_if_the_mirror_had_been_at_rest(tmp_path: Path) -> None:
     """What pyRTC's `persistence` was told last is the mean of the true slopes, while the mirror moves all the time."""
-    from bench_rows.disturbances import line
+    from bench_rows.disturbances import vibration
     from bench_rows.loop_worth import Cell
     from bench_rows.rivals import Predicted
     from pyrtc.predictive import PersistencePredictor
 
-    cell, known = Cell("", 0.24), line(4.8, 0.1, 31 * N, 7)
+    cell, known = Cell("", 0.24), vibration(4.8, 0.1, 31 * N, 7)
     rig, made = played(cell, known, tmp_path), []
 
     def build(of: Rig) -> Predicted:
@@ -109,12 +109,12 @@ def test_a_predictor_is_shown_the_disturbance_as_if_the_mirror_had_been_at_rest(
     assert made[0].predictor.predict()[0] == pytest.approx(last, abs=1e-4)
 
 
-def test_pyrtcs_predictors_cancel_a_slow_line_better_than_the_integrator(tmp_path: Path) -> None:
-    from bench_rows.disturbances import line
+def test_pyrtcs_predictors_cancel_a_slow_vibration_better_than_the_integrator(tmp_path: Path) -> None:
+    from bench_rows.disturbances import vibration
     from bench_rows.loop_worth import Cell
     from bench_rows.rivals import PREDICTORS, predicted
 
-    cell, known = Cell("", 0.24), line(4.8, 0.1, 331 * N, 7)
+    cell, known = Cell("", 0.24), vibration(4.8, 0.1, 331 * N, 7)
     past = known.slopes[: 300 * N].reshape(-1, N).mean(axis=1)[:, None]
     rig = played(cell, replace(known, slopes=known.slopes[300 * N :]), tmp_path)
     integrator = residual_rms(series(rig, "integrator")[5:])
@@ -122,13 +122,13 @@ def test_pyrtcs_predictors_cancel_a_slow_line_better_than_the_integrator(tmp_pat
         assert residual_rms(series(rig, predicted(name, past))[5:]) < 0.7 * integrator
 
 
-def test_with_the_true_state_hardly_anything_is_left_of_a_line_that_does_not_change(tmp_path: Path) -> None:
-    """What is left is what the line's own noise adds after each exposure's end: at most some per cent."""
-    from bench_rows.disturbances import line
+def test_with_the_true_state_hardly_anything_is_left_of_a_vibration_that_does_not_change(tmp_path: Path) -> None:
+    """What is left is what the vibration's own noise adds after each exposure's end: at most some per cent."""
+    from bench_rows.disturbances import vibration
     from bench_rows.loop_worth import Cell
     from bench_rows.rivals import with_true_state
 
-    cell, known = Cell("", 2.4), line(48.0, 0.1, 31 * N, 7)
+    cell, known = Cell("", 2.4), vibration(48.0, 0.1, 31 * N, 7)
     rig = played(cell, known, tmp_path)
     left = residual_rms(series(rig, with_true_state(known))[5:])
     A, C = known.A, known.C

@@ -207,10 +207,10 @@ class StandIn(Series):
         for s in range(self.n // 5 + 1):
             at = HOST_ZERO_NS + s * 10**9
             for i, device in enumerate(("camera", "mirror")):
-                link = schemas.LinkStatistics(
+                counts = schemas.ConnectionStatistics(
                     device=device, bytes_received=s * 90_000 * (i + 1), bad_crc=s // 4, round_trip_s=0.0002 + 1e-5 * i
                 )
-                yield Recorded("/link", at, 0, link)
+                yield Recorded("/connection", at, 0, counts)
                 clock = schemas.ClockSample(
                     device=device,
                     host_receive_ns=at,

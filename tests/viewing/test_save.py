@@ -276,13 +276,13 @@ def test_latency_counts_from_the_end_of_the_exposure(entities: Entities) -> None
 
 
 def test_losses_add_up(entities: Entities) -> None:
-    assert scalars(entities["/link/lost/frames"])[:, 0].tolist() == [0] * 3 + [1] * 8
-    assert scalars(entities["/link/lost/chunks"])[:, 0].tolist() == [0] * 4 + [1] * 7
+    assert scalars(entities["/connection/lost/frames"])[:, 0].tolist() == [0] * 3 + [1] * 8
+    assert scalars(entities["/connection/lost/chunks"])[:, 0].tolist() == [0] * 4 + [1] * 7
 
 
 def test_what_links_and_clocks_do_is_shown_in_its_units(entities: Entities) -> None:
-    np.testing.assert_allclose(scalars(entities["/link/received/mirror"])[:, 0], 180)
-    np.testing.assert_allclose(scalars(entities["/link/round_trip/camera"])[:, 0], 0.2)
+    np.testing.assert_allclose(scalars(entities["/connection/received/mirror"])[:, 0], 180)
+    np.testing.assert_allclose(scalars(entities["/connection/round_trip/camera"])[:, 0], 0.2)
     np.testing.assert_allclose(scalars(entities["/clock/offset/camera"])[:, 0], [0, 20, 40])
     np.testing.assert_allclose(scalars(entities["/clock/sigma/mirror"])[:, 0], [90, 45, 30])
     assert entities["/clock/sigma/mirror"]["time"][1] == 10**9

@@ -123,7 +123,7 @@ def test_the_profile_is_that_of_the_first_spot_along_x(recording: Simulated, sav
 
 
 def test_no_view_is_empty(saved: Path) -> None:
-    missing = [each for each in absent_from_views(saved) if not each.startswith(("/link", "/mirror"))]
+    missing = [each for each in absent_from_views(saved) if not each.startswith(("/connection", "/mirror"))]
     assert missing == []
 
 

@@ -53,7 +53,7 @@ def together(parts: Sequence[DisturbanceRun]) -> DisturbanceRun:
     )  # fmt: skip
 
 
-def line(frequency_hz: float, sd: float, steps: int, seed: int) -> DisturbanceRun:
+def vibration(frequency_hz: float, sd: float, steps: int, seed: int) -> DisturbanceRun:
     """A vibration: a resonance that noise drives. Its model is the true one."""
     model = ProcessSum((Process("resonance", (frequency_hz, DAMPING, sd)),))
     space, random = model.state_space(STEP_S), np.random.default_rng([seed, 1])

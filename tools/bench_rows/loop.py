@@ -36,7 +36,7 @@ def residual(rig: Rig, controller: str, estimator: str, exposures: int, seed: in
 
 
 def residual_slopes(effort: Effort) -> list[Row]:
-    """Drift and a line of equal sd, as the rig file's model has them: 5 seeds of 120 exposures, four gains tried.
+    """Drift and a vibration of equal sd, as the rig file's model has them: 5 seeds of 120 exposures, four gains tried.
 
     The integrator's gain is the best for all seeds together, with hindsight. In brackets: the mean over the seeds of
     ours over the integrator's, and its one-sided 95 % bound, which is to be below one.
@@ -58,7 +58,7 @@ def residual_slopes(effort: Effort) -> list[Row]:
             bound = shares.mean() + _T_95[len(seeds)] * shares.std(ddof=1) / math.sqrt(len(seeds))
             rate = rig.timing.frame_period_steps * rig.timing.fast_step_s * frequency
             rows.append(Row(
-                f"loop, drift + line at {rate:.1f} of the frame rate: lqg + {estimator}",
+                f"loop, drift + vibration at {rate:.1f} of the frame rate: lqg + {estimator}",
                 f"{np.mean(ours):.4f} ({shares.mean():.3f}, below {bound:.3f})",
                 f"integrator {np.mean(tried[best]):.4f} (gain {gains[best]:g}); open {np.mean(still):.4f}",
                 float(1 / bound), 1.0,
@@ -80,10 +80,10 @@ def fall_back(effort: Effort) -> list[Row]:
     seeds, exposures = range(501, 501 + effort.of(24, 2)), effort.of(240, 6)
     wrong = _by_model(0.7 * 12.0), _by_model(1.3 * 12.0)
     cases: list[tuple[str, float, Series | None]] = [
-        ("as the model has it, line at 0.6", 12.0, None),
-        ("as the model has it, line at 2.4", 48.0, None),
-        ("line 30 % below the model's", 12.0, wrong[0]),
-        ("line 30 % above the model's", 12.0, wrong[1]),
+        ("as the model has it, vibration at 0.6", 12.0, None),
+        ("as the model has it, vibration at 2.4", 48.0, None),
+        ("vibration 30 % below the model's", 12.0, wrong[0]),
+        ("vibration 30 % above the model's", 12.0, wrong[1]),
         ("turbulence alone, 5 and 11 m/s", 12.0, _turbulence(5.0)),
         ("turbulence alone, 20 and 44 m/s", 12.0, _turbulence(20.0)),
     ]
@@ -92,7 +92,7 @@ def fall_back(effort: Effort) -> list[Row]:
         found = []
         for seed in seeds:
             with TemporaryDirectory() as folder:
-                rig = _disturbed(_with_line(frequency), series, exposures, seed, Path(folder))
+                rig = _disturbed(_with_vibration(frequency), series, exposures, seed, Path(folder))
                 alone = replace(rig, control=replace(rig.control, fall_back=False))
                 each = ((alone, "", ""), (alone, "integrator", ""), (alone, "lqg", "o1"), (rig, "lqg", "o1"))
                 found.append([residual(*of, exposures, seed) for of in each])
@@ -107,7 +107,7 @@ def fall_back(effort: Effort) -> list[Row]:
     return rows
 
 
-def _with_line(frequency_hz: float) -> Rig:
+def _with_vibration(frequency_hz: float) -> Rig:
     return parse_rig(load_rig("loop").toml.replace("frequency_hz = 12.0", f"frequency_hz = {frequency_hz}"))
 
 
@@ -127,7 +127,7 @@ def _by_model(frequency_hz: float) -> Series:
     """The disturbance of the rig's model with its vibration at another frequency."""
 
     def series(steps: int, rng: np.random.Generator) -> NDArray[np.float64]:
-        disturbance = _with_line(frequency_hz).disturbance
+        disturbance = _with_vibration(frequency_hz).disturbance
         assert disturbance is not None
         assert disturbance.model is not None
         model = disturbance.model

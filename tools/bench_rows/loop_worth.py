@@ -1,4 +1,4 @@
-"""Rows about the benefit of closing the loop under turbulence and a vibration ("line"), beside pyRTC's predictors and
+"""Rows about the benefit of closing the loop under turbulence and a vibration, beside pyRTC's predictors and
 the limit."""
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from aolink.identification import (
 from aolink.jobs.closed_loop import closed_loop
 from aolink.numerics.arrays import FloatArray
 from aolink.rig import Rig, load_rig, parse_rig
-from bench_rows.disturbances import STEP_S, DisturbanceRun, likeliest, line, together, turbulence
+from bench_rows.disturbances import STEP_S, DisturbanceRun, likeliest, together, turbulence, vibration
 from bench_rows.rivals import PREDICTORS, predicted, with_true_state
 from bench_rows.row import Effort, Row
 
@@ -50,7 +50,7 @@ class Cell:
 
     turbulence: str
     """``own``, ``hcipy``, or empty for none."""
-    line: float
+    vibration: float
     """Frequency of the vibration over the frame rate; 0 for none. Where there are both, their sd is equal."""
     widths: float = 1.5
     """Sd of the path over that of the kernel."""
@@ -65,7 +65,7 @@ class Cell:
 
     def __str__(self) -> str:
         kind = {"own": "turbulence", "hcipy": "HCIPy's turbulence", "": ""}[self.turbulence]
-        at = f"line at {self.line:g}" if self.line else ""
+        at = f"vibration at {self.vibration:g}" if self.vibration else ""
         text = " + ".join(filter(None, (kind, at)))
         others = [
             f"{self.widths:g} widths" if self.widths != 1.5 else "", f"N = {self.steps}" if self.steps != 50 else "",
@@ -76,7 +76,7 @@ class Cell:
     @property
     def kinds(self) -> list[str]:
         """Kinds of the processes that are identified, as `aolink identify --model` names them."""
-        return [kind for kind, there in (("second-order", self.turbulence), ("resonance", self.line)) if there]
+        return [kind for kind, there in (("second-order", self.turbulence), ("resonance", self.vibration)) if there]
 
     @property
     def sd(self) -> float:
@@ -85,11 +85,11 @@ class Cell:
 
     def disturbance(self, steps: int, past: int, seed: int) -> DisturbanceRun:
         """Slopes of that many fast steps, the first ``past`` of them known."""
-        parts, sd = [], self.sd / math.sqrt(bool(self.turbulence) + bool(self.line))
+        parts, sd = [], self.sd / math.sqrt(bool(self.turbulence) + bool(self.vibration))
         if self.turbulence:
             parts.append(turbulence(self.turbulence, sd, steps, past, seed))
-        if self.line:
-            parts.append(line(self.line / (self.steps * STEP_S), sd, steps, seed))
+        if self.vibration:
+            parts.append(vibration(self.vibration / (self.steps * STEP_S), sd, steps, seed))
         return together(parts)
 
     def rig(self, model: ProcessSum) -> Rig:
@@ -102,10 +102,10 @@ class Cell:
 
 HEADLINE = tuple(Cell("own", at, identified=("o1", "profile")) for at in (2.4, 2.7))
 # At 3.0 whole periods fit into an exposure: the centroid is zero.
-TURBULENCE_AND_LINE = (
+TURBULENCE_AND_VIBRATION = (
     *(Cell("own", at) for at in (0.24, 0.6, 1.2, 1.5, 3.0, 3.3)), *(Cell("hcipy", at) for at in (2.4, 2.7)),
 )  # fmt: skip
-LINE = (*(Cell("", at) for at in (0.24, 1.2, 1.5, 2.4, 2.7, 3.0, 3.3)), Cell("", 0.6, identified=("o1",)))
+VIBRATION = (*(Cell("", at) for at in (0.24, 1.2, 1.5, 2.4, 2.7, 3.0, 3.3)), Cell("", 0.6, identified=("o1",)))
 TURBULENCE = (Cell("hcipy", 0.0), Cell("own", 0.0, identified=("o1",)))
 FACTORS = tuple(
     cell
@@ -157,7 +157,7 @@ class Measured:
 
     cell: Cell
     rms: Mapping[str, FloatArray]
-    lines: tuple[float, ...]
+    vibrations: tuple[float, ...]
     """Identified frequency of the vibration over the frame rate, by seed; empty where it was not searched for."""
 
     @cached_property
@@ -173,7 +173,7 @@ class Measured:
     @property
     def goals(self) -> list[Goal]:
         """The goals of the cell, named before anything was measured."""
-        cell, at, found = self.cell, self.cell.line, []
+        cell, at, found = self.cell, self.cell.vibration, []
         as_named = (cell.widths, cell.steps, cell.noise) == (1.5, 50, 0.02)
         if not at:
             found += [Goal(name, "", 1.02) for name in self.ours]
@@ -214,11 +214,11 @@ class Ratio:
 def measured(cell: Cell, size: Size) -> Measured:
     """Close the loop of a cell by each controller, on the same disturbances."""
     each, models = zip(*(_of_seed(cell, seed, size) for seed in size.seeds), strict=True)
-    lines = [
+    vibrations = [
         process["frequency_hz"] * cell.steps * STEP_S
         for model in models if model for process in model.processes if process.kind == "resonance"
     ]  # fmt: skip
-    return Measured(cell, {name: np.array([found[name] for found in each]) for name in each[0]}, tuple(lines))
+    return Measured(cell, {name: np.array([found[name] for found in each]) for name in each[0]}, tuple(vibrations))
 
 
 def all_measured(cells: Sequence[Cell], short: bool, size: Size = FULL) -> Iterator[Measured]:
@@ -296,8 +296,8 @@ def _from_path(cell: Cell, whole: DisturbanceRun, past: int) -> ProcessSum:
 
 
 def worth_headline(effort: Effort) -> list[Row]:
-    """Turbulence and a line of equal sd at 2.4 and 2.7 times the frame rate, which centroids cannot reach; in a whole
-    run on fresh seeds as well."""
+    """Turbulence and a vibration of equal sd at 2.4 and 2.7 times the frame rate, which centroids cannot reach; in a
+    whole run on fresh seeds as well."""
     fresh = [] if effort.share < 1 else _rows(HEADLINE, effort, FRESH, "fresh seeds")
     return [*_rows(HEADLINE, effort), *fresh]
 
@@ -307,14 +307,14 @@ def worth_long_past(effort: Effort) -> list[Row]:
     return _rows(HEADLINE, effort, LONG_PAST, "600 exposures before")
 
 
-def worth_lines(effort: Effort) -> list[Row]:
+def worth_vibrations(effort: Effort) -> list[Row]:
     """The same with the vibration at other frequencies, and with HCIPy's turbulence."""
-    return _rows(TURBULENCE_AND_LINE, effort)
+    return _rows(TURBULENCE_AND_VIBRATION, effort)
 
 
 def worth_resonance(effort: Effort) -> list[Row]:
     """A resonance alone."""
-    return _rows(LINE, effort)
+    return _rows(VIBRATION, effort)
 
 
 def worth_air(effort: Effort) -> list[Row]:
@@ -339,7 +339,7 @@ def _rows(cells: Sequence[Cell], effort: Effort, size: Size = FULL, note: str = 
 def _row(figure: str, each: Measured) -> Row:
     limits = ("true state", *([FROM_PATH] if each.cell.identified else []))
     theirs = [f"{name} {each.ratio(name)}" for name in (*PREDICTORS, *limits)]
-    found = f"; line identified at {', '.join(f'{at:.2f}' for at in each.lines)}" if each.lines else ""
+    found = f"; vibration identified at {', '.join(f'{at:.2f}' for at in each.vibrations)}" if each.vibrations else ""
     return Row(
         figure, ", ".join(f"{name} {each.ratio(name)}" for name in each.ours) + found,
         f"{', '.join(theirs)}; {each.best} {each.rms[each.best].mean():.4f}, open {each.rms['open'].mean():.4f}",

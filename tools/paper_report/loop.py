@@ -8,16 +8,16 @@ from bench_rows.loop_worth import (
     FACTORS,
     FROM_PATH,
     HEADLINE,
-    LINE,
     TURBULENCE,
-    TURBULENCE_AND_LINE,
+    TURBULENCE_AND_VIBRATION,
+    VIBRATION,
     Measured,
     all_measured,
 )
 
 from paper_report.blocks import Block, Heading, Table, Text
 
-_GROUPS = (HEADLINE, TURBULENCE_AND_LINE, TURBULENCE, LINE, FACTORS)
+_GROUPS = (HEADLINE, TURBULENCE_AND_VIBRATION, TURBULENCE, VIBRATION, FACTORS)
 _COLUMNS = (
     "ar_kalman",
     "least_squares",
@@ -53,16 +53,17 @@ def loop_section(cells: Sequence[Measured]) -> list[Block]:
         Heading("What closing the loop is worth"),
         Text(
             "Not the paper's: the rig loop with its mirror, disturbed by tilt of two von Karman layers (5 and 11 m/s"
-            " over 0.5 m), by a line of damping 0.002 at so many times the frame rate, or by both with equal sd; if not"
-            " said otherwise the path's sd is 1.5 times the kernel's, an exposure has 50 fast steps of 1 ms, and the"
-            " noise of a centroid is 2 % of the path's sd. Residual slopes at the fast rate, rms, over those of the"
+            " over 0.5 m), by a vibration of damping 0.002 at so many times the frame rate, or by both with equal sd;"
+            " if not said otherwise the path's sd is 1.5 times the kernel's, an exposure has 50 fast steps of 1 ms, and"
+            " the noise of a centroid is 2 % of the path's sd. Residual slopes at the fast rate, rms, over those of the"
             f" integrator whose gain is the best for these seeds: mean over {seeds} seeds, in brackets the one-sided"
-            " 95 % bound. o1, moments and profile serve lqg with the true model of the line, and of turbulence with one"
-            " that is fitted to its true slopes before; identified means with a model from the blurred frames before"
-            f" alone; {FROM_PATH} has a model of the same kinds that is fitted to the true slopes of these frames,"
-            " and so bounds identification. ar_kalman and least_squares are pyRTC's predictors, fitted to the centroids"
-            " of the same frames. true state is lqg given the disturbance itself up to the end of each exposure, by an"
-            " autoregressive model of order 64 of turbulence: what bounds all of them, as far as that model goes."
+            " 95 % bound. o1, moments and profile serve lqg with the true model of the vibration, and of turbulence"
+            " with one that is fitted to its true slopes before; identified means with a model from the blurred frames"
+            f" before alone; {FROM_PATH} has a model of the same kinds that is fitted to the true slopes of these"
+            " frames, and so bounds identification. ar_kalman and least_squares are pyRTC's predictors, fitted to the"
+            " centroids of the same frames. true state is lqg given the disturbance itself up to the end of each"
+            " exposure, by an autoregressive model of order 64 of turbulence: what bounds all of them, as far"
+            " as that model goes."
         ),
         Table(["disturbance", *_COLUMNS, "gain"], rows),
         Text("The goals, each to be kept by the bound:"),

@@ -181,7 +181,7 @@ class AravisCamera:
                 raise DeviceError(f"the camera {self._address} does not answer when it is asked to stop") from None
 
     def statistics(self) -> dict[str, int]:
-        """Counts of its packets by the fields of ``LinkStatistics``, empty for a camera that is not on a network.
+        """Counts of its packets by the fields of ``ConnectionStatistics``, empty for a camera that is not on a network.
 
         ``sequence_gaps`` are the packets of pictures that are missing in the frames that came.
         """

@@ -102,8 +102,8 @@ class PictureStream:
                 yield picture
 
     def counts(self) -> dict[str, int]:
-        """Counts of a network's packets, by the fields of ``LinkStatistics``."""
-        names = {"packets_received": "n_received_packets", "bytes_received": "n_transferred_bytes",
+        """Counts of a network's packets, by the fields of ``ConnectionStatistics``."""
+        names = {"messages_received": "n_received_packets", "bytes_received": "n_transferred_bytes",
                  "duplicates": "n_duplicated_packets", "retransmits": "n_resent_packets"}  # fmt: skip
         counts = {
             field: int(self._aravis("arv_stream_get_info_uint64_by_name", self._stream, name.encode()))

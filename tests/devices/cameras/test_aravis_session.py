@@ -13,7 +13,7 @@ from aolink.devices.cameras.pixel_formats import PIXEL_FORMATS
 from aolink.devices.interfaces import Lacks
 from aolink.recording import topics
 from aolink.recording.reader import Recording
-from aolink.recording.schemas_pb2 import ExposureInfo, LinkStatistics
+from aolink.recording.schemas_pb2 import ConnectionStatistics, ExposureInfo
 from aolink.session import record
 from aolink.session.replay import replay
 from tests.devices.cameras.gige import PICTURES, codes, lenslet, need_aravis, packed
@@ -50,10 +50,10 @@ def test_a_session_is_recorded_estimated_and_replayed(
     recording = Recording(tmp_path / "a.mcap")
     assert recording.metadata["camera"].startswith("Aravis Fake, serial number GV01")
     assert recording.metadata["camera_lacks"] == lacks
-    link = messages_of(LinkStatistics, recording, topics.LINK)[-1]
+    counted = messages_of(ConnectionStatistics, recording, topics.CONNECTION)[-1]
     chunks_lost = sum(each.chunks_lost for each in messages_of(ExposureInfo, recording, topics.EXPOSURE))
-    assert (link.device, report.connection_faults["sequence_gaps"]) == ("camera", link.sequence_gaps)
-    assert link.sequence_gaps >= chunks_lost
+    assert (counted.device, report.connection_faults["sequence_gaps"]) == ("camera", counted.sequence_gaps)
+    assert counted.sequence_gaps >= chunks_lost
 
     exposures, estimates = list(recording.exposures()), list(estimate(recording, "o3"))
     errors = []
