@@ -131,6 +131,7 @@ def estimate(
         raise typer.BadParameter("--jobs is for this machine: with --scheduler its workers do the work")
     if only and output is None:
         raise typer.BadParameter("--only is for the copy that -o writes: give -o too")
+    _check_names(estimator or [])
     models = batch_models(rig, settings)
     if not side and len(files) == 1 and len(models) == 1 and not is_folder:
         if parquet or jobs > 1:
@@ -174,6 +175,16 @@ def batch_models(rig: str | None, settings: Sequence[str] | None) -> "list[Model
     from aolink.rig import load_rig
 
     return batch.models(load_rig(rig).toml if rig else None, settings or [], Path(rig).stem if rig else "")
+
+
+def _check_names(estimators: Sequence[str]) -> None:
+    """Raise EstimatorError before anything is opened, so that a misspelt name does not fail once for each recording."""
+    from aolink.estimation.options import with_options
+    from aolink.estimation.registry import estimator_row
+
+    for each in estimators:
+        with_options(each)
+        estimator_row(each)
 
 
 def _estimate_many(

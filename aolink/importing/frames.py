@@ -225,7 +225,10 @@ def film_periods(film: Film) -> tuple[NDArray[np.int64], float | None]:
     period = float(np.median(gaps))
     if period <= 0 or (gaps <= 0).any():
         late = int(np.argmax(gaps <= 0)) + 1
-        raise ImportingError(f"{film.name}: frame {late} is not later than the one before: its times are damaged")
+        raise ImportingError(
+            f"{film.name}: frame {late} is not later than the one before: frames are not in the order of their times,"
+            " or the times are damaged"
+        )
     counts = np.rint(gaps / period).astype(np.int64)
     off = np.abs(gaps / period - counts)
     if (counts < 1).any() or (off > _IRREGULAR).any():

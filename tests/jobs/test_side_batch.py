@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from aolink.errors import AolinkError, RigError
+from aolink.errors import AolinkError, EstimatorError, RigError
 from aolink.files import writing
 from aolink.jobs import batch
 from aolink.recording.reader import Recording
@@ -149,11 +149,12 @@ def test_a_table_takes_the_place_of_a_table_only(aolink: Run, tmp_path: Path, na
         (["--side", "-o", "out", "--table", "t.csv"], "give a name that ends with .parquet"),
         (["--side", "-o", "out", "--shard", "3/2"], "I/N is needed"),
         (["--side", "-o", "out", "--scheduler", "tcp://127.0.0.1:1", "--jobs", "2"], "--jobs is for this machine"),
+        (["--side", "-o", "out", "-e", "o1", "-e", "o9"], "there is no estimator 'o9'"),
     ],
 )
 def test_options_that_do_not_go_together(aolink: Run, tmp_path: Path, arguments: list[str], message: str) -> None:
     write_small(tmp_path / "a.mcap", 1)
     result = aolink("estimate", "a.mcap", *arguments)
-    assert result.returncode in (1, 2)
+    assert result.returncode in (1, 2, EstimatorError.exit_code)
     assert message in " ".join(result.stderr.replace("│", " ").split())
     assert not (tmp_path / "out").exists()
