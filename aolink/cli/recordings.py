@@ -196,9 +196,11 @@ def _estimate_many(
     from aolink.jobs.tables import check_table, fill_table, join_tables, table_beside
 
     of_exposures = table.with_suffix(".exposures.parquet") if side and table.suffix == ".parquet" else None
-    for each in (table, of_exposures):
-        if each is not None and not overwrite:
-            check_table(each)
+    places = [table]
+    if of_exposures is not None:
+        places += [of_exposures, *(table_beside(job.output) for job in todo)]
+    for each in () if overwrite else places:
+        check_table(each)
 
     try:
         folder.mkdir(parents=True, exist_ok=True)

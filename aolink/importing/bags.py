@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -53,20 +53,30 @@ def mcap_film(path: Path, topic: str | None) -> Film:
                 " of it (`aolink recover`, where it is a recording of aolink)"
             )
         summary = make_reader(file, validate_crcs=True).get_summary()
-        pairs: Iterable[tuple[Schema | None, Channel]]
-        indexed = summary is not None and bool(summary.channels)
+        kinds = set[tuple[str, str]]()
+        disordered = set[str]()
+        indexed = summary is not None and bool(summary.channels and summary.chunk_indexes)
         if indexed and summary is not None:
-            pairs = [(summary.schemas.get(each.schema_id), each) for each in summary.channels.values()]
-            indexed = all(schema or not each.schema_id for schema, each in pairs)
+            kinds = {
+                (each.topic, _kind(summary.schemas.get(each.schema_id), each)) for each in summary.channels.values()
+            }
+            indexed = all(each.schema_id in summary.schemas or not each.schema_id for each in summary.channels.values())
         if not indexed:  # the summary is optional, and so are the channels and the schemas in it
-            pairs = ((schema, each) for schema, each, _ in _linear(file).iter_messages(log_time_order=False))
-        found = {(each.topic, kind) for schema, each in pairs if (kind := _kind(schema, each))}
+            latest: dict[str, int] = {}
+            for schema, channel, message in _linear(file).iter_messages(log_time_order=False):
+                kinds.add((channel.topic, _kind(schema, channel)))
+                if message.log_time < latest.get(channel.topic, 0):
+                    disordered.add(channel.topic)
+                latest[channel.topic] = message.log_time
+        found = [(name, kind) for name, kind in kinds if kind]
     chosen = _chosen(dict(sorted(found, key=lambda one: one[1] in _DECODERS)), topic, path)  # a picture's kind wins
 
     def messages() -> Iterator[_Stamped]:
         with path.open("rb") as file:
             reader = make_reader(file, validate_crcs=True) if indexed else _linear(file)
-            for schema, channel, message in reader.iter_messages(topics=[chosen]):
+            # Without an index all messages are held in memory where they are sorted.
+            sort = indexed or chosen in disordered
+            for schema, channel, message in reader.iter_messages(topics=[chosen], log_time_order=sort):
                 if read := _DECODERS.get(_kind(schema, channel)):
                     yield read(message.data, message.publish_time or message.log_time)
 

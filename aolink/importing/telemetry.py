@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from pathlib import Path
 from typing import Any
@@ -101,7 +102,10 @@ def _by_numbers(time: Any, count: int, known: dict[str, Any]) -> list[str]:
         return [f"not used: {stamps} times and {len(numbers)} frame numbers for {count} frames"]
     if (np.diff(numbers) == 1).all():
         return []
-    if not known.get("rate_hz") or not np.isfinite(numbers).all():
+    steps = np.diff(numbers)
+    if not (steps >= 1).all() or np.median(steps) != 1:
+        return ["the frame numbers do not count up by one: not used"]
+    if not known.get("rate_hz"):
         return ["by their numbers frames are missing, which without a frame rate or times in the file is not used"]
     known["times_ns"] = np.round((numbers - numbers[0]) * 1e9 / known["rate_hz"]).astype(np.int64)
     return ["frames are missing by their numbers"]
@@ -138,7 +142,15 @@ def _commands(loops: list[Any], known: dict[str, Any], count: int, start_s: floa
     first = of_loop[0]
     if len({None if each is None else each.tobytes() for each in of_loop}) > 1:
         return [f"the loops {names} command at unlike times: their commands are left out, the mirror counts as parked"]
-    rate, delay = loops[0].framerate, loops[0].delay
+    if len({each.delay for each in loops}) > 1:
+        return [f"the loops {names} have unlike delays: their commands are left out, the mirror counts as parked"]
+    rate, delay = loops[0].framerate, loops[0].delay or 0.0
+    if not 0 <= delay < math.inf:
+        return [f"the delay of {names} is {delay:g}: their commands are left out, the mirror counts as parked"]
+    frame_rate = known.get("rate_hz") or rate
+    # From the middle of an exposure to the middle of its command, which is held for a frame as well.
+    after_ns = delay * 1e9 / frame_rate if frame_rate else 0.0
+    delayed = f", {delay:g} {'frame' if delay == 1 else 'frames'} later, as the loop's delay says" if after_ns else ""
     if first is not None and start_s is not None:
         if (late := np.flatnonzero(np.diff(first) <= 0)).size:
             raise ImportingError(
@@ -147,14 +159,15 @@ def _commands(loops: list[Any], known: dict[str, Any], count: int, start_s: floa
         known["input_times_ns"] = np.round((first - start_s) * 1e9).astype(np.int64)
         how = "by its own time"
     elif n != count and rate:
-        known["input_times_ns"] = np.round(np.arange(n) * 1e9 / rate).astype(np.int64)
-        how = f"at the loop's {rate:g} commands/s, from the first exposure on"
-    elif n == count and delay and (frame_rate := known.get("rate_hz") or rate):
-        # From the middle of an exposure to the middle of its command, which is held for a frame as well.
-        known["input_times_ns"] = np.round((np.arange(n) + delay) * 1e9 / frame_rate).astype(np.int64)
-        how = f"from {delay:g} frames after its picture on, as the loop's delay says"
+        known["input_times_ns"] = np.round(np.arange(n) * 1e9 / rate + after_ns).astype(np.int64)
+        how = f"at the loop's {rate:g} commands/s, from the first exposure on{delayed}"
+    elif n == count and delayed:
+        times_ns = known.get("times_ns")
+        of_frames = np.arange(n) * 1e9 / frame_rate if times_ns is None else times_ns - times_ns[0]
+        known["input_times_ns"] = np.round(of_frames + after_ns).astype(np.int64)
+        how = f"from its picture on{delayed}"
     elif n == count:
-        how = "from its picture on"
+        how = "from its picture on" + (", without a frame rate also where the loop has a delay" if delay else "")
     else:
         return [
             f"the {n} commands of {names} for {count} frames have neither times nor a rate: they are left out, the"

@@ -118,7 +118,8 @@ def check_table(path: Path) -> None:
         found = []
     if not {*_KEYS} <= {*found}:
         raise RecordingError(
-            f"{path} exists and is no table of a batch: give another name, or --overwrite to replace it"
+            f"{path} exists and is no table of a batch: give another folder or, with --side, another --table;"
+            " --overwrite replaces it"
         )
 
 

@@ -664,6 +664,41 @@ def test_frames_of_telemetry_that_are_missing_by_their_numbers(tmp_path):
     assert "frames are missing by their numbers" in film.notes
 
 
+def numbered(tmp_path, frame_numbers, delay, count=7):
+    """Telemetry at 50 frames/s with frame numbers instead of times, and ``count`` commands of a loop with a delay."""
+    path = others.write_aot(tmp_path / "a.fits", numbers(np.float32), times_s=[0.0], commands=np.ones((count, 2)))
+    system = aotpy.AOSystem.read_from_file(path)
+    time = system.wavefront_sensors[0].detector.pixel_intensities.time
+    time.timestamps, time.frame_numbers = [], frame_numbers
+    system.loops[0].delay, system.loops[0].framerate = delay, 100.0
+    system.write_to_file(str(tmp_path / "b.fits"))
+    return open_film(tmp_path / "b.fits")
+
+
+def test_a_delayed_command_follows_its_frame_where_frames_are_missing(tmp_path):
+    film = numbered(tmp_path, [4, 5, 6, 8, 9, 10, 11], 1.0)
+    np.testing.assert_array_equal(film.input_times_ns, (np.array([0, 1, 2, 4, 5, 6, 7]) + 1) * 20_000_000)
+    assert any("from its picture on, 1 frame later" in note for note in film.notes)
+
+
+def test_commands_at_their_loops_rate_wait_for_its_delay(tmp_path):
+    film = numbered(tmp_path, range(7), 2.0, 14)
+    np.testing.assert_array_equal(film.input_times_ns, np.arange(14) * 10_000_000 + 40_000_000)
+
+
+def test_a_delay_that_cannot_be_leaves_the_commands_out(tmp_path):
+    film = numbered(tmp_path, range(7), -1.0)
+    assert film.inputs is None
+    assert any("is -1: their commands are left out" in note for note in film.notes)
+
+
+@pytest.mark.parametrize("stated", [[0] * 7, range(0, 70, 10), [253, 254, 255, 0, 1, 2, 3]])
+def test_frame_numbers_that_do_not_count_frames_are_not_used(stated, tmp_path):
+    film = numbered(tmp_path, list(stated), None)
+    assert film.times_ns is None
+    assert "the frame numbers do not count up by one: not used" in film.notes
+
+
 @pytest.mark.parametrize("shape", [(7, 4, 2), (7, 2)])
 def test_slopes_in_another_order_are_refused(shape, tmp_path):
     telemetry = others.write_aot(tmp_path / "a.fits", None, slopes=np.zeros((7, 2, 1), np.float32))

@@ -226,4 +226,4 @@ def test_commands_wait_for_their_loops_delay(tmp_path: Path) -> None:
     inputs = np.concatenate([each.inputs for each in recording.exposures()])
     np.testing.assert_array_equal(inputs[:30], np.tile(rig.mirror.park, (30, 1)))
     np.testing.assert_array_equal(inputs[30:], np.repeat(commands, 20, axis=0)[:110])
-    assert any("from 1.5 frames after its picture on" in note for note in account.notes)
+    assert any("from its picture on, 1.5 frames later" in note for note in account.notes)

@@ -120,6 +120,7 @@ def test_a_part_that_is_started_twice_is_one_clear_line(aolink: Run, tmp_path: P
     [
         ("t.parquet", ["--side", "--table", "t.parquet"]),
         ("t.exposures.parquet", ["--side", "--table", "t.parquet"]),
+        ("out/a.o1.parquet", ["--side", "--table", "t.parquet"]),
         ("out/results.csv", ["--side"]),
         ("out/results.csv", []),
     ],
@@ -130,7 +131,7 @@ def test_a_table_takes_the_place_of_a_table_only(aolink: Run, tmp_path: Path, na
     (tmp_path / name).write_text("name,mass\nmine,3\n")
     command = ("estimate", "a.mcap", "-e", "o1", *arguments, "-o", "out/")
     refused = aolink(*command)
-    assert refused.stderr.startswith(f"aolink: {name} exists and is no table of a batch: give another name, or --over")
+    assert refused.stderr.startswith(f"aolink: {name} exists and is no table of a batch: give another folder or, ")
     assert refused.stderr.count("\n") == 1
     assert (tmp_path / name).read_text() == "name,mass\nmine,3\n"
     assert not [*(tmp_path / "out").glob("*.mcap")]
