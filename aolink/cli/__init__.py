@@ -9,6 +9,7 @@ from rich.markup import escape
 import aolink
 from aolink.cli import (  # noqa: F401  their commands
     calibration,
+    estimate,
     exchange,
     figures,
     films,
