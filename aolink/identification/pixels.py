@@ -46,11 +46,13 @@ _DECAY = 1 / 8
 """Decay time of the vibration of a candidate beside a maximum, in lengths of the recording."""
 _ALIKE = 3.0
 """Such a candidate is not made where the maximum's own damping is within this factor."""
-_LASTING, _LEAST_CYCLES = 3.0, 0.5
+_LASTING, _LEAST_CYCLES = 3.0, 0.25
 """How long the vibrations of a scan's first round last, in exposures, and its lowest frequency, in cycles an exposure:
 below that, centroids show the frequency."""
 _SPACING = 0.15
 """Distance of a scan's frequencies, in cycles in the time that its vibrations last: half of a resonance's width."""
+_PARTS = 4
+"""Frequencies that are told apart in the least distance of a scan."""
 _PEAKS = 4
 """Most frequencies of a round of a scan, each better than its neighbours, about which the next one looks."""
 _NEAR_ENOUGH = 0.1
@@ -81,6 +83,16 @@ class Candidate:
     """The local maximum of the likelihood of readings that it is, or is beside."""
 
 
+@dataclass(frozen=True, eq=False)
+class Scan:
+    """What the pixels say about frequencies at equal distances (`scanned`)."""
+
+    candidates: list[Candidate]
+    """A candidate at each frequency that they prefer."""
+    left: dict[int, list[tuple[float, float]]]
+    """Intervals of frequencies that they do not rule out, Hz, from low to high, by the number of the parameter."""
+
+
 def candidates(space: Space, found: Sequence[Maximum], seen: Sequence[Readings]) -> list[Candidate]:
     """Each maximum, with vibrations that last an eighth of the recording where its own do not.
 
@@ -108,7 +120,7 @@ def candidates(space: Space, found: Sequence[Maximum], seen: Sequence[Readings])
 def scanned(
     space: Space, highest: Maximum, seen: Sequence[Readings], rig_of: RigOf, exposures: Sequence[Exposure],
     tell: Tell = lambda done, of: None,
-) -> list[Candidate]:  # fmt: skip
+) -> Scan:  # fmt: skip
     """Candidates for each vibration of a sum at the frequencies that the pixels prefer, wherever the maxima are.
 
     In the first round vibrations last for three exposures, so that their frequencies may be far apart; at each
@@ -118,28 +130,32 @@ def scanned(
     There is no candidate for a vibration that is alone, which `maxima` finds, and where `profile` cannot work on the
     rig. The parameters are those of `candidates`, and ``highest`` is the maximum from which the others are climbed to.
     """
+    out = Scan([], {})
     if len(space.kinds) < 2 or not exposures:
-        return []
+        return out
     try:
         make_estimator(rig_of(highest.x), _QUICK)
     except EstimatorError:
-        return []
-    out = []
+        return out
     for k in _frequencies(space):
-        out += _scan(space, k, highest.x, seen, rig_of, exposures, tell)
+        found, out.left[k] = _scan(space, k, highest.x, seen, rig_of, exposures, tell)
+        out.candidates.extend(found)
     return out
 
 
 def _scan(
     space: Space, k: int, start: FloatArray, seen: Sequence[Readings], rig_of: RigOf, exposures: Sequence[Exposure],
     tell: Tell,
-) -> list[Candidate]:  # fmt: skip
-    """The candidates of the vibration whose frequency is parameter k."""
+) -> tuple[list[Candidate], list[tuple[float, float]]]:  # fmt: skip
+    """The candidates of the vibration whose frequency is parameter k, and the frequencies that are left."""
     of = [Likelihood(each, SHORT_RUN) for each in seen]
     period_s, exposure_s = (steps * seen[0].step_s for steps in (seen[0].period_steps, seen[0].n_steps))
     longest = max(_LASTING, _DECAY * len(exposures))
     rounds = 1 + math.ceil(math.log2(longest / _LASTING))
     low, high = np.array(space.bounds).T
+    apart = _SPACING / (longest * period_s) / _PARTS
+    every = np.arange(math.exp(low[k]), math.exp(high[k]) + apart, apart)
+    possible = np.ones(len(every), bool)
     peaks: list[Candidate] = []
     for number in range(rounds):
         lasting = min(_LASTING * 2**number, longest) * period_s
@@ -156,15 +172,20 @@ def _scan(
             top = climb(space, np.clip(x, low, high), of, _NEAR_ENOUGH, fixed=(k, k + 1))
             found.append(Candidate(top.x, top))
         left = by_pixels(found, rig_of, exposures, partial(_tell_of_round, tell, number, rounds))
+        for each in found:
+            if each not in left:
+                possible &= np.abs(every - math.exp(each.x[k])) > spacing / 2
         peaks = [
             each for rank, each in enumerate(left)
             if all(abs(math.exp(each.x[k]) - math.exp(better.x[k])) > 1.5 * spacing for better in left[:rank])
         ][:_PEAKS]  # fmt: skip
     tops = [climb(space, each.x, of) for each in peaks]
-    return [
+    best = [
         Candidate(each.x, top if abs(top.x[k] - each.x[k]) < _STAYED else each.maximum)
         for each, top in zip(peaks, tops, strict=True)
     ]
+    first, after = np.flatnonzero(np.diff(np.pad(possible, 1).astype(int))).reshape(-1, 2).T
+    return best, list(zip(every[first] - apart / 2, every[after - 1] + apart / 2, strict=True))
 
 
 def _tell_of_round(tell: Tell, number: int, rounds: int, done: int, of: int) -> None:

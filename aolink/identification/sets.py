@@ -68,6 +68,19 @@ class Identified:
             (each.low <= value or each.open_low) and (value <= each.high or each.open_high) for each in self.pieces
         )
 
+    def within(self, intervals: Sequence[tuple[float, float]]) -> Identified:
+        """The part of the set that lies in these intervals, which may overlap; the whole set where none of it does."""
+        pieces = [
+            Piece(
+                low, high, min(max(each.best, low), high), each.open_low and low == each.low,
+                each.open_high and high == each.high,
+            )
+            for each in self.pieces
+            for low, high in ((max(each.low, low), min(each.high, high)) for low, high in intervals)
+            if low <= high
+        ]  # fmt: skip
+        return replace(self, pieces=_joined(pieces) or self.pieces)
+
     def at(self, value: float) -> Identified:
         """The set with another best value, which the pixels prefer; its nearest piece is extended to hold it."""
         distances = [max(each.low - value, value - each.high) for each in self.pieces]

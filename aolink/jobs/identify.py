@@ -183,6 +183,7 @@ def _of_output(
         tell(f"fit, {output}", 0, len(of.names) + 1)
     everything = tops = maxima(of, seen)
     x = tops[0].x
+    left_hz: dict[int, list[tuple[float, float]]] = {}
     if rig.plant.n_outputs == 1 and rig.plant.axes <= _BY_PIXELS and rig.plant.wandering is None:
 
         def rig_of(x: FloatArray) -> Rig:
@@ -192,12 +193,19 @@ def _of_output(
             if tell:
                 tell(f"pixels, {output}", done, of)
 
-        found = [*candidates(of, everything, seen), *scanned(of, tops[0], seen, rig_of, exposures, on_pixels)]
-        left = by_pixels(found, rig_of, exposures, on_pixels)
+        scan = scanned(of, tops[0], seen, rig_of, exposures, on_pixels)
+        left = by_pixels([*candidates(of, everything, seen), *scan.candidates], rig_of, exposures, on_pixels)
+        for k, intervals in scan.left.items():
+            # What is left of the candidates was compared with the best frequencies of the scan itself.
+            hz, damping = np.exp([each.x[k : k + 2] for each in left]).T
+            left_hz[k] = [*zip(hz * (1 - damping), hz * (1 + damping), strict=True), *intervals]
         tops = list(dict.fromkeys(each.maximum for each in left))
         x = refined(of, left[0].x, rig_of, exposures, on_pixels)
     sets = identified(of, tops, seen, (lambda k: tell(f"fit, {output}", k + 1, len(of.names) + 1)) if tell else None)
-    sets = tuple(each.at(value) for each, value in zip(sets, np.exp(x).tolist(), strict=True))
+    sets = tuple(
+        (each.within(left_hz[k]) if k in left_hz else each).at(value)
+        for k, (each, value) in enumerate(zip(sets, np.exp(x).tolist(), strict=True))
+    )
     plant = of.fitted_plant(x)
     noise, wider = of.others(x)
     notes = _ruled_out(of, everything, tops)

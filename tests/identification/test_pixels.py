@@ -88,7 +88,11 @@ def test_a_scan_finds_a_vibration_far_from_every_maximum():
     exposures = frames(2.4, 64)
     of, seen = space(exposures)
     highest, told = candidate(1.13, 0.0, 1e-4).maximum, []
-    found = scanned(of, highest, seen, shaken, exposures, lambda *done: told.append(done))
+    scan = scanned(of, highest, seen, shaken, exposures, lambda *done: told.append(done))
+    found, left = scan.candidates, np.array(scan.left[2]) * EXPOSURE_S
+    assert any(low < 2.4 < high for low, high in left)
+    examined = left[left[:, 1] > 0.25]
+    assert np.diff(examined).sum() < 0.3  # of 3.75 cycles an exposure
     best = found[0]
     assert math.exp(best.x[2]) * EXPOSURE_S == pytest.approx(2.4, abs=0.02)
     assert 1 / (2 * math.pi * math.exp(best.x[2]) * math.exp(best.x[3]) * EXPOSURE_S) == pytest.approx(64 / 8)
@@ -109,13 +113,16 @@ def test_nothing_is_scanned_where_one_vibration_is_alone_or_there_are_no_pixels(
     def unasked(x):
         raise AssertionError("no rig is wanted")
 
+    def nothing(scan):
+        return not scan.candidates and not scan.left
+
     exposures, highest = frames(2.4, 32), candidate(2.6, 0.0).maximum
     of, seen = space(exposures)
-    assert scanned(of, highest, seen, unasked, []) == []
-    assert scanned(of, highest, seen, refused, exposures) == []
+    assert nothing(scanned(of, highest, seen, unasked, []))
+    assert nothing(scanned(of, highest, seen, refused, exposures))
     variance = load_rig("loop").sensor.kernel.variance
     alone = space_of(("resonance",), seen, variance, with_noise=False, with_kernel=False)
-    assert scanned(alone, Maximum(highest.x[2:], 0.0, 12), seen, unasked, exposures) == []
+    assert nothing(scanned(alone, Maximum(highest.x[2:], 0.0, 12), seen, unasked, exposures))
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,8 @@
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 import aolink
 from aolink.errors import IdentificationError
@@ -111,3 +113,25 @@ def test_a_set_is_extended_to_hold_the_value_that_the_pixels_prefer(value, ends)
     assert found.holds(value)
     moved = [each for each in found.pieces if each not in (low, high)]
     assert [(each.low, each.high, each.best) for each in moved] == [(*ends, value)]
+
+
+interval = st.tuples(st.floats(0.0, 10.0), st.floats(0.0, 10.0)).map(sorted)
+
+
+@given(
+    pieces=st.lists(interval, min_size=1, max_size=4), intervals=st.lists(interval, max_size=4), at=st.floats(0.0, 10.0)
+)
+def test_the_part_of_a_set_within_intervals_is_what_both_hold(pieces, intervals, at):
+    whole = Identified("frequency_hz", 1.0, tuple(Piece(low, high, low, False, False) for low, high in pieces), 1.0)
+    part = whole.within(intervals)
+    both = whole.holds(at) and any(low <= at <= high for low, high in intervals)
+    meet = any(max(a, c) <= min(b, d) for a, b in pieces for c, d in intervals)
+    assert part.holds(at) == (both if meet else whole.holds(at))
+    assert all(piece.low <= piece.best <= piece.high for piece in part.pieces)
+
+
+def test_an_end_that_was_not_an_end_of_the_set_stays_so_only_where_it_is():
+    whole = Identified("frequency_hz", 5.0, (Piece(1.0, 9.0, 5.0, True, True),), 1.0)
+    (low, high) = whole.within([(0.0, 2.0), (4.0, 9.5)]).pieces
+    assert (low.low, low.high, low.open_low, low.open_high) == (1.0, 2.0, True, False)
+    assert (high.low, high.high, high.open_low, high.open_high, high.best) == (4.0, 9.0, False, True, 5.0)

@@ -28,7 +28,7 @@ ROWS = {
     "loop": ("residual_slopes", "fall_back"),
     "loop_soak": ("closed_loop_soak",),
     "loop_worth": (
-        "worth_headline", "worth_long_past", "worth_vibrations", "worth_resonance", "worth_air", "worth_factors",
+        "worth_headline", "worth_past", "worth_vibrations", "worth_resonance", "worth_air", "worth_factors",
     ),
     "identification": ("coverage", "coverage_with_pixels", "following", "spheres"),
 }  # fmt: skip
@@ -37,7 +37,7 @@ ROWS = {
 LONG = frozenset(
     {
         "soak", "closed_loop_soak", "bit_errors", "large_frames", "time_to_park", "restoration_quality", "shaken",
-        "moving_scene", "residual_slopes", "fall_back", "worth_headline", "worth_long_past", "worth_vibrations",
+        "moving_scene", "residual_slopes", "fall_back", "worth_headline", "worth_past", "worth_vibrations",
         "worth_resonance", "worth_air", "worth_factors", "drawn_scenes", "coverage", "coverage_with_pixels",
         "following", "spheres",
     }
