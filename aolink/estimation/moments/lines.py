@@ -48,9 +48,8 @@ class WindowedMoments:
     models_noise = True
 
     def __init__(
-        self, sensor: Sensor, orders: Sequence[int] = (0, 1, 2, 3), *, basis: Basis = "monomial",
-        flux: Flux = "known",
-    ) -> None:  # fmt: skip
+        self, sensor: Sensor, orders: Sequence[int] = (0, 1, 2, 3), *, basis: Basis = "monomial", flux: Flux = "known"
+    ) -> None:
         self.sensor, self.basis, self.flux = sensor, basis, flux
         # A ratio to the light in the window needs the light first.
         self.orders = tuple(orders) if flux == "known" else (0, *(p for p in orders if p))

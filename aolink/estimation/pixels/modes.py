@@ -12,7 +12,7 @@ the kernel is wide a mode is not Gaussian, so mean and covariance are those of p
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy import special
@@ -58,8 +58,7 @@ _NEW_DIRECTIONS = 4
 _NO_INFORMATION = 1e-13
 
 
-@dataclass(frozen=True, eq=False)
-class Modes:
+class Modes(NamedTuple):
     """Modes of the posterior, (axes, starts, ...)."""
 
     mean: FloatArray
@@ -76,11 +75,6 @@ class Modes:
         """Room for a number of modes, none of which is there yet."""
         nothing, never = np.zeros((axes, count)), np.full((axes, count), np.inf)
         return cls(np.zeros((axes, count, n)), np.zeros((axes, count, n, n)), -never, nothing, never)
-
-    @property
-    def arrays(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
-        """The five, in this order."""
-        return self.mean, self.covariance, self.log_evidence, self.distance, self.objective
 
     @property
     def total_evidence(self) -> FloatArray:
@@ -134,7 +128,7 @@ def found_compiled(
     compiled_modes.find_modes_of_lines(
         line, np.ascontiguousarray(prior.mean), np.ascontiguousarray(prior.covariance), np.ascontiguousarray(starts),
         of_axis, whole, reversed_precision, _PASSES, FIRST_DAMPING, LARGEST_DAMPING, FREE_DAMPING, _CONVERGED,
-        *found.arrays,
+        *found,
     )  # fmt: skip
     return found
 
@@ -169,7 +163,7 @@ def _at(rows: PixelView, m: FloatArray, L: FloatArray, s: FloatArray) -> Points:
 
 def without_repeats(modes: Modes) -> Modes:
     """The modes without those that an earlier start has led to; the remaining ones come first."""
-    mean, covariance, *rest = kept = [each.copy() for each in modes.arrays]
+    mean, covariance, *rest = kept = [each.copy() for each in modes]
     most = compiled_modes.drop_repeats(mean, covariance, _APART, *rest)
     return Modes(*(each[:, : max(most, 1)] for each in kept))
 
@@ -250,9 +244,9 @@ def reversed_starts(view: PixelView, prior: Gaussian, points: FloatArray) -> Flo
 def with_more(modes: Modes, axes: slice | Indices, more: Modes) -> Modes:
     """The same modes, and after them those that more starts of some axes led to."""
     spread = Modes.none(len(modes.mean), *more.mean.shape[1:])
-    for room, new in zip(spread.arrays, more.arrays, strict=True):
+    for room, new in zip(spread, more, strict=True):
         room[axes] = new
-    return Modes(*(np.concatenate(each, axis=1) for each in zip(modes.arrays, spread.arrays, strict=True)))
+    return Modes(*(np.concatenate(each, axis=1) for each in zip(modes, spread, strict=True)))
 
 
 def whitened(prior: Gaussian, points: FloatArray) -> FloatArray:

@@ -30,9 +30,7 @@ _LEAST_SPREAD = 1e-3
 _WHOLE = 4
 
 
-def tempered_points(
-    view: PixelView, prior: GaussianMixture, count: int, keys: Sequence[tuple[int, ...]]
-) -> FloatArray:  # fmt: skip
+def tempered_points(view: PixelView, prior: GaussianMixture, count: int, keys: Sequence[tuple[int, ...]]) -> FloatArray:
     """Equally likely points of the posterior, (axes, count, n).
 
     Parameters
