@@ -137,8 +137,9 @@ class Process(Covariance):
             if name.endswith("correlation_s"):
                 found.append(complex(-1 / value))
             elif name.endswith("frequency_hz"):
-                damping = self[name.replace("frequency_hz", "damping")]
-                found += _pair(2 * math.pi * value, damping)
+                omega, damping = 2 * math.pi * value, self[name.replace("frequency_hz", "damping")]
+                root = omega * complex(damping**2 - 1) ** 0.5
+                found += [-omega * damping + root, -omega * damping - root]
         poles = np.array(found)
         for k in range(1, len(poles)):
             while np.abs(poles[k] - poles[:k]).min() < _APART * abs(poles[k]):
@@ -156,15 +157,9 @@ class Process(Covariance):
 
     @cached_property
     def shares(self) -> ComplexArray:
-        """The share of each pole in the stationary covariance, slope units squared: 1 / (a'(lambda) a(-lambda))."""
-        poles = self.poles
+        poles = self.poles  # shares are proportional to 1 / (a'(lambda) a(-lambda))
         shares = np.array([1 / (np.prod(p - np.delete(poles, k)) * np.prod(-p - poles)) for k, p in enumerate(poles)])
         return np.asarray(shares * (self.variance / shares.sum().real))
-
-
-def _pair(omega: float, damping: float) -> list[complex]:
-    root = omega * complex(damping**2 - 1) ** 0.5
-    return [-omega * damping + root, -omega * damping - root]
 
 
 @dataclass(frozen=True)

@@ -178,7 +178,7 @@ def _frequencies(space: Space) -> list[int]:
 
 def by_pixels(
     found: Sequence[Candidate], rig_of: RigOf, exposures: Sequence[Exposure], tell: Tell = lambda done, of: None
-) -> list[Candidate]:  # fmt: skip
+) -> list[Candidate]:
     """The candidates that the pixels do not rule out, the one with the highest evidence first.
 
     Where `profile` cannot work on the rig, or there is one candidate only, they are all returned in their order.
@@ -219,7 +219,7 @@ def by_pixels(
 
 def refined(
     space: Space, x: FloatArray, rig_of: RigOf, exposures: Sequence[Exposure], tell: Tell = lambda done, of: None
-) -> FloatArray:  # fmt: skip
+) -> FloatArray:
     """Parameters in which damping and frequency of each vibration are where the pixels' evidence is highest.
 
     First the damping, then the frequency is moved to the vertex of the parabola through five evidences. Where `profile`
