@@ -306,7 +306,7 @@ def grouped(
 
 def rig_frame(
     film: Film, rig: Rig, settings: FilmSettings, period: int, pixels: NDArray[np.uint16], mask: NDArray[np.bool_]
-) -> Frame:  # fmt: skip
+) -> Frame:
     """The frame of an exposure that begins the given number of the rig's frame periods after the film."""
     timing = rig.timing
     first = period * timing.frame_period_steps

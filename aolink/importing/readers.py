@@ -413,6 +413,4 @@ def _aot(path: Path, topic: str | None) -> Film:
     return telemetry.aot_film(path, topic)
 
 
-_READERS: dict[str, Callable[[Path], Film]] = {
-    ".npy": _npy, ".npz": _npz, ".tif": _tiff, ".tiff": _tiff,
-}  # fmt: skip
+_READERS: dict[str, Callable[[Path], Film]] = {".npy": _npy, ".npz": _npz, ".tif": _tiff, ".tiff": _tiff}
