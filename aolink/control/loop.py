@@ -191,19 +191,13 @@ class ControlLoop:
         self._drop_before(exposure.first_step)
         clipped, self._clipped = self._clipped, 0
         return Act(
-            frame_id=exposure.frame_id,
-            first_step=first,
-            delay_steps=first - end,
-            late=first > end + self.delay_steps,
-            state=self.state,
-            reason=self.reason,
+            frame_id=exposure.frame_id, first_step=first, delay_steps=first - end,
+            late=first > end + self.delay_steps, state=self.state, reason=self.reason,
             slope_rms=rms(slopes[np.isfinite(slopes)]),
             path_rms=math.nan if estimate is None else rms(estimate.path[np.isfinite(estimate.path)]),
-            clipped_steps=clipped,
-            fit=self.fit,
-            acting=self.acting,
+            clipped_steps=clipped, fit=self.fit, acting=self.acting,
             gained=math.nan if change is None else change.gained,
-        )
+        )  # fmt: skip
 
     @property
     def acting(self) -> str:
