@@ -97,11 +97,9 @@ def _ramp(rig: Rig, begin: FloatArray, end: FloatArray) -> FloatArray:
 
 
 def measure_interaction(
-    rig: Rig,
-    exposures: Iterable[Exposure],
-    slopes_of: Callable[[Exposure], FloatArray] | None = None,
+    rig: Rig, exposures: Iterable[Exposure], slopes_of: Callable[[Exposure], FloatArray] | None = None,
     rest_exposures: int = 1,
-) -> Interaction:
+) -> Interaction:  # fmt: skip
     """Fit slopes to inputs by least squares, over the exposures whose input had rested since the beginning of an
     earlier exposure.
 
@@ -144,14 +142,8 @@ def measure_interaction(
     matrix, residual = solution[:-1].T, y - design @ solution
     freedom = (len(u) - design.shape[1]) * y.shape[1]
     noise = float(np.sqrt((residual**2).sum() / freedom)) if freedom else float("nan")
-    return Interaction(
-        matrix=matrix,
-        offset=solution[-1],
-        singular_values=np.linalg.svd(matrix, compute_uv=False),
-        residual_rms=rms(residual),
-        sd=noise * np.sqrt(np.diag(np.linalg.inv(design.T @ design))[:-1]),
-        exposures=len(u),
-    )
+    sd = noise * np.sqrt(np.diag(np.linalg.inv(design.T @ design))[:-1])
+    return Interaction(matrix, solution[-1], np.linalg.svd(matrix, compute_uv=False), rms(residual), sd, len(u))
 
 
 def check_spots(rig: Rig) -> None:

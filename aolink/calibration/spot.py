@@ -65,12 +65,9 @@ class Spot:
 
 
 def fit_spots(
-    sensor: Sensor,
-    signals: Sequence[tuple[str, int, FloatArray]],
-    good: BoolArray,
-    noise: tuple[float, float],
+    sensor: Sensor, signals: Sequence[tuple[str, int, FloatArray]], good: BoolArray, noise: tuple[float, float],
     dark_frames: int,
-) -> Spot:
+) -> Spot:  # fmt: skip
     """Fit one width and one scale to the spots of several recordings, each at its own position.
 
     Parameters
@@ -117,17 +114,11 @@ def fit_spots(
         total = inside[:, good].sum() / sensor.pixel_width
         amplitude, amplitude_sd = means.sum() / total, math.sqrt(variance.sum()) / total
     return Spot(
-        positions=tuple(map(float, positions)),
-        position_sds=tuple(map(float, sds[2:])),
-        sigma=sigma,
-        sigma_sd=float(sigma * sds[1]),
-        counts_per_density=float(amplitude),
-        counts_per_density_sd=float(amplitude_sd),
-        chi_square=chi_square,
-        freedom=freedom,
-        largest_residual=float(np.abs(residuals).max() / means.max()),
+        positions=tuple(map(float, positions)), position_sds=tuple(map(float, sds[2:])), sigma=sigma,
+        sigma_sd=float(sigma * sds[1]), counts_per_density=float(amplitude), counts_per_density_sd=float(amplitude_sd),
+        chi_square=chi_square, freedom=freedom, largest_residual=float(np.abs(residuals).max() / means.max()),
         noise=noise,
-    )
+    )  # fmt: skip
 
 
 def _check_inside(sensor: Sensor, sources: Sequence[str], positions: FloatArray, shares: FloatArray) -> None:
@@ -200,14 +191,9 @@ def _first_guess(
 
 
 def check_at_rest(
-    sensor: Sensor,
-    source: str,
-    counts: NDArray[np.uint16],
-    alone: tuple[FloatArray, float],
-    good: BoolArray,
-    spot: Spot,
-    number: int,
-) -> list[str]:
+    sensor: Sensor, source: str, counts: NDArray[np.uint16], alone: tuple[FloatArray, float], good: BoolArray,
+    spot: Spot, number: int,
+) -> list[str]:  # fmt: skip
     """Check that position and light of a spot stay the same from frame to frame; gives notes.
 
     Parameters
@@ -248,9 +234,9 @@ def check_at_rest(
         excess = math.sqrt((scatter - expected) / max(1 - own, 1e-3))
         if moves:
             raise CalibrationError(
-                f"{source} is said to show a resting spot, but the spot moves by"
-                f" {excess * sensor.pixel_width:.2g} (standard deviation,"
-                " slope units) from frame to frame: park the mirror, keep the bench still, and record it again"
+                f"{source} is said to show a resting spot, but the spot moves by {excess * sensor.pixel_width:.2g}"
+                " (standard deviation, slope units) from frame to frame: park the mirror, keep the bench still, and"
+                " record it again"
             )
         notes.append(
             f"{source}: the light of the spot flickers by {excess:.1%} from frame to frame: without flats,"
