@@ -118,18 +118,15 @@ def arrays(
     _check_size(series, len(names))
     columns: dict[str, list[Any]] = {name: [] for name in (*EXPOSURE, *TRUTH)}
     by_estimator: dict[str, list[list[Any]]] = {name: [[] for _ in names] for name in ESTIMATE}
-    times: list[int] = []
-    leads, scenes, slopes = [], [], []
+    rest: list[tuple[int, Any, Any, Any]] = []
     first: Exposure | None = None
     clock = ""
     for exposure, estimates in together(series, names, progress):
         if first is None:
             first, clock = exposure, clock_of(exposure)
         _check_alike(series, first, exposure)
-        times.append(time_ns(series, exposure, clock))
-        leads.append(exposure.lead_inputs)
-        scenes.append(exposure.scene)
-        slopes.append(exposure.slopes)
+        time = time_ns(series, exposure, clock)
+        rest.append((time, exposure.lead_inputs, exposure.scene, exposure.slopes))
         for name, row in EXPOSURE.items():
             columns[name].append(row.of(name, exposure))
         for name, row in TRUTH.items():
@@ -137,6 +134,7 @@ def arrays(
         for name, row in ESTIMATE.items():
             for column, estimate in zip(by_estimator[name], estimates, strict=True):
                 column.append(None if estimate is None else row.of(name, estimate))
+    times, leads, scenes, slopes = zip(*rest, strict=True)
     found = {
         "time": Variable(
             dims=("time",), values=np.array(times).astype("datetime64[ns]"),

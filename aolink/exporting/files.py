@@ -23,13 +23,9 @@ _ROWS_AT_ONCE = 4096
 
 
 def export(
-    series: Series,
-    path: str | Path,
-    estimators: Sequence[str] | None = None,
-    *,
-    overwrite: bool = False,
+    series: Series, path: str | Path, estimators: Sequence[str] | None = None, *, overwrite: bool = False,
     progress: Progress = no_progress,
-) -> None:
+) -> None:  # fmt: skip
     """Write exposures and their estimates into a file of another program's format, which its suffix selects.
 
     ``.npz``, ``.nc`` (NetCDF) and ``.fits`` (AOT telemetry) hold everything of `arrays`; ``.parquet`` and ``.csv`` the
@@ -90,12 +86,9 @@ def _write_parquet(series: Series, names: Sequence[str], path: Path, progress: P
     pyarrow = needed("pyarrow", "parquet", "Parquet (.parquet)")
     parquet = needed("pyarrow.parquet", "parquet", "Parquet (.parquet)")
     types = {
-        "text": pyarrow.string(),
-        "integer": pyarrow.int64(),
-        "number": pyarrow.float64(),
-        "time": pyarrow.timestamp("ns", "UTC"),
-        "numbers": pyarrow.list_(pyarrow.float64()),
-    }
+        "text": pyarrow.string(), "integer": pyarrow.int64(), "number": pyarrow.float64(),
+        "time": pyarrow.timestamp("ns", "UTC"), "numbers": pyarrow.list_(pyarrow.float64()),
+    }  # fmt: skip
     known = [(column.name, types[column.kind]) for column in columns(series, names, lists=True)]
     schema = pyarrow.schema(known, metadata=facts(series) | {"rig_toml": series.rig.toml})
     left = rows(series, names, lists=True, progress=progress)
@@ -105,10 +98,6 @@ def _write_parquet(series: Series, names: Sequence[str], path: Path, progress: P
 
 
 WRITERS: dict[str, Callable[[Series, Sequence[str], Path, Progress], None]] = {
-    ".npz": _write_npz,
-    ".csv": _write_csv,
-    ".parquet": _write_parquet,
-    ".nc": _write_netcdf,
-    ".fits": write_fits,
-}
+    ".npz": _write_npz, ".csv": _write_csv, ".parquet": _write_parquet, ".nc": _write_netcdf, ".fits": write_fits,
+}  # fmt: skip
 """Functions that write a format, by the suffix of the file."""
