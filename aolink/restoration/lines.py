@@ -102,9 +102,7 @@ class _Lines:
     direction: Direction
 
     @classmethod
-    def of(
-        cls, picture: Blurred, values: FloatArray, origin: int, boundary: _Boundary, direction: Direction
-    ) -> _Lines:  # fmt: skip
+    def of(cls, picture: Blurred, values: FloatArray, origin: int, boundary: _Boundary, direction: Direction) -> _Lines:
         """The rows of a picture with the taps that blurred it."""
         batch, height, columns = picture.planes.shape
         known = _known(boundary, height, values.shape[-1] - 1)
