@@ -62,12 +62,8 @@ def poke_inputs(rig: Rig, amplitude: FloatArray | float, rest_exposures: int = 1
 
     Each value is held for ``rest_exposures`` frame periods, in which the mirror settles, and one more to be measured.
     Where the rig file has ``mirror.slew_max_per_s``, a ramp of whole frame periods leads to each value, and from the
-    last to the safe input.
-
-    Raises
-    ------
-    CalibrationError
-        The pokes would go beyond the mirror's limits, or a ramp would take longer than a minute.
+    last to the safe input. Raises `CalibrationError` where the pokes would go beyond the mirror's limits, or a ramp
+    would take longer than a minute.
     """
     size = np.broadcast_to(np.asarray(amplitude, dtype=np.float64), rig.n_inputs)
     pokes = np.concatenate([sign * np.diag(size) for sign in (1.0, -1.0)]) + rig.mirror.park
@@ -103,6 +99,9 @@ def measure_interaction(
     """Fit slopes to inputs by least squares, over the exposures whose input had rested since the beginning of an
     earlier exposure.
 
+    Raises `CalibrationError` where the sensor has no grid of spots, spots are missing, or inputs did not move apart
+    from each other.
+
     Parameters
     ----------
     rest_exposures:
@@ -110,11 +109,6 @@ def measure_interaction(
     slopes_of:
         Function that gives the slopes of an exposure instead of its spots' centroids, (n_outputs,), such as those of
         the rig file's plant. It is called for every exposure, in order.
-
-    Raises
-    ------
-    CalibrationError
-        The sensor has no grid of spots, spots are missing, or inputs did not move apart from each other.
     """
     check_spots(rig)
     inputs, slopes, value, rested = [], [], np.full(rig.n_inputs, np.nan), 0

@@ -70,6 +70,8 @@ def fit_spots(
 ) -> Spot:  # fmt: skip
     """Fit one width and one scale to the spots of several recordings, each at its own position.
 
+    Raises `CalibrationError` where there is no spot, only a part of it, or light everywhere.
+
     Parameters
     ----------
     signals:
@@ -78,11 +80,6 @@ def fit_spots(
         Pixels to use, (pixels,).
     noise:
         Variance of a dark pixel in one frame, counts squared, and counts per electron.
-
-    Raises
-    ------
-    CalibrationError
-        There is no spot, only a part of it, or light everywhere.
     """
     means = np.array([mean[good] for _, _, mean in signals])
     dark_variance = noise[0] / dark_frames
@@ -196,6 +193,8 @@ def check_at_rest(
 ) -> list[str]:  # fmt: skip
     """Check that position and light of a spot stay the same from frame to frame; gives notes.
 
+    Raises `CalibrationError` where the spot moves.
+
     Parameters
     ----------
     counts:
@@ -204,11 +203,6 @@ def check_at_rest(
         Variance of each good pixel by itself, (good pixels,), and the variance of that over its square.
     number:
         Number of the spot in the fit.
-
-    Raises
-    ------
-    CalibrationError
-        The spot moves.
     """
     kernel = Kernel(shape="gaussian", sigma=spot.sigma)
     position = np.array([spot.positions[number]])

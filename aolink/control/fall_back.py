@@ -101,10 +101,7 @@ class _Judged(NamedTuple):
 class Rival:
     """A controller that does not act, computed beside the one that does.
 
-    Parameters
-    ----------
-    held:
-        The input from which it begins, (n_inputs,).
+    ``held``: the input from which it begins, (n_inputs,).
     """
 
     def __init__(self, rig: Rig, row: ControllerRow, delay_steps: int, held: FloatArray) -> None:

@@ -164,11 +164,8 @@ class ControlLoop:
     def see(self, exposure: Exposure, estimate: Estimate | None, earliest_step: int) -> Act:
         """Take the next exposure, with its estimate where the controller needs one.
 
-        Parameters
-        ----------
-        earliest_step:
-            The first fast step whose input can still be changed. Steps before it stay as they are; those from the
-            returned ``first_step`` on must be sent anew, also where they were sent before.
+        ``earliest_step``: the first fast step whose input can still be changed. Steps before it stay as they are; those
+        from the returned ``first_step`` on must be sent anew, also where they were sent before.
         """
         end = exposure.first_step + exposure.n_steps
         first = max(end + self.delay_steps, earliest_step)
@@ -258,7 +255,6 @@ class ControlLoop:
         self._held.append(self._rig.mirror.quantise(u))
 
     def _forget_from(self, step: int) -> None:
-        """Forget the inputs of the steps from this one on."""
         for rows in (self._sent, self._held, self._limited):
             del rows[step - self._oldest :]
 

@@ -100,19 +100,9 @@ def arrays(
     ``input``; ``axis``, ``state`` and ``output`` of the plant; ``estimator``. ``lead_inputs`` are those of the steps
     between exposures, end to end along ``lead_step``: ``lead_steps`` says how many belong to each exposure, before it.
     Frames of a picture sensor are ``scene``. Variables of a truth, or of estimates, are there if any exposure has one;
-    where one exposure has none, numbers are NaN and texts empty.
-
-    Parameters
-    ----------
-    estimators:
-        Estimators whose estimates are exported; all by default.
-
-    Raises
-    ------
-    RecordingError
-        There are no estimates of such a name.
-    ExportError
-        There is no exposure, the exposures have different sizes, or the arrays would be too large for the memory.
+    where one exposure has none, numbers are NaN and texts empty. ``estimators``: estimators whose estimates are
+    exported; all by default. Raises `RecordingError` where there are no estimates of such a name; `ExportError` where
+    there is no exposure, the exposures have different sizes, or the arrays would be too large for the memory.
     """
     names = series.named(estimators)
     _check_size(series, len(names))

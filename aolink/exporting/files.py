@@ -29,7 +29,9 @@ def export(
     """Write exposures and their estimates into a file of another program's format, which its suffix selects.
 
     ``.npz``, ``.nc`` (NetCDF) and ``.fits`` (AOT telemetry) hold everything of `arrays`; ``.parquet`` and ``.csv`` the
-    table of `aolink.exporting.table`, the former with inputs and paths as lists.
+    table of `aolink.exporting.table`, the former with inputs and paths as lists. Raises `RecordingError` where there
+    are no estimates of such a name; `ExportError` where the suffix is not known, a package is missing, the file exists
+    and not ``overwrite``, or cannot be written; there is no exposure, or the format cannot hold them (`arrays`).
 
     Parameters
     ----------
@@ -39,14 +41,6 @@ def export(
         Estimators whose estimates are exported; all by default.
     progress:
         Called with the number of exposures read.
-
-    Raises
-    ------
-    RecordingError
-        There are no estimates of such a name.
-    ExportError
-        The suffix is not known, a package is missing, the file exists and not ``overwrite``, or cannot be written;
-        there is no exposure, or the format cannot hold them (`arrays`).
     """
     path = Path(path)
     if (write := WRITERS.get(path.suffix.lower())) is None:

@@ -36,14 +36,9 @@ def exposure_with_estimates(
 ) -> tuple[Exposure, dict[str, Estimate]]:
     """An exposure by its number, counted from 0, and its estimates.
 
-    Without names they are those of the baseline and of the estimator with the highest rank.
-
-    Raises
-    ------
-    RecordingError
-        There are no estimates of such a name.
-    ExportError
-        There is no such exposure, or its frame is not of the rig's sensor.
+    Without names they are those of the baseline and of the estimator with the highest rank. Raises `RecordingError`
+    where there are no estimates of such a name; `ExportError` where there is no such exposure, or its frame is not of
+    the rig's sensor.
     """
     if not 0 <= number < len(series):
         there = f"has {len(series)}, counted from 0" if len(series) else "holds none"

@@ -31,8 +31,6 @@ _DATED = {".svg": "Date", ".pdf": "CreationDate"}
 
 @dataclass(frozen=True)
 class _Figure:
-    """A figure that has a name."""
-
     what: str
     """The content of the figure, in words."""
     height: float
