@@ -22,14 +22,8 @@ from aolink.rig import Rig
 class Estimator:
     """One estimator on one rig: exposures in, estimates out, in the order in which they come.
 
-    It has no clock and does no input or output: the same exposures give the same estimates, bit for bit.
-
-    Parameters
-    ----------
-    name:
-        Name that the estimates have.
-    filter:
-        The filter of this rig, such as a `BlurFilter`.
+    It has no clock and does no input or output: the same exposures give the same estimates, bit for bit. Estimates have
+    its ``name``; ``filter`` is that of this rig, such as a `BlurFilter`.
     """
 
     def __init__(self, rig: Rig, name: str, filter: Filter) -> None:

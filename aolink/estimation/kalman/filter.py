@@ -203,14 +203,8 @@ class BlurFilter(Filter):
 def gate_status(used: BoolArray, lost: BoolArray, missed: IntArray) -> tuple[IntArray, IntArray]:
     """The `Status` of measured axes, and how many of their measurements in a row were gated, all (axes,).
 
-    Parameters
-    ----------
-    used:
-        Whether the measurement passed the gate.
-    lost:
-        Whether enough measurements before it were gated for the filter to start again.
-    missed:
-        Number of measurements in a row before it that were gated.
+    ``used`` says whether the measurement passed the gate, ``lost`` whether enough of those before it were gated for the
+    filter to start again; ``missed`` counts the measurements in a row before it that were gated.
     """
     now = np.where(used, 0, np.where(lost, 1, missed + 1))
     passed = np.where(lost, Status.REINITIALISED, Status.OK)
@@ -237,10 +231,7 @@ class TwoStateFilter(BlurFilter):
         """`step` for exposures without a gap between them, all at once and to the same bits, up to the first of which
         an axis is gated or not finite; None if that is the first of all.
 
-        Parameters
-        ----------
-        responses, measured:
-            A row for each axis of the first exposure, then of the second.
+        ``responses`` and ``measured`` have a row for each axis of the first exposure, then of the second.
         """
         if self._missed.any():
             return None

@@ -37,12 +37,8 @@ _AXES_OF_A_THREAD = 16
 class WindowedMoments:
     """Windowed moments of line-sensor profiles, one output for each axis.
 
-    Parameters
-    ----------
-    orders:
-        Orders of the basis functions; 0 is the light in the window.
-    basis, flux:
-        As in `Windowed`.
+    ``orders`` are those of the basis functions; 0 is the light in the window. ``basis`` and ``flux`` are as in
+    `Windowed`.
     """
 
     models_noise = True
@@ -91,10 +87,7 @@ def updated(
 ) -> Gaussian:
     """Priors of a path's coefficients, of any covariance, updated with the moments of orders 0 to 3.
 
-    Parameters
-    ----------
-    memory:
-        Factor of the covariance of what the linearisation leaves out, (axes,), the same in all passes.
+    ``memory``: factor of the covariance of what the linearisation leaves out, (axes,), the same in all passes.
     """
     orders, n = (0, 1, 2, 3), prior.mean.shape[1]
     lines = _lines(sensor, orders, "monomial", "known", nodes, measured, n, np.empty((0, n)))

@@ -86,15 +86,8 @@ class MixtureUpdater(Protocol):
 
 
 class MixtureFilter(Filter):
-    """A mixture for each axis, carried from exposure to exposure.
-
-    Parameters
-    ----------
-    updater:
-        Updates it with a frame.
-    gate:
-        Whether frames that are too far from their prediction are left out.
-    """
+    """A mixture for each axis, carried from exposure to exposure: ``updater`` updates it with a frame. ``gate`` says
+    whether frames that are too far from their prediction are left out."""
 
     def __init__(self, plant: Plant, sensor: BaseSensor, updater: MixtureUpdater, *, gate: bool = True) -> None:
         self.plant, self.sensor, self._updater, self._gate = plant, sensor, updater, gate

@@ -26,13 +26,7 @@ from aolink.estimation.kalman.update import joseph_update
 from aolink.estimation.moments.lines import updated
 from aolink.estimation.pixels.filter import Innovation
 from aolink.estimation.pixels.gaussian_mixture import log_sum
-from aolink.estimation.pixels.levenberg_marquardt import (
-    FIRST_DAMPING,
-    FREE_DAMPING,
-    LARGEST_DAMPING,
-    Points,
-    minimise,
-)
+from aolink.estimation.pixels.levenberg_marquardt import FIRST_DAMPING, FREE_DAMPING, LARGEST_DAMPING, Points, minimise
 from aolink.estimation.pixels.likelihood import PixelView
 from aolink.numerics import batched
 from aolink.numerics.arrays import FloatArray, Indices
@@ -88,15 +82,7 @@ class Modes(NamedTuple):
 
 
 def find_modes(view: PixelView, prior: Gaussian, starts: FloatArray) -> Modes:
-    """The mode that each start leads to.
-
-    Parameters
-    ----------
-    prior:
-        Prior of each axis.
-    starts:
-        In whitened coordinates, (axes, starts, n).
-    """
+    """The mode that each start, in whitened coordinates, (axes, starts, n), leads to, with this prior of each axis."""
     axes, count, n = starts.shape
     if (line := view.line) is not None:
         return found_compiled(line, prior, starts, np.full(axes, count), 0, 0.0)
@@ -190,11 +176,9 @@ def broad(view: PixelView, prior: Gaussian, memory: FloatArray | None = None) ->
 def spread_starts(view: PixelView, prior: Gaussian, wide: Gaussian) -> tuple[FloatArray, FloatArray]:
     """The mean of a wide Gaussian and points on both sides of it along the path's most uncertain directions.
 
-    Returns
-    -------
-    The points, (axes, 1 + 2 directions, n), in coordinates in which the prior is N(0, I): the mean, and a pair for each
-    direction. And the mean square of the path along each direction at one standard deviation, the largest first,
-    (axes, n).
+    They are (axes, 1 + 2 directions, n), in coordinates in which the prior is N(0, I): the mean, and a pair for each
+    direction. The second result is the mean square of the path along each direction at one standard deviation, the
+    largest first, (axes, n).
     """
     axes, n = wide.mean.shape
     if view.on_line:

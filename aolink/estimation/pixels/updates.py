@@ -95,11 +95,9 @@ class ImportanceUpdater:
         return reduced.size**2 / self.points if self.points else 1.0
 
     def reduction(self, model: ExposureModel, sensor: BaseSensor) -> Reduction:
-        """The coefficients that it works with."""
         return reduction(model, sensor)
 
     def update(self, view: PixelView, prior: GaussianMixture, unseen: Gaussian, number: int) -> MixtureUpdate:
-        """The posterior of axes with a prior of their start states."""
         reduced = view.reduced
         modes, proposal = explored(view, prior)
         own = reduced.prior(prior.gaussian)
