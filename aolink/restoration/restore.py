@@ -19,14 +19,9 @@ _COLOURS = (3, 4)
 
 
 def restore(
-    image: ArrayLike,
-    psf: Psf | ArrayLike,
-    *,
-    method: str = DEFAULT_METHOD,
-    noise_sd: float | None = None,
-    mask: ArrayLike | None = None,
-    **parameters: Any,
-) -> Restored:
+    image: ArrayLike, psf: Psf | ArrayLike, *, method: str = DEFAULT_METHOD, noise_sd: float | None = None,
+    mask: ArrayLike | None = None, **parameters: Any,
+) -> Restored:  # fmt: skip
     """Take the blur out of a picture.
 
     Parameters
