@@ -33,8 +33,6 @@ _LOSSY = "the pictures are compressed with JPEG, after a gamma curve"
 
 @dataclass(frozen=True, eq=False)
 class _Stamped:
-    """A picture of a bag."""
-
     time_ns: int
     """The picture's own time stamp, or 0 where it has none."""
     arrival_ns: int
