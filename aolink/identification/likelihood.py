@@ -66,14 +66,9 @@ class ShortRuns:
 
 
 class Likelihood:
-    """Log-likelihood of readings, for many models one after the other.
+    """Log-likelihood of readings, for many models one after the other, by short runs of ``length`` exposures.
 
-    Parameters
-    ----------
-    seen:
-        The readings; all outputs have one model, of which each output is an independent draw.
-    length:
-        Exposures in a short run.
+    All outputs of the readings have one model, of which each output is an independent draw.
     """
 
     def __init__(self, seen: Readings, length: int) -> None:
@@ -94,14 +89,8 @@ class Likelihood:
     ) -> float:
         """Log-likelihood, -inf where the model gives no valid covariance.
 
-        Parameters
-        ----------
-        noise:
-            Factor of the pixels' noise variance.
-        wider:
-            The kernel's variance less the rig file's, slope units squared.
-        nodes:
-            Nodes in an exposure; `nodes` of the model where None.
+        ``noise`` is the factor of the pixels' noise variance, ``wider`` the kernel's variance less the rig file's,
+        slope units squared, ``nodes`` the number in an exposure; `nodes` of the model where None.
         """
         return float(self.of_outputs(model, noise, wider, nodes).sum())
 
@@ -140,11 +129,9 @@ class Likelihood:
             several = (seen.mean, seen.square, seen.square_noise, seen.centre, response)
             self._short_runs[nodes] = [
                 ShortRuns(
-                    seen.usable[where[0]],
-                    np.array([o for o, _ in where]),
-                    *(np.array([each[at] for at in where]) for each in several),
+                    seen.usable[w[0]], np.array([o for o, _ in w]), *(np.array([x[at] for at in w]) for x in several)
                 )
-                for where in self._alike(self.length)
+                for w in self._alike(self.length)
             ]
         return self._short_runs[nodes]
 
@@ -243,15 +230,8 @@ def _walk(model: DisturbanceProcesses) -> float:
 
 
 class _GivenMeans:
-    """The path in a short run of exposures, given its means over them.
-
-    Parameters
-    ----------
-    with_means:
-        Cov(y_i, path in exposure j), (L, L, nodes).
-    own:
-        Covariance of the path in each exposure, (L, nodes, nodes).
-    """
+    """The path in a short run of exposures, given its means over them, from ``with_means``, Cov(y_i, path in exposure
+    j), (L, L, nodes), and ``own``, the covariance of the path in each exposure, (L, nodes, nodes)."""
 
     def __init__(
         self, with_means: FloatArray, own: FloatArray, weights: FloatArray, usable: BoolArray, mean_noise: float
@@ -290,17 +270,8 @@ class _GivenMeans:
 
 
 def _shifted_gamma(e: FloatArray, variance: FloatArray, third: FloatArray, read: FloatArray) -> FloatArray:
-    """Log-density of a gamma variable, shifted to mean zero, with Gaussian noise.
-
-    Parameters
-    ----------
-    e:
-        Values, any shape.
-    variance, third:
-        Second and third cumulant of the gamma variable, the latter above zero.
-    read:
-        Variance of the noise.
-    """
+    """Log-density at e of a gamma variable, shifted to mean zero, with Gaussian noise of variance ``read``;
+    ``variance`` and ``third`` are the gamma variable's second and third cumulant, the latter above zero."""
     sd = np.sqrt(variance)
     skewness = np.clip(third / (variance * sd), _LEAST_SKEWNESS, _MOST_SKEWNESS)
     k = 4 / skewness**2

@@ -76,17 +76,8 @@ class Covariance(ABC):
         return np.asarray((self.shares * np.exp(self.poles * lag_s[..., None])).sum(axis=-1).real)
 
     def covariance_across(self, apart_s: FloatArray, at_s: FloatArray) -> FloatArray:
-        """Cov(theta(t + at_b), theta(t + apart + at_a)), where ``apart`` is more than all differences of ``at``.
-
-        Parameters
-        ----------
-        apart_s, at_s:
-            s, (m,) and (k,).
-
-        Returns
-        -------
-        (m, k, k), a first.
-        """
+        """Cov(theta(t + at_b), theta(t + apart + at_a)), (m, k, k), a first, for times (m,) and (k,), s; ``apart`` is
+        more than all differences of ``at``."""
         poles = self._tamed(at_s)
         inside = self.shares[:, None, None] * np.exp(poles[:, None, None] * (at_s[:, None] - at_s))
         return np.asarray(np.tensordot(np.exp(np.outer(apart_s, poles)), inside, axes=1).real)
@@ -202,15 +193,8 @@ class ProcessSum:
         return all(process.is_stationary for process in self.processes)
 
     def state_space(self, step_s: float, start_variance: float = 0.0) -> StateSpace:
-        """The model sampled at the fast rate, exactly.
-
-        Parameters
-        ----------
-        step_s:
-            Fast step, s.
-        start_variance:
-            Variance of a random walk's start, slope units squared.
-        """
+        """The model sampled at the fast rate, exactly; ``start_variance`` is that of a random walk's start, slope units
+        squared."""
         parts = [_sampled(process, step_s, start_variance) for process in self.processes]
         A, W, P = (linalg.block_diag(*(part[k] for part in parts)) for k in (0, 1, 2))
         C = np.concatenate([np.eye(1, len(part[0])) for part in parts], axis=1)
