@@ -19,8 +19,8 @@ Answer = TypeVar("Answer")
 class CheckedController:
     """The `Controller` of a row on a rig.
 
-    Raises `ControlError` where it cannot be made for this rig; from `see` and `step`, its own code fails, or it gives
-    something that is no input of this rig.
+    Raises `ControlError` where it cannot be made for this rig; `see` and `step` raise it where its own code
+    fails, or gives something that is no input of this rig.
     """
 
     def __init__(self, row: ControllerRow, rig: Rig) -> None:

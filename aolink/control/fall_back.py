@@ -101,7 +101,7 @@ class _Judged(NamedTuple):
 class Rival:
     """A controller that does not act, computed beside the one that does.
 
-    ``held``: the input from which it begins, (n_inputs,).
+    It begins from the input ``held``, (n_inputs,).
     """
 
     def __init__(self, rig: Rig, row: ControllerRow, delay_steps: int, held: FloatArray) -> None:

@@ -164,8 +164,8 @@ class ControlLoop:
     def see(self, exposure: Exposure, estimate: Estimate | None, earliest_step: int) -> Act:
         """Take the next exposure, with its estimate where the controller needs one.
 
-        ``earliest_step``: the first fast step whose input can still be changed. Steps before it stay as they are; those
-        from the returned ``first_step`` on must be sent anew, also where they were sent before.
+        ``earliest_step`` is the first fast step whose input can still be changed. Steps before it stay as they are;
+        those from the returned ``first_step`` on must be sent anew, also where they were sent before.
         """
         end = exposure.first_step + exposure.n_steps
         first = max(end + self.delay_steps, earliest_step)

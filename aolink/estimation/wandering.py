@@ -50,7 +50,7 @@ _MET = 0.01
 class WanderingEstimator(Estimator):
     """One estimator on a rig with ``plant.wandering``.
 
-    ``make``: makes the estimator for a rig. Raises `EstimatorError` where the plant cannot run faster or slower.
+    ``make`` makes the estimator for a rig. Raises `EstimatorError` where the plant cannot run faster or slower.
     """
 
     def __init__(self, rig: Rig, make: Callable[[Rig], Estimator]) -> None:

@@ -100,8 +100,8 @@ def arrays(
     ``input``; ``axis``, ``state`` and ``output`` of the plant; ``estimator``. ``lead_inputs`` are those of the steps
     between exposures, end to end along ``lead_step``: ``lead_steps`` says how many belong to each exposure, before it.
     Frames of a picture sensor are ``scene``. Variables of a truth, or of estimates, are there if any exposure has one;
-    where one exposure has none, numbers are NaN and texts empty. ``estimators``: estimators whose estimates are
-    exported; all by default. Raises `RecordingError` where there are no estimates of such a name; `ExportError` where
+    where one exposure has none, numbers are NaN and texts empty. Estimates of ``estimators`` are exported;
+    by default of all. Raises `RecordingError` where there are no estimates of such a name; `ExportError` where
     there is no exposure, the exposures have different sizes, or the arrays would be too large for the memory.
     """
     names = series.named(estimators)

@@ -38,8 +38,8 @@ def columns(series: Series, names: Sequence[str], *, lists: bool = False) -> lis
     `Exposure`) and its ``axis``. For that axis it has the mean of each input (``input_1_mean``, ...), the states
     (``x1``, ...) at both ends with their standard deviations, the mean of each output's path (``path_1_mean``), the RMS
     of the path about these means (``path_rms``), of its standard deviation (``path_sd_rms``) and, where the truth is
-    known, of its error (``path_error_rms``); ``status``, ``reason`` and ``nis``. ``lists``: whether to add the axis's
-    inputs (steps x inputs), paths and their standard deviations (outputs x steps) as lists.
+    known, of its error (``path_error_rms``); ``status``, ``reason`` and ``nis``. ``lists`` says whether to add the
+    axis's inputs (steps x inputs), paths and their standard deviations (outputs x steps) as lists.
     """
     plant = series.rig.plant
     inputs, states = range(1, plant.n_inputs + 1), range(1, plant.n_states + 1)

@@ -68,7 +68,7 @@ def moments_of_frames(
 ) -> tuple[Indices, Measurement | None]:
     """Which of some frames show all spots without a flaw, and the moments of these, a row for each output of each.
 
-    ``frames``: (frames, rows, columns), of which all pixels arrived.
+    Frames are (frames, rows, columns); all of their pixels arrived.
     """
     from aolink.estimation.compiled.frames import brightest_stretches, window_sums  # not before it is needed
 

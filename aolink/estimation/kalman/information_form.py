@@ -68,7 +68,7 @@ def stepped_gain(A: FloatArray, H: FloatArray, Q: FloatArray, R: FloatArray) -> 
     """The gain that a Kalman filter settles at, (n_states, m); None where it does not settle.
 
     The Riccati equation stepped from exposure to exposure: a second for 288 states of a plant that forgets its state
-    within a few exposures. ``R``: blocks along the diagonal, (blocks, size, size).
+    within a few exposures. R are blocks along the diagonal, (blocks, size, size).
     """
     blocks, size, _ = R.shape
     weighted = np.asarray(np.linalg.solve(R, H.reshape(blocks, size, -1)), dtype=np.float64).reshape(len(H), -1)

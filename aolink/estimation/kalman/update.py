@@ -42,8 +42,8 @@ def blocked_update(
     """`joseph_update` for few states and many measurements, whose noise is shared within blocks only.
 
     With G = H' R^-1 H and M = (I + P G)^-1 P, the optimal gain is M H' R^-1 and S^-1 y = R^-1 (y - H K y): nothing has
-    more rows than there are states, and P may be singular. Where S is large, only its diagonal is computed. ``R``:
-    (axes, blocks, size, size)
+    more rows than there are states, and P may be singular. Where S is large, only its diagonal is computed. R is
+    (axes, blocks, size, size).
     """
     axes, blocks, size, _ = R.shape
     n = prior.mean.shape[1]

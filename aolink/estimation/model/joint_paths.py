@@ -98,7 +98,7 @@ class JointPaths:
     def foreseen(self, mean: FloatArray, response: InputResponse, axis: int) -> JointPaths:
         """The same with the response to an exposure's inputs, and as many nodes as a path about this mean needs.
 
-        ``mean``: mean of the coefficients before the exposure, (size,).
+        ``mean`` is that of the coefficients before the exposure, (size,).
         """
         paths, path = copy(self), response.path[axis]
         expected = self.shares(mean) @ self._functions.T + path

@@ -87,7 +87,7 @@ def updated(
 ) -> Gaussian:
     """Priors of a path's coefficients, of any covariance, updated with the moments of orders 0 to 3.
 
-    ``memory``: factor of the covariance of what the linearisation leaves out, (axes,), the same in all passes.
+    ``memory`` is the factor of the covariance of what the linearisation leaves out, (axes,), the same in all passes.
     """
     orders, n = (0, 1, 2, 3), prior.mean.shape[1]
     lines = _lines(sensor, orders, "monomial", "known", nodes, measured, n, np.empty((0, n)))

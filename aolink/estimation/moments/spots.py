@@ -170,7 +170,7 @@ def _meetings(C: FloatArray, order: int) -> FloatArray:
     """Terms of Mehler's series between two spots at every two nodes: weights of products of their n-th derivatives.
 
     Cov(f, f') has, for each n, the sum over all ways to pair n derivatives by x or y of f with n of f', of the product
-    of the pairs' covariances, over n!. ``C``: covariance of the two spots' positions, (axes, nodes, 2, nodes, 2).
+    of the pairs' covariances, over n!. C is the covariance of the two spots' positions, (axes, nodes, 2, nodes, 2).
 
     Returns
     -------

@@ -47,7 +47,7 @@ _NO_LIGHT = 1e-9
 class JointPixels:
     """The pixels of one frame as a function of the coefficients of all spots together.
 
-    ``windows``: spots of one copy of the plant, as `by_spot` gives them.
+    ``windows`` are the spots of one copy of the plant, as `by_spot` gives them.
     """
 
     def __init__(self, sensor: SpotSensor, paths: JointPaths, windows: SpotWindows) -> None:
