@@ -62,12 +62,8 @@ def poke_inputs(rig: Rig, amplitude: FloatArray | float, rest_exposures: int = 1
 
     Each value is held for ``rest_exposures`` frame periods, in which the mirror settles, and one more to be measured.
     Where the rig file has ``mirror.slew_max_per_s``, a ramp of whole frame periods leads to each value, and from the
-    last to the safe input.
-
-    Raises
-    ------
-    CalibrationError
-        The pokes would go beyond the mirror's limits, or a ramp would take longer than a minute.
+    last to the safe input. Raises `CalibrationError` where the pokes would go beyond the mirror's limits, or a ramp
+    would take longer than a minute.
     """
     size = np.broadcast_to(np.asarray(amplitude, dtype=np.float64), rig.n_inputs)
     pokes = np.concatenate([sign * np.diag(size) for sign in (1.0, -1.0)]) + rig.mirror.park
@@ -97,13 +93,14 @@ def _ramp(rig: Rig, begin: FloatArray, end: FloatArray) -> FloatArray:
 
 
 def measure_interaction(
-    rig: Rig,
-    exposures: Iterable[Exposure],
-    slopes_of: Callable[[Exposure], FloatArray] | None = None,
+    rig: Rig, exposures: Iterable[Exposure], slopes_of: Callable[[Exposure], FloatArray] | None = None,
     rest_exposures: int = 1,
-) -> Interaction:
+) -> Interaction:  # fmt: skip
     """Fit slopes to inputs by least squares, over the exposures whose input had rested since the beginning of an
     earlier exposure.
+
+    Raises `CalibrationError` where the sensor has no grid of spots, spots are missing, or inputs did not move apart
+    from each other.
 
     Parameters
     ----------
@@ -112,11 +109,6 @@ def measure_interaction(
     slopes_of:
         Function that gives the slopes of an exposure instead of its spots' centroids, (n_outputs,), such as those of
         the rig file's plant. It is called for every exposure, in order.
-
-    Raises
-    ------
-    CalibrationError
-        The sensor has no grid of spots, spots are missing, or inputs did not move apart from each other.
     """
     check_spots(rig)
     inputs, slopes, value, rested = [], [], np.full(rig.n_inputs, np.nan), 0
@@ -144,14 +136,8 @@ def measure_interaction(
     matrix, residual = solution[:-1].T, y - design @ solution
     freedom = (len(u) - design.shape[1]) * y.shape[1]
     noise = float(np.sqrt((residual**2).sum() / freedom)) if freedom else float("nan")
-    return Interaction(
-        matrix=matrix,
-        offset=solution[-1],
-        singular_values=np.linalg.svd(matrix, compute_uv=False),
-        residual_rms=rms(residual),
-        sd=noise * np.sqrt(np.diag(np.linalg.inv(design.T @ design))[:-1]),
-        exposures=len(u),
-    )
+    sd = noise * np.sqrt(np.diag(np.linalg.inv(design.T @ design))[:-1])
+    return Interaction(matrix, solution[-1], np.linalg.svd(matrix, compute_uv=False), rms(residual), sd, len(u))
 
 
 def check_spots(rig: Rig) -> None:

@@ -92,13 +92,8 @@ class Calibration:
     @property
     def values(self) -> dict[str, Measured]:
         """The measured values, by the rig file's key."""
-        found = {
-            "sensor.black_level": self.black_level,
-            "sensor.noise_density": self.noise_density,
-            "sensor.counts_per_density": self.counts_per_density,
-            "sensor.photoelectrons": self.photoelectrons,
-            "sensor.kernel.sigma": self.kernel_sigma,
-        }
+        names = ("black_level", "noise_density", "counts_per_density", "photoelectrons")
+        found = {f"sensor.{name}": getattr(self, name) for name in names} | {"sensor.kernel.sigma": self.kernel_sigma}
         return {key: value for key, value in found.items() if value is not None}
 
 
@@ -130,12 +125,8 @@ def pixel_statistics(series: Sequence[NDArray[np.uint16]], *, steady: bool = Tru
         counts = [each - each.mean(axis=1, keepdims=True) for each in counts]
     differences = frames - len(counts)
     squares = np.sum([(np.diff(each, axis=0) ** 2).sum(axis=0) for each in counts], axis=0)
-    return PixelStatistics(
-        frames=frames,
-        mean=mean,
-        variance=squares / (2 * differences * share),
-        spread=sum(3 * len(each) - 4 for each in counts) / differences**2 / share,
-    )
+    spread = sum(3 * len(each) - 4 for each in counts) / differences**2 / share
+    return PixelStatistics(frames=frames, mean=mean, variance=squares / (2 * differences * share), spread=spread)
 
 
 def line_sensor(rig: Rig) -> Sensor:
@@ -336,15 +327,9 @@ def _photon_transfer(
 
 
 def _result(
-    rig: Rig,
-    recordings: Sequence[Frames],
-    black: Measured,
-    read: Measured,
-    gain: Measured | None,
-    spot: Spot | None,
-    good: BoolArray,
-    notes: list[str],
-) -> Calibration:
+    rig: Rig, recordings: Sequence[Frames], black: Measured, read: Measured, gain: Measured | None, spot: Spot | None,
+    good: BoolArray, notes: list[str],
+) -> Calibration:  # fmt: skip
     sensor, scale = rig.sensor, None
     if spot is not None:
         scale = Measured(spot.counts_per_density, spot.counts_per_density_sd)
@@ -368,18 +353,12 @@ def _result(
         )
         sigma = None
     return Calibration(
-        black_level=black,
-        read_noise=Measured(math.sqrt(read.value), read.sd / (2 * math.sqrt(read.value))),
-        noise_density=Measured(density, density_sd),
-        gain=gain,
-        photoelectrons=_photoelectrons(rig, gain, used, notes),
-        counts_per_density=scale,
-        kernel_sigma=sigma,
-        spot=spot,
+        black_level=black, read_noise=Measured(math.sqrt(read.value), read.sd / (2 * math.sqrt(read.value))),
+        noise_density=Measured(density, density_sd), gain=gain,
+        photoelectrons=_photoelectrons(rig, gain, used, notes), counts_per_density=scale, kernel_sigma=sigma, spot=spot,
         frames={kind: sum(len(each.counts) for each in recordings if each.kind == kind) for kind in KINDS},
-        hot_pixels=tuple(map(int, np.flatnonzero(~good))),
-        notes=tuple(notes),
-    )
+        hot_pixels=tuple(map(int, np.flatnonzero(~good))), notes=tuple(notes),
+    )  # fmt: skip
 
 
 def _photoelectrons(rig: Rig, gain: Measured | None, scale: Measured, notes: list[str]) -> Measured | None:

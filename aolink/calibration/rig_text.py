@@ -46,10 +46,8 @@ def _updated_table(rig: Rig, calibration: Calibration, sources: Sequence[str]) -
     """The table with the new values; values that were not measured this time stay as before."""
     table = rig.calibration or CalibrationTable()
     sds = {
-        key.removeprefix("sensor.").replace(".", "_") + "_sd": float(f"{value.sd:.3g}")
-        if value.sd == value.sd
-        else None
-        for key, value in calibration.values.items()
+        key.removeprefix("sensor.").replace(".", "_") + "_sd": None if math.isnan(sd) else float(f"{sd:.3g}")
+        for key, sd in ((key, value.sd) for key, value in calibration.values.items())
     }
     frames = {f"{kind}_frames": n for kind, n in calibration.frames.items() if n}
     kept = [each for each in table.sources if not any(n and each.startswith(k) for k, n in calibration.frames.items())]

@@ -65,13 +65,12 @@ class Spot:
 
 
 def fit_spots(
-    sensor: Sensor,
-    signals: Sequence[tuple[str, int, FloatArray]],
-    good: BoolArray,
-    noise: tuple[float, float],
+    sensor: Sensor, signals: Sequence[tuple[str, int, FloatArray]], good: BoolArray, noise: tuple[float, float],
     dark_frames: int,
-) -> Spot:
+) -> Spot:  # fmt: skip
     """Fit one width and one scale to the spots of several recordings, each at its own position.
+
+    Raises `CalibrationError` where there is no spot, only a part of it, or light everywhere.
 
     Parameters
     ----------
@@ -81,11 +80,6 @@ def fit_spots(
         Pixels to use, (pixels,).
     noise:
         Variance of a dark pixel in one frame, counts squared, and counts per electron.
-
-    Raises
-    ------
-    CalibrationError
-        There is no spot, only a part of it, or light everywhere.
     """
     means = np.array([mean[good] for _, _, mean in signals])
     dark_variance = noise[0] / dark_frames
@@ -117,17 +111,11 @@ def fit_spots(
         total = inside[:, good].sum() / sensor.pixel_width
         amplitude, amplitude_sd = means.sum() / total, math.sqrt(variance.sum()) / total
     return Spot(
-        positions=tuple(map(float, positions)),
-        position_sds=tuple(map(float, sds[2:])),
-        sigma=sigma,
-        sigma_sd=float(sigma * sds[1]),
-        counts_per_density=float(amplitude),
-        counts_per_density_sd=float(amplitude_sd),
-        chi_square=chi_square,
-        freedom=freedom,
-        largest_residual=float(np.abs(residuals).max() / means.max()),
+        positions=tuple(map(float, positions)), position_sds=tuple(map(float, sds[2:])), sigma=sigma,
+        sigma_sd=float(sigma * sds[1]), counts_per_density=float(amplitude), counts_per_density_sd=float(amplitude_sd),
+        chi_square=chi_square, freedom=freedom, largest_residual=float(np.abs(residuals).max() / means.max()),
         noise=noise,
-    )
+    )  # fmt: skip
 
 
 def _check_inside(sensor: Sensor, sources: Sequence[str], positions: FloatArray, shares: FloatArray) -> None:
@@ -200,15 +188,12 @@ def _first_guess(
 
 
 def check_at_rest(
-    sensor: Sensor,
-    source: str,
-    counts: NDArray[np.uint16],
-    alone: tuple[FloatArray, float],
-    good: BoolArray,
-    spot: Spot,
-    number: int,
-) -> list[str]:
+    sensor: Sensor, source: str, counts: NDArray[np.uint16], alone: tuple[FloatArray, float], good: BoolArray,
+    spot: Spot, number: int,
+) -> list[str]:  # fmt: skip
     """Check that position and light of a spot stay the same from frame to frame; gives notes.
+
+    Raises `CalibrationError` where the spot moves.
 
     Parameters
     ----------
@@ -218,11 +203,6 @@ def check_at_rest(
         Variance of each good pixel by itself, (good pixels,), and the variance of that over its square.
     number:
         Number of the spot in the fit.
-
-    Raises
-    ------
-    CalibrationError
-        The spot moves.
     """
     kernel = Kernel(shape="gaussian", sigma=spot.sigma)
     position = np.array([spot.positions[number]])
@@ -248,9 +228,9 @@ def check_at_rest(
         excess = math.sqrt((scatter - expected) / max(1 - own, 1e-3))
         if moves:
             raise CalibrationError(
-                f"{source} is said to show a resting spot, but the spot moves by"
-                f" {excess * sensor.pixel_width:.2g} (standard deviation,"
-                " slope units) from frame to frame: park the mirror, keep the bench still, and record it again"
+                f"{source} is said to show a resting spot, but the spot moves by {excess * sensor.pixel_width:.2g}"
+                " (standard deviation, slope units) from frame to frame: park the mirror, keep the bench still, and"
+                " record it again"
             )
         notes.append(
             f"{source}: the light of the spot flickers by {excess:.1%} from frame to frame: without flats,"

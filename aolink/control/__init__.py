@@ -10,21 +10,7 @@ from aolink.control.registry import controller_names, find_controller
 from aolink.control.stability import Stability, check_stable, stability
 
 __all__ = [
-    "Act",
-    "ControlLoop",
-    "Controller",
-    "ControllerRow",
-    "FallBack",
-    "Fit",
-    "FitMonitor",
-    "MirrorModes",
-    "Seen",
-    "Stability",
-    "State",
-    "check_stable",
-    "controller_names",
-    "delay_steps",
-    "find_controller",
-    "response_at_rest",
+    "Act", "ControlLoop", "Controller", "ControllerRow", "FallBack", "Fit", "FitMonitor", "MirrorModes", "Seen",
+    "Stability", "State", "check_stable", "controller_names", "delay_steps", "find_controller", "response_at_rest",
     "stability",
-]
+]  # fmt: skip

@@ -19,28 +19,23 @@ Answer = TypeVar("Answer")
 class CheckedController:
     """The `Controller` of a row on a rig.
 
-    Raises
-    ------
-    ControlError
-        It cannot be made for this rig; from `see` and `step`, its own code fails, or it gives something that is no
-        input of this rig.
+    Raises `ControlError` where it cannot be made for this rig; `see` and `step` raise it where its own code
+    fails, or gives something that is no input of this rig.
     """
 
     def __init__(self, row: ControllerRow, rig: Rig) -> None:
         self._name, self._shape = row.name, (rig.n_inputs,)
-        self._controller = _asked(
-            lambda: row.build(rig), f"the controller {row.name} cannot work on the rig {rig.name}"
-        )
+        refused = f"the controller {row.name} cannot work on the rig {rig.name}"
+        self._controller = _asked(lambda: row.build(rig), refused)
+        self._failed = f"the controller {row.name} failed"
 
     def see(self, seen: Seen) -> None:
         """Take the next exposure."""
-        _asked(lambda: self._controller.see(seen), f"the controller {self._name} failed")
+        _asked(lambda: self._controller.see(seen), self._failed)
 
     def step(self, held: FloatArray) -> FloatArray:
         """The input wanted for the next fast step, (n_inputs,), finite."""
-        u = _asked(
-            lambda: np.asarray(self._controller.step(held), dtype=np.float64), f"the controller {self._name} failed"
-        )
+        u = _asked(lambda: np.asarray(self._controller.step(held), dtype=np.float64), self._failed)
         if u.shape != self._shape or not np.isfinite(u).all():
             found = "a number that is not finite" if u.shape == self._shape else f"an array of {u.shape}"
             raise ControlError(f"the controller {self._name} gives {found}, expected {self._shape} finite inputs")

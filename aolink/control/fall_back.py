@@ -101,10 +101,7 @@ class _Judged(NamedTuple):
 class Rival:
     """A controller that does not act, computed beside the one that does.
 
-    Parameters
-    ----------
-    held:
-        The input from which it begins, (n_inputs,).
+    It begins from the input ``held``, (n_inputs,).
     """
 
     def __init__(self, rig: Rig, row: ControllerRow, delay_steps: int, held: FloatArray) -> None:
@@ -200,17 +197,14 @@ class FallBack:
         if end - len(held) != self._end:
             self.interrupt()
         self._end, self._since = end, self._since + 1
+        state = None if estimate is None else estimate.end_state
         if not self._rivals:
-            self._rivals = {
-                name: Rival(self._rig, row, self._delay, held[-1])
-                for name, row in self._rows.items()
-                if name != self.acting
-            }
+            others = {name: row for name, row in self._rows.items() if name != self.acting}
+            self._rivals = {name: Rival(self._rig, row, self._delay, held[-1]) for name, row in others.items()}
             self._settling = _SETTLING
             for rival in self._rivals.values():
-                rival.see(held[-1:], slopes, None if estimate is None else estimate.end_state)
+                rival.see(held[-1:], slopes, state)
             return None
-        state = None if estimate is None else estimate.end_state
         differences = {name: rival.see(held, slopes, state) for name, rival in self._rivals.items()}
         self._settling -= 1
         if self._settling >= 0 or not np.isfinite(slopes).any():

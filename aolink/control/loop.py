@@ -164,11 +164,8 @@ class ControlLoop:
     def see(self, exposure: Exposure, estimate: Estimate | None, earliest_step: int) -> Act:
         """Take the next exposure, with its estimate where the controller needs one.
 
-        Parameters
-        ----------
-        earliest_step:
-            The first fast step whose input can still be changed. Steps before it stay as they are; those from the
-            returned ``first_step`` on must be sent anew, also where they were sent before.
+        ``earliest_step`` is the first fast step whose input can still be changed. Steps before it stay as they are;
+        those from the returned ``first_step`` on must be sent anew, also where they were sent before.
         """
         end = exposure.first_step + exposure.n_steps
         first = max(end + self.delay_steps, earliest_step)
@@ -191,19 +188,13 @@ class ControlLoop:
         self._drop_before(exposure.first_step)
         clipped, self._clipped = self._clipped, 0
         return Act(
-            frame_id=exposure.frame_id,
-            first_step=first,
-            delay_steps=first - end,
-            late=first > end + self.delay_steps,
-            state=self.state,
-            reason=self.reason,
+            frame_id=exposure.frame_id, first_step=first, delay_steps=first - end,
+            late=first > end + self.delay_steps, state=self.state, reason=self.reason,
             slope_rms=rms(slopes[np.isfinite(slopes)]),
             path_rms=math.nan if estimate is None else rms(estimate.path[np.isfinite(estimate.path)]),
-            clipped_steps=clipped,
-            fit=self.fit,
-            acting=self.acting,
+            clipped_steps=clipped, fit=self.fit, acting=self.acting,
             gained=math.nan if change is None else change.gained,
-        )
+        )  # fmt: skip
 
     @property
     def acting(self) -> str:
@@ -264,7 +255,6 @@ class ControlLoop:
         self._held.append(self._rig.mirror.quantise(u))
 
     def _forget_from(self, step: int) -> None:
-        """Forget the inputs of the steps from this one on."""
         for rows in (self._sent, self._held, self._limited):
             del rows[step - self._oldest :]
 

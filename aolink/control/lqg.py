@@ -57,10 +57,7 @@ def lqr_gain(plant: Plant, effort: float, n_steps: int) -> FloatArray:
     a sum that converges even where x_2 never dies out, such as a random walk. Then
     K = (rho I + B_1' P B_1)^-1 B_1' [P A_1,  P A_12 + S A_2].
 
-    Raises
-    ------
-    ControlError
-        The Riccati equation has no stabilising solution.
+    Raises `ControlError` where the Riccati equation has no stabilising solution.
     """
     one, two = reached(plant)
     A1, A12, A2 = (plant.A[np.ix_(*pair)] for pair in ((one, one), (one, two), (two, two)))

@@ -61,42 +61,12 @@ else:  # the type checker would accept any name
 
 
 __all__ = [
-    "ESTIMATOR_NAMES",
-    "BlurFilter",
-    "Consistency",
-    "Driver",
-    "Engine",
-    "Estimate",
-    "Estimator",
-    "EstimatorRow",
-    "ExposureModel",
-    "Filter",
-    "Gaussian",
-    "Measurement",
-    "Needs",
-    "Options",
-    "PathMoments",
-    "Posterior",
-    "Profile",
-    "Score",
-    "Scorer",
-    "SpotWindows",
-    "Status",
-    "Update",
-    "WindowedMoments",
-    "WindowedSpots",
-    "estimator_row",
-    "estimator_rows",
-    "exposure_model",
-    "joseph_update",
-    "make_estimator",
-    "measure_moments",
-    "measure_moments_2d",
-    "path_from_coefficients",
-    "run",
-    "score",
-    "smooth",
-]
+    "ESTIMATOR_NAMES", "BlurFilter", "Consistency", "Driver", "Engine", "Estimate", "Estimator", "EstimatorRow",
+    "ExposureModel", "Filter", "Gaussian", "Measurement", "Needs", "Options", "PathMoments", "Posterior", "Profile",
+    "Score", "Scorer", "SpotWindows", "Status", "Update", "WindowedMoments", "WindowedSpots", "estimator_row",
+    "estimator_rows", "exposure_model", "joseph_update", "make_estimator", "measure_moments", "measure_moments_2d",
+    "path_from_coefficients", "run", "score", "smooth",
+]  # fmt: skip
 
 
 def __dir__() -> list[str]:

@@ -90,9 +90,8 @@ def considered(
             coefficients=scale * (late.coefficients - early.coefficients),
             end_state=scale * (late.end_state - early.end_state),
         )
-        coefficient_covariance = estimate.coefficient_covariance + _bent(share, estimate, late, early, "coefficients")
+        covariance = estimate.coefficient_covariance + _bent(share, estimate, late, early, "coefficients")
         n = estimate.end_state.shape[1]
-        start_covariance = coefficient_covariance[:, :n, :n]
         end_covariance = estimate.end_covariance + _bent(share, estimate, late, early, "end_state")
         innovation_covariance, nis = estimate.innovation_covariance, estimate.nis
         if innovation_covariance.ndim == 3:
@@ -100,14 +99,11 @@ def considered(
             innovation_covariance = innovation_covariance + change[:, :, None] * change[:, None, :]
             nis = _nis(estimate, change)
         yield replace(
-            estimate,
-            coefficient_covariance=coefficient_covariance,
-            start_covariance=alignment.added_to(start_covariance, "coefficients"),
+            estimate, coefficient_covariance=covariance, alignment=alignment,
+            start_covariance=alignment.added_to(covariance[:, :n, :n], "coefficients"),
             end_covariance=alignment.added_to(end_covariance, "end_state"),
-            innovation_covariance=innovation_covariance,
-            nis=nis,
-            alignment=alignment,
-        )
+            innovation_covariance=innovation_covariance, nis=nis,
+        )  # fmt: skip
 
 
 def _bent(

@@ -70,12 +70,9 @@ class Driver:
     """
 
     def __init__(
-        self,
-        rig: Rig,
-        names: Sequence[str],
-        engine: Engine = "aolink",
+        self, rig: Rig, names: Sequence[str], engine: Engine = "aolink",
         skipped: Mapping[str, Container[int]] | None = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self.rig = rig
         self.estimators = [make_estimator(rig, name, engine=engine) for name in names]
         self._skipped = skipped or {}

@@ -155,11 +155,8 @@ class Estimate:
     def path_covariance(self, outputs: Sequence[int] | None = None) -> FloatArray:
         """Covariance of the path over its fast steps, slope units squared.
 
-        Parameters
-        ----------
-        outputs:
-            Numbers of the outputs wanted, such as those of one spot's x and y. All of them by default: with many
-            outputs that is a very large matrix.
+        ``outputs`` are the numbers of those wanted, such as those of one spot's x and y. All of them by default: with
+        many outputs that is a very large matrix.
 
         Returns
         -------

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +14,7 @@ from aolink.estimation.batch import Batch
 from aolink.estimation.estimate import Estimate, Status, as_recorded
 from aolink.estimation.frames.measure import MeasuredFrame, Measurements
 from aolink.estimation.kalman.filter import Filter, Posterior, Run
+from aolink.estimation.model.base import ExposureModel
 from aolink.exposure import Exposure
 from aolink.rig import Rig
 
@@ -20,14 +22,8 @@ from aolink.rig import Rig
 class Estimator:
     """One estimator on one rig: exposures in, estimates out, in the order in which they come.
 
-    It has no clock and does no input or output: the same exposures give the same estimates, bit for bit.
-
-    Parameters
-    ----------
-    name:
-        Name that the estimates have.
-    filter:
-        The filter of this rig, such as a `BlurFilter`.
+    It has no clock and does no input or output: the same exposures give the same estimates, bit for bit. Estimates have
+    its ``name``; ``filter`` is that of this rig, such as a `BlurFilter`.
     """
 
     def __init__(self, rig: Rig, name: str, filter: Filter) -> None:
@@ -39,7 +35,9 @@ class Estimator:
         """The filter's last posterior, of an exposure that it took by itself."""
         self._next_step: int | None = None
         self._last_input = np.zeros(rig.n_inputs)
-        self._considering: _Considering | None = None
+        self._copies: tuple[float, list[tuple[Estimator, Shifted]]] | None = None
+        # From the first exposure on that needs them, copies with inputs of later and of earlier fast steps, with the
+        # share of a standard deviation in their shift.
 
     @property
     def shared(self) -> list[object]:
@@ -53,16 +51,24 @@ class Estimator:
 
     def steps(self, batch: Batch) -> Iterator[Estimate]:
         """The estimates of a batch of exposures, one after the other, the same bits as by `step`."""
-        if self._considering is None:
+        step_ns = self.rig.timing.fast_step_ns
+        if self._copies is None:
             for k, exposure in enumerate(batch.exposures):
-                if matters(exposure, self.rig.timing.fast_step_ns):
+                if matters(exposure, step_ns):
                     if k:
                         yield from self.steps_as_aligned(Batch(self.rig, batch.exposures[:k]))
                         batch = Batch(self.rig, batch.exposures[k:])
-                    self._considering = _Considering(self, exposure)
+                    share, shared = share_of_shift(exposure, step_ns), {id(part): part for part in self.shared}
+                    both = [(copy.deepcopy(self, dict(shared)), Shifted(each, step_ns)) for each in (share, -share)]
+                    self._copies = share, both
                     break
         made = self.steps_as_aligned(batch)
-        yield from made if self._considering is None else self._considering.estimates(batch, made)
+        if self._copies is None:
+            yield from made
+            return
+        share, both = self._copies
+        later, earlier = (each.steps(Batch(self.rig, list(map(shifted, batch.exposures)))) for each, shifted in both)
+        yield from considered(batch.exposures, made, later, earlier, share, step_ns)
 
     def steps_as_aligned(self, batch: Batch) -> Iterator[Estimate]:
         """`steps` as if the exposures' alignment had no error."""
@@ -100,30 +106,18 @@ class Estimator:
     def _run_estimates(self, batch: Batch, first: int, done: Run) -> Iterator[Estimate]:
         """The estimates of exposures that the filter took at once."""
         assert batch.model is not None
-        exposures = batch.exposures[first : first + len(done.nis)]
-        for exposure, state, covariance, end, end_covariance, innovation, S, nis in zip(
-            exposures, done.coefficients, done.covariance, done.end, done.end_covariance, done.innovation,
-            done.innovation_covariance, done.nis, strict=True,
-        ):  # fmt: skip
-            yield Estimate(
-                estimator=self.name,
-                frame_id=exposure.frame_id,
-                first_step=exposure.first_step,
-                n_steps=exposure.n_steps,
-                status=Status.OK,
-                reason="",
-                start_state=state,
-                start_covariance=covariance,
-                end_state=end,
-                end_covariance=end_covariance,
-                coefficients=state,
-                coefficient_covariance=covariance,
-                inputs=exposure.inputs,
-                model=batch.model,
-                innovation=innovation,
-                innovation_covariance=S,
-                nis=nis,
-            )
+        for exposure, *arrays in zip(batch.exposures[first : first + len(done.nis)], *done, strict=True):
+            own = Run(*arrays)
+            yield self._estimate(
+                exposure, batch.model, status=Status.OK, reason="", coefficients=own.start_state,
+                coefficient_covariance=own.start_covariance, **own._asdict(),
+            )  # fmt: skip
+
+    def _estimate(self, exposure: Exposure, model: ExposureModel, **results: Any) -> Estimate:
+        return Estimate(
+            estimator=self.name, frame_id=exposure.frame_id, first_step=exposure.first_step, n_steps=exposure.n_steps,
+            inputs=exposure.inputs, model=model, **results,
+        )  # fmt: skip
 
     def _stepped(self, batch: Batch, k: int, measured: MeasuredFrame) -> Estimate:
         """The estimate of exposure k, which may have gaps and flaws."""
@@ -131,31 +125,17 @@ class Estimator:
         reasons = self._bridge(exposure, batch.finite[k])
         taken, remark = measured
         posterior = self.filter.step(model, batch.response_to(k), taken)
-        self.several = posterior.several
-        self.posterior = posterior
+        self.several, self.posterior = posterior.several, posterior
         reasons = [*([remark] if remark else []), *reasons, *_status_reasons(posterior)]
         coefficients, n = posterior.coefficients.mean, self.rig.plant.n_states
         covariance = as_recorded(posterior.coefficients.covariance)
-        return Estimate(
-            estimator=self.name,
-            frame_id=exposure.frame_id,
-            first_step=exposure.first_step,
-            n_steps=exposure.n_steps,
-            status=_worst(posterior.status),
-            reason="; ".join(reasons),
-            start_state=posterior.start.mean,
-            start_covariance=covariance[:, :n, :n],
-            end_state=posterior.end.mean,
-            end_covariance=as_recorded(posterior.end.covariance),
-            coefficients=coefficients,
-            coefficient_covariance=covariance,
-            inputs=exposure.inputs,
-            model=model,
-            innovation=posterior.innovation,
-            innovation_covariance=posterior.innovation_covariance,
-            nis=posterior.nis,
-            components=posterior.components,
-        )
+        return self._estimate(
+            exposure, model, status=_worst(posterior.status), reason="; ".join(reasons),
+            start_state=posterior.start.mean, start_covariance=covariance[:, :n, :n], end_state=posterior.end.mean,
+            end_covariance=as_recorded(posterior.end.covariance), coefficients=coefficients,
+            coefficient_covariance=covariance, innovation=posterior.innovation,
+            innovation_covariance=posterior.innovation_covariance, nis=posterior.nis, components=posterior.components,
+        )  # fmt: skip
 
     def _bridge(self, exposure: Exposure, finite: bool) -> list[str]:
         """Predict to the start of an exposure; returns reasons to doubt its step numbers or inputs.
@@ -176,27 +156,6 @@ class Estimator:
         self._next_step = exposure.first_step + exposure.n_steps
         self._last_input = exposure.inputs[-1]
         return reasons
-
-
-class _Considering:
-    """Two copies of an estimator with inputs of other fast steps, from the first exposure on that needs them."""
-
-    def __init__(self, estimator: Estimator, first: Exposure) -> None:
-        rig = self._rig = estimator.rig
-        step_ns = rig.timing.fast_step_ns
-        self._share = share_of_shift(first, step_ns)
-        shared = {id(part): part for part in estimator.shared}
-        self._copies = [
-            (copy.deepcopy(estimator, dict(shared)), Shifted(share, step_ns)) for share in (self._share, -self._share)
-        ]
-
-    def estimates(self, batch: Batch, made: Iterator[Estimate]) -> Iterator[Estimate]:
-        """The estimates of a batch, with the error of the alignment."""
-        later, earlier = (
-            each.steps(Batch(self._rig, [shifted(exposure) for exposure in batch.exposures]))
-            for each, shifted in self._copies
-        )
-        return considered(batch.exposures, made, later, earlier, self._share, self._rig.timing.fast_step_ns)
 
 
 # From good to bad; an estimate has the worst status of its axes.

@@ -71,10 +71,8 @@ def with_exposure(rig: Rig, exposure_steps: int) -> Rig:
 def exposure_scan(rig: Rig, steps: Iterable[int] | None = None) -> list[ExpectedError]:
     """Expected errors of o1 over exposure times in fast steps, `candidates` where None.
 
-    Raises
-    ------
-    EstimatorError
-        The plant has too many outputs or states, or an undamped mode that the centroid does not observe.
+    Raises `EstimatorError` where the plant has too many outputs or states, or an undamped mode that the centroid does
+    not observe.
     """
     if rig.plant.n_outputs > _MOST_OUTPUTS:
         raise EstimatorError(f"an exposure scan takes {_MOST_OUTPUTS} outputs at most, {rig.name} has more")

@@ -28,8 +28,8 @@ from aolink.plant.alike import alike_systems
 from aolink.rig import Rig
 
 
-def _blur_filter(rig: Rig, options: Options, observation: Observation[Any] | None) -> BlurFilter:
-    return BlurFilter(rig.plant, observation, process_noise=options.process_noise, gate=options.gate)
+def _blur_filter(rig: Rig, options: Options, observation: Observation[Any] | None, **more: Any) -> BlurFilter:
+    return BlurFilter(rig.plant, observation, process_noise=options.process_noise, gate=options.gate, **more)
 
 
 def open_loop(rig: Rig, options: Options) -> Filter:
@@ -41,9 +41,7 @@ def paper(rig: Rig, options: Options, *orders: int) -> Filter:
     gain = _steady_gain(rig, options) if orders == (1,) and options.gain == "steady-state" else None
     if options.engine == "filterpy":
         theirs = FilterpyMoments(rig.plant, orders, gain, flux=options.flux)
-        return BlurFilter(
-            rig.plant, theirs, process_noise=options.process_noise, gate=options.gate, predictor=theirs.predict
-        )
+        return _blur_filter(rig, options, theirs, predictor=theirs.predict)
     if options.second_order and 2 in orders:
         if rig.plant.n_outputs > 2:
             raise EstimatorError(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal, get_args
+from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from aolink.errors import EstimatorError
 from aolink.estimation.frames.frame_data import Flux
@@ -22,7 +22,7 @@ _MOST_DRAWS = 400
 class Options:
     """Choices that the paper leaves open."""
 
-    gain: str = "steady-state"
+    gain: Literal["steady-state", "time-varying"] = "steady-state"
     """The gain of o1: "steady-state", or "time-varying", which a plant without a steady-state gain always gets."""
     process_noise: Noise = "lifted"
     """Noise that an exposure adds to the state: "lifted", or "printed" for the paper's B_w W B_w'."""
@@ -93,15 +93,8 @@ def checked_options(**options: Any) -> Options:
         if key not in _NAMES:
             raise EstimatorError(f"estimators have no option {key!r}: use {', '.join(_NAMES)}")
     chosen = Options(**options)
-    choices = {
-        "gain": ("steady-state", "time-varying"),
-        "process_noise": get_args(Noise),
-        "flux": get_args(Flux),
-        "basis": get_args(Basis),
-        "engine": get_args(Engine),
-    }
-    for key, values in choices.items():
-        if getattr(chosen, key) not in values:
+    for key, kind in get_type_hints(Options).items():
+        if get_origin(kind) is Literal and getattr(chosen, key) not in (values := get_args(kind)):
             raise EstimatorError(f"{key} = {getattr(chosen, key)!r} is not known: use one of {', '.join(values)}")
     if chosen.tempered is not None and chosen.tempered != 0 and chosen.tempered < _FEWEST_TEMPERED:
         raise EstimatorError(

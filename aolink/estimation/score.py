@@ -6,7 +6,7 @@ import itertools
 import math
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -63,13 +63,9 @@ class UnusedCounter:
             return
         # Reasons hold numbers, such as a NIS, that differ from frame to frame.
         key = (status.name, _NUMBER.sub("#", reason))
-        before = self._found.get(key)
-        self._found[key] = Unused(
-            exposures=before.exposures + 1 if before else 1,
-            status=status.name,
-            reason=before.reason if before else reason,
-            first_frame=before.first_frame if before else frame_id,
-        )
+        first = Unused(exposures=0, status=status.name, reason=reason, first_frame=frame_id)
+        before = self._found.get(key, first)
+        self._found[key] = replace(before, exposures=before.exposures + 1)
 
     def result(self) -> tuple[Unused, ...]:
         """The counts so far, the most frequent first."""
@@ -157,19 +153,13 @@ class Scorer:
     def result(self) -> Score:
         """The score of what was added so far."""
         return Score(
-            exposures=self._exposures,
-            estimated=self._estimated,
-            measured=self._measured,
-            looks=self._looks,
-            unused=self._unused.result(),
-            gated=self._gated,
-            start_rmse=math.sqrt(self._start.mean),
-            end_rmse=math.sqrt(self._end.mean),
-            path_rmse=math.sqrt(self._path.mean),
+            exposures=self._exposures, estimated=self._estimated, measured=self._measured, looks=self._looks,
+            unused=self._unused.result(), gated=self._gated, start_rmse=math.sqrt(self._start.mean),
+            end_rmse=math.sqrt(self._end.mean), path_rmse=math.sqrt(self._path.mean),
             nis=_consistency(self._nis, self._measurements),
             start_nees=_consistency(self._start_nees, self._states),
             end_nees=_consistency(self._end_nees, self._states),
-        )
+        )  # fmt: skip
 
 
 def score(exposures: Sequence[Exposure], estimates: Sequence[Estimate], skip: int = 0) -> Score:

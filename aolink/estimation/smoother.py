@@ -82,9 +82,7 @@ def _backward(plant: Plant, exposures: Sequence[Exposure], estimates: Sequence[E
     return smoothed[::-1]
 
 
-def _through_mixtures(
-    plant: Plant, exposures: Sequence[Exposure], estimates: Sequence[Estimate]
-) -> list[Estimate]:  # fmt: skip
+def _through_mixtures(plant: Plant, exposures: Sequence[Exposure], estimates: Sequence[Estimate]) -> list[Estimate]:
     """Each estimate corrected by backward simulation, for estimates with components."""
     from aolink.estimation.pixels.backward import Next, Smoothed, smoothed  # its imports take long
 
@@ -128,9 +126,7 @@ def _corrected(
     # A state that is known for certain has no inverse, and needs none.
     inverse: FloatArray = np.linalg.pinv(spread, hermitian=True).astype(np.float64)
 
-    def corrected(
-        mean: FloatArray, covariance: FloatArray, gain: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:  # fmt: skip
+    def corrected(mean: FloatArray, covariance: FloatArray, gain: FloatArray) -> tuple[FloatArray, FloatArray]:
         after = batched.symmetric(covariance + batched.congruence(gain, change))
         return mean + batched.matvec(gain, innovation), _without_negative(after)
 

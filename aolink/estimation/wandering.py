@@ -50,15 +50,7 @@ _MET = 0.01
 class WanderingEstimator(Estimator):
     """One estimator on a rig with ``plant.wandering``.
 
-    Parameters
-    ----------
-    make:
-        Makes the estimator for a rig.
-
-    Raises
-    ------
-    EstimatorError
-        The plant cannot run faster or slower.
+    ``make`` makes the estimator for a rig. Raises `EstimatorError` where the plant cannot run faster or slower.
     """
 
     def __init__(self, rig: Rig, make: Callable[[Rig], Estimator]) -> None:

@@ -100,36 +100,23 @@ def arrays(
     ``input``; ``axis``, ``state`` and ``output`` of the plant; ``estimator``. ``lead_inputs`` are those of the steps
     between exposures, end to end along ``lead_step``: ``lead_steps`` says how many belong to each exposure, before it.
     Frames of a picture sensor are ``scene``. Variables of a truth, or of estimates, are there if any exposure has one;
-    where one exposure has none, numbers are NaN and texts empty.
-
-    Parameters
-    ----------
-    estimators:
-        Estimators whose estimates are exported; all by default.
-
-    Raises
-    ------
-    RecordingError
-        There are no estimates of such a name.
-    ExportError
-        There is no exposure, the exposures have different sizes, or the arrays would be too large for the memory.
+    where one exposure has none, numbers are NaN and texts empty. Estimates of ``estimators`` are exported;
+    by default of all. Raises `RecordingError` where there are no estimates of such a name; `ExportError` where
+    there is no exposure, the exposures have different sizes, or the arrays would be too large for the memory.
     """
     names = series.named(estimators)
     _check_size(series, len(names))
     columns: dict[str, list[Any]] = {name: [] for name in (*EXPOSURE, *TRUTH)}
     by_estimator: dict[str, list[list[Any]]] = {name: [[] for _ in names] for name in ESTIMATE}
-    times: list[int] = []
-    leads, scenes, slopes = [], [], []
+    rest: list[tuple[int, Any, Any, Any]] = []
     first: Exposure | None = None
     clock = ""
     for exposure, estimates in together(series, names, progress):
         if first is None:
             first, clock = exposure, clock_of(exposure)
         _check_alike(series, first, exposure)
-        times.append(time_ns(series, exposure, clock))
-        leads.append(exposure.lead_inputs)
-        scenes.append(exposure.scene)
-        slopes.append(exposure.slopes)
+        time = time_ns(series, exposure, clock)
+        rest.append((time, exposure.lead_inputs, exposure.scene, exposure.slopes))
         for name, row in EXPOSURE.items():
             columns[name].append(row.of(name, exposure))
         for name, row in TRUTH.items():
@@ -137,6 +124,7 @@ def arrays(
         for name, row in ESTIMATE.items():
             for column, estimate in zip(by_estimator[name], estimates, strict=True):
                 column.append(None if estimate is None else row.of(name, estimate))
+    times, leads, scenes, slopes = zip(*rest, strict=True)
     found = {
         "time": Variable(
             dims=("time",), values=np.array(times).astype("datetime64[ns]"),

@@ -23,17 +23,15 @@ _ROWS_AT_ONCE = 4096
 
 
 def export(
-    series: Series,
-    path: str | Path,
-    estimators: Sequence[str] | None = None,
-    *,
-    overwrite: bool = False,
+    series: Series, path: str | Path, estimators: Sequence[str] | None = None, *, overwrite: bool = False,
     progress: Progress = no_progress,
-) -> None:
+) -> None:  # fmt: skip
     """Write exposures and their estimates into a file of another program's format, which its suffix selects.
 
     ``.npz``, ``.nc`` (NetCDF) and ``.fits`` (AOT telemetry) hold everything of `arrays`; ``.parquet`` and ``.csv`` the
-    table of `aolink.exporting.table`, the former with inputs and paths as lists.
+    table of `aolink.exporting.table`, the former with inputs and paths as lists. Raises `RecordingError` where there
+    are no estimates of such a name; `ExportError` where the suffix is not known, a package is missing, the file exists
+    and not ``overwrite``, or cannot be written; there is no exposure, or the format cannot hold them (`arrays`).
 
     Parameters
     ----------
@@ -43,14 +41,6 @@ def export(
         Estimators whose estimates are exported; all by default.
     progress:
         Called with the number of exposures read.
-
-    Raises
-    ------
-    RecordingError
-        There are no estimates of such a name.
-    ExportError
-        The suffix is not known, a package is missing, the file exists and not ``overwrite``, or cannot be written;
-        there is no exposure, or the format cannot hold them (`arrays`).
     """
     path = Path(path)
     if (write := WRITERS.get(path.suffix.lower())) is None:
@@ -90,12 +80,9 @@ def _write_parquet(series: Series, names: Sequence[str], path: Path, progress: P
     pyarrow = needed("pyarrow", "parquet", "Parquet (.parquet)")
     parquet = needed("pyarrow.parquet", "parquet", "Parquet (.parquet)")
     types = {
-        "text": pyarrow.string(),
-        "integer": pyarrow.int64(),
-        "number": pyarrow.float64(),
-        "time": pyarrow.timestamp("ns", "UTC"),
-        "numbers": pyarrow.list_(pyarrow.float64()),
-    }
+        "text": pyarrow.string(), "integer": pyarrow.int64(), "number": pyarrow.float64(),
+        "time": pyarrow.timestamp("ns", "UTC"), "numbers": pyarrow.list_(pyarrow.float64()),
+    }  # fmt: skip
     known = [(column.name, types[column.kind]) for column in columns(series, names, lists=True)]
     schema = pyarrow.schema(known, metadata=facts(series) | {"rig_toml": series.rig.toml})
     left = rows(series, names, lists=True, progress=progress)
@@ -105,10 +92,6 @@ def _write_parquet(series: Series, names: Sequence[str], path: Path, progress: P
 
 
 WRITERS: dict[str, Callable[[Series, Sequence[str], Path, Progress], None]] = {
-    ".npz": _write_npz,
-    ".csv": _write_csv,
-    ".parquet": _write_parquet,
-    ".nc": _write_netcdf,
-    ".fits": write_fits,
-}
+    ".npz": _write_npz, ".csv": _write_csv, ".parquet": _write_parquet, ".nc": _write_netcdf, ".fits": write_fits,
+}  # fmt: skip
 """Functions that write a format, by the suffix of the file."""

@@ -38,13 +38,8 @@ def columns(series: Series, names: Sequence[str], *, lists: bool = False) -> lis
     `Exposure`) and its ``axis``. For that axis it has the mean of each input (``input_1_mean``, ...), the states
     (``x1``, ...) at both ends with their standard deviations, the mean of each output's path (``path_1_mean``), the RMS
     of the path about these means (``path_rms``), of its standard deviation (``path_sd_rms``) and, where the truth is
-    known, of its error (``path_error_rms``); ``status``, ``reason`` and ``nis``.
-
-    Parameters
-    ----------
-    lists:
-        Whether to add the axis's inputs (steps x inputs), paths and their standard deviations (outputs x steps) as
-        lists.
+    known, of its error (``path_error_rms``); ``status``, ``reason`` and ``nis``. ``lists`` says whether to add the
+    axis's inputs (steps x inputs), paths and their standard deviations (outputs x steps) as lists.
     """
     plant = series.rig.plant
     inputs, states = range(1, plant.n_inputs + 1), range(1, plant.n_states + 1)
@@ -82,18 +77,13 @@ def rows(
     for exposure, estimates in together(series, names, progress):
         clock = clock_of(exposure) if clock is None else clock
         shared = {
-            "recording": series.path.name,
-            "rig": series.rig.name,
-            "time": time_ns(series, exposure, clock),
+            "recording": series.path.name, "rig": series.rig.name, "time": time_ns(series, exposure, clock),
             "lead_steps": len(exposure.lead_inputs),
-        } | {name: getattr(exposure, name) for name in _OF_EXPOSURE}
+        } | {name: getattr(exposure, name) for name in _OF_EXPOSURE}  # fmt: skip
         inputs = exposure.inputs.reshape(exposure.n_steps, plant.axes, -1).swapaxes(0, 1)
         truth = {} if exposure.truth is None else _of_truth(exposure.truth, plant.axes, lists)
-        of_each = [
-            (name, _of_estimate(estimate, exposure, lists))
-            for name, estimate in zip(names, estimates, strict=True)
-            if estimate is not None
-        ]
+        made = zip(names, estimates, strict=True)
+        of_each = [(name, _of_estimate(each, exposure, lists)) for name, each in made if each is not None]
         for axis in range(plant.axes):
             row = shared | {"axis": axis}
             row |= {f"input_{j}_mean": mean for j, mean in enumerate(inputs[axis].mean(axis=0).tolist(), 1)}
@@ -122,10 +112,7 @@ def _of_truth(truth: Truth, axes: int, lists: bool) -> dict[str, ByAxis]:
 def _of_estimate(estimate: Estimate, exposure: Exposure, lists: bool) -> dict[str, ByAxis]:
     """The values of an estimate for each axis, by column."""
     axes = len(estimate.start_state)
-    found: dict[str, ByAxis] = {
-        "status": [estimate.status.name] * axes,
-        "reason": [estimate.reason] * axes,
-    }
+    found: dict[str, ByAxis] = {"status": [estimate.status.name] * axes, "reason": [estimate.reason] * axes}
     for end, states, covariance in (
         ("start", estimate.start_state, estimate.start_covariance),
         ("end", estimate.end_state, estimate.end_covariance),

@@ -60,10 +60,7 @@ def _system(aot: Any, series: Series, found: Mapping[str, Variable]) -> Any:
     telescope = aot.MainTelescope(uid="NONE")  # AOT requires a telescope, and a source
     source = aot.NaturalGuideStar(uid="SPOT")
     sensor, pixels = rig.sensor, found["pixels"].values
-    if "slopes" in found:
-        slopes = found["slopes"].values
-    else:
-        slopes = _centres(sensor, pixels, found["mask"].values)
+    slopes = found["slopes"].values if "slopes" in found else _centres(sensor, pixels, found["mask"].values)
     # As the format has them, (frames, 2, spots); NaN where there is no second direction.
     centres = np.full((len(slopes), 2, sensor.spots), np.nan)
     centres[:, : sensor.directions] = slopes.reshape(len(slopes), sensor.spots, -1).swapaxes(1, 2)
@@ -76,16 +73,12 @@ def _system(aot: Any, series: Series, found: Mapping[str, Variable]) -> Any:
         frame_rate=1 / (rig.timing.frame_period_steps * step_s),
     )
     wavefront_sensor = aot.ShackHartmann(
-        uid="SENSOR",
-        source=source,
-        n_valid_subapertures=sensor.spots,
+        uid="SENSOR", source=source, n_valid_subapertures=sensor.spots, detector=camera,
         measurements=aot.Image("CENTRES_OF_GRAVITY", centres, unit="slope unit", time=frames),
-        subaperture_mask=aot.Image("SUBAPERTURES", grid),
-        mask_offsets=[aot.Coordinates(0, 0)],
+        subaperture_mask=aot.Image("SUBAPERTURES", grid), mask_offsets=[aot.Coordinates(0, 0)],
         subaperture_size=float(sensor.profile.pixels) if sensor.directions == 2 else None,
-        detector=camera,
         centroiding_algorithm=None if "slopes" in found else "centre of gravity of the window",
-    )
+    )  # fmt: skip
     mirrors = {1: aot.LinearStage, 2: aot.TipTiltMirror}
     sized = {} if rig.n_inputs in mirrors else {"n_valid_actuators": rig.n_inputs}
     mirror = mirrors.get(rig.n_inputs, aot.DeformableMirror)(uid="MIRROR", telescope=telescope, **sized)
@@ -94,24 +87,19 @@ def _system(aot: Any, series: Series, found: Mapping[str, Variable]) -> Any:
     of_exposure = np.repeat(np.arange(len(times)), found["lead_steps"].values + found["n_steps"].values)
     stamps = begun[of_exposure] + (steps - found["first_step"].values[of_exposure]) * step_s
     loop = aot.ControlLoop(
-        uid="LOOP",
-        commanded_corrector=mirror,
-        input_sensor=wavefront_sensor,
+        uid="LOOP", commanded_corrector=mirror, input_sensor=wavefront_sensor, closed=False, framerate=1 / step_s,
         commands=aot.Image("COMMANDS", commands, unit="input unit"),
         time=aot.Time(uid="FAST_STEPS", timestamps=stamps.tolist(), frame_numbers=steps.tolist()),
-        closed=False,
-        framerate=1 / step_s,
-    )
+    )  # fmt: skip
     cameras = []
     if "scene" in found:
         scene = aot.Detector(uid="SCENE", pixel_intensities=aot.Image("SCENE", found["scene"].values, "adu", frames))
         cameras.append(aot.ScoringCamera(uid="SCENE_CAMERA", detector=scene))
     first, last = (datetime.fromtimestamp(float(each), UTC) for each in (begun[0], begun[-1]))
     return aot.AOSystem(
-        ao_mode="SCAO", name=_header_text(rig.name), config=_header_text(rig.summary),
-        date_beginning=first, date_end=last,
-        main_telescope=telescope, sources=[source], scoring_cameras=cameras, wavefront_sensors=[wavefront_sensor],
-        wavefront_correctors=[mirror], loops=[loop],
+        ao_mode="SCAO", name=_header_text(rig.name), config=_header_text(rig.summary), date_beginning=first,
+        date_end=last, main_telescope=telescope, sources=[source], scoring_cameras=cameras,
+        wavefront_sensors=[wavefront_sensor], wavefront_correctors=[mirror], loops=[loop],
     )  # fmt: skip
 
 

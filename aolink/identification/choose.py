@@ -46,13 +46,8 @@ class Tried:
 
 
 def tried(name: str, space: Callable[[Sequence[str]], Space], seen: Sequence[Readings]) -> Tried:
-    """Fit a sum of kinds to halves of recordings, and score it on the other halves.
-
-    Parameters
-    ----------
-    space:
-        A function that gives the parameters of the kinds.
-    """
+    """Fit a sum of kinds to halves of recordings, and score it on the other halves; ``space`` gives the parameters of
+    the kinds."""
     if all(each.slots < 2 * FEWEST for each in seen):
         raise IdentificationError(
             f"{max(each.slots for each in seen)} exposures are too short a recording to choose a model with, which is"

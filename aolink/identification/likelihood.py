@@ -18,7 +18,6 @@ Sums over the steps of an exposure are Gauss's quadrature.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -56,25 +55,20 @@ class ShortRuns:
 
     usable: BoolArray
     """(L,)"""
+    output: np.ndarray[tuple[int], np.dtype[np.int64]]
+    """The output of each run."""
     mean: FloatArray
     square: FloatArray
     square_noise: FloatArray
     centre: FloatArray
     response: FloatArray
     """Response to the inputs at the nodes, (runs, L, nodes)."""
-    output: np.ndarray[tuple[int], np.dtype[np.int64]]
-    """The output of each run."""
 
 
 class Likelihood:
-    """Log-likelihood of readings, for many models one after the other.
+    """Log-likelihood of readings, for many models one after the other, by short runs of ``length`` exposures.
 
-    Parameters
-    ----------
-    seen:
-        The readings; all outputs have one model, of which each output is an independent draw.
-    length:
-        Exposures in a short run.
+    All outputs of the readings have one model, of which each output is an independent draw.
     """
 
     def __init__(self, seen: Readings, length: int) -> None:
@@ -95,14 +89,8 @@ class Likelihood:
     ) -> float:
         """Log-likelihood, -inf where the model gives no valid covariance.
 
-        Parameters
-        ----------
-        noise:
-            Factor of the pixels' noise variance.
-        wider:
-            The kernel's variance less the rig file's, slope units squared.
-        nodes:
-            Nodes in an exposure; `nodes` of the model where None.
+        ``noise`` is the factor of the pixels' noise variance, ``wider`` the kernel's variance less the rig file's,
+        slope units squared, ``nodes`` the number in an exposure; `nodes` of the model where None.
         """
         return float(self.of_outputs(model, noise, wider, nodes).sum())
 
@@ -136,33 +124,30 @@ class Likelihood:
 
     def _in_short_runs(self, nodes: int) -> list[ShortRuns]:
         if nodes not in self._short_runs:
-            rows, _ = self._rule(nodes)
-            seen, L = self.seen, self.length
+            seen, (rows, _) = self.seen, self._rule(nodes)
             response = seen.response[:, :, :-1] @ rows.T
-            patterns: dict[bytes, list[tuple[int, slice]]] = {}
-            for o in range(len(seen.mean)):
-                for first in range(0, seen.slots, L):
-                    some = slice(first, min(first + L, seen.slots))
-                    if seen.usable[o, some].any():
-                        patterns.setdefault(seen.usable[o, some].tobytes(), []).append((o, some))
+            several = (seen.mean, seen.square, seen.square_noise, seen.centre, response)
             self._short_runs[nodes] = [
                 ShortRuns(
-                    usable=seen.usable[where[0]],
-                    mean=_taken(seen.mean, where),
-                    square=_taken(seen.square, where),
-                    square_noise=_taken(seen.square_noise, where),
-                    centre=_taken(seen.centre, where),
-                    response=_taken(response, where),
-                    output=np.array([o for o, _ in where]),
+                    seen.usable[w[0]], np.array([o for o, _ in w]), *(np.array([x[at] for at in w]) for x in several)
                 )
-                for where in patterns.values()
+                for w in self._alike(self.length)
             ]
         return self._short_runs[nodes]
 
+    def _alike(self, length: int) -> list[list[tuple[int, slice]]]:
+        """Runs of exposures, as output and slots, those with the same usable exposures together."""
+        seen, patterns = self.seen, dict[bytes, list[tuple[int, slice]]]()
+        for o in range(len(seen.mean)):
+            for first in range(0, seen.slots, length):
+                some = slice(first, min(first + length, seen.slots))
+                if seen.usable[o, some].any():
+                    patterns.setdefault(seen.usable[o, some].tobytes(), []).append((o, some))
+        return list(patterns.values())
+
     def _of_means(self, model: DisturbanceProcesses, nodes: int, noise: float, out: FloatArray) -> FloatArray:
         """Add the log-density of each output's means to ``out``; the constants of the outputs that make it largest."""
-        rows, weights = self._rule(nodes)
-        seen = self.seen
+        seen, (rows, weights) = self.seen, self._rule(nodes)
         at = np.asarray(rows @ np.arange(float(seen.n_steps))) * seen.step_s
         run = min(_LONG_RUN, seen.slots)
         begin = np.arange(float(run)) * (seen.period_steps * seen.step_s)
@@ -199,25 +184,17 @@ class Likelihood:
     def _in_long_runs(self, nodes: int, run: int) -> list[tuple[BoolArray, Indices, FloatArray]]:
         """The means without the inputs' response in long runs: usable (run,), outputs (runs,), means (runs, good)."""
         if nodes not in self._means:
-            rows, weights = self._rule(nodes)
-            seen = self.seen
+            seen, (rows, weights) = self.seen, self._rule(nodes)
             y = seen.mean + seen.centre - (seen.response[:, :, :-1] @ rows.T) @ weights
-            patterns: dict[bytes, list[tuple[int, slice]]] = {}
-            for o in range(len(y)):
-                for first in range(0, seen.slots, run):
-                    some = slice(first, min(first + run, seen.slots))
-                    if seen.usable[o, some].any():
-                        patterns.setdefault(seen.usable[o, some].tobytes(), []).append((o, some))
             self._means[nodes] = [
                 (seen.usable[where[0]], np.array([o for o, _ in where]),
                  np.array([y[each][seen.usable[each]] for each in where]))
-                for where in patterns.values()
+                for where in self._alike(run)
             ]  # fmt: skip
         return self._means[nodes]
 
     def _given_means(self, model: DisturbanceProcesses, nodes: int, usable: BoolArray, noise: float) -> _GivenMeans:
-        rows, weights = self._rule(nodes)
-        seen = self.seen
+        seen, (rows, weights) = self.seen, self._rule(nodes)
         at = np.asarray(rows @ np.arange(float(seen.n_steps))) * seen.step_s
         begin = np.arange(float(len(usable))) * (seen.period_steps * seen.step_s)
         table = _stationary(model, begin, at)
@@ -232,11 +209,6 @@ class Likelihood:
             with_means = with_means + walk * np.tensordot(weights, shared, axes=(0, 1))
             own = own + walk * np.einsum("jajb->jab", shared)
         return _GivenMeans(with_means, own, weights, usable, noise * self.mean_noise)
-
-
-def _taken(values: FloatArray, where: Sequence[tuple[int, slice]]) -> FloatArray:
-    """Stretches of equal length, each from one output, (stretches, ...)."""
-    return np.array([values[at] for at in where])
 
 
 def _stationary(model: DisturbanceProcesses, apart: FloatArray, at: FloatArray) -> FloatArray:
@@ -258,19 +230,12 @@ def _walk(model: DisturbanceProcesses) -> float:
 
 
 class _GivenMeans:
-    """The path in a short run of exposures, given its means over them.
-
-    Parameters
-    ----------
-    with_means:
-        Cov(y_i, path in exposure j), (L, L, nodes).
-    own:
-        Covariance of the path in each exposure, (L, nodes, nodes).
-    """
+    """The path in a short run of exposures, given its means over them, from ``with_means``, Cov(y_i, path in exposure
+    j), (L, L, nodes), and ``own``, the covariance of the path in each exposure, (L, nodes, nodes)."""
 
     def __init__(
         self, with_means: FloatArray, own: FloatArray, weights: FloatArray, usable: BoolArray, mean_noise: float
-    ) -> None:  # fmt: skip
+    ) -> None:
         self.weights, self.good = weights, np.flatnonzero(usable)
         over = with_means[np.ix_(self.good, self.good)]
         sigma = over @ weights
@@ -305,17 +270,8 @@ class _GivenMeans:
 
 
 def _shifted_gamma(e: FloatArray, variance: FloatArray, third: FloatArray, read: FloatArray) -> FloatArray:
-    """Log-density of a gamma variable, shifted to mean zero, with Gaussian noise.
-
-    Parameters
-    ----------
-    e:
-        Values, any shape.
-    variance, third:
-        Second and third cumulant of the gamma variable, the latter above zero.
-    read:
-        Variance of the noise.
-    """
+    """Log-density at e of a gamma variable, shifted to mean zero, with Gaussian noise of variance ``read``;
+    ``variance`` and ``third`` are the gamma variable's second and third cumulant, the latter above zero."""
     sd = np.sqrt(variance)
     skewness = np.clip(third / (variance * sd), _LEAST_SKEWNESS, _MOST_SKEWNESS)
     k = 4 / skewness**2

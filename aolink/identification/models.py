@@ -76,17 +76,8 @@ class Covariance(ABC):
         return np.asarray((self.shares * np.exp(self.poles * lag_s[..., None])).sum(axis=-1).real)
 
     def covariance_across(self, apart_s: FloatArray, at_s: FloatArray) -> FloatArray:
-        """Cov(theta(t + at_b), theta(t + apart + at_a)), where ``apart`` is more than all differences of ``at``.
-
-        Parameters
-        ----------
-        apart_s, at_s:
-            s, (m,) and (k,).
-
-        Returns
-        -------
-        (m, k, k), a first.
-        """
+        """Cov(theta(t + at_b), theta(t + apart + at_a)), (m, k, k), a first, for times (m,) and (k,), s; ``apart`` is
+        more than all differences of ``at``."""
         poles = self._tamed(at_s)
         inside = self.shares[:, None, None] * np.exp(poles[:, None, None] * (at_s[:, None] - at_s))
         return np.asarray(np.tensordot(np.exp(np.outer(apart_s, poles)), inside, axes=1).real)
@@ -137,8 +128,9 @@ class Process(Covariance):
             if name.endswith("correlation_s"):
                 found.append(complex(-1 / value))
             elif name.endswith("frequency_hz"):
-                damping = self[name.replace("frequency_hz", "damping")]
-                found += _pair(2 * math.pi * value, damping)
+                omega, damping = 2 * math.pi * value, self[name.replace("frequency_hz", "damping")]
+                root = omega * complex(damping**2 - 1) ** 0.5
+                found += [-omega * damping + root, -omega * damping - root]
         poles = np.array(found)
         for k in range(1, len(poles)):
             while np.abs(poles[k] - poles[:k]).min() < _APART * abs(poles[k]):
@@ -156,15 +148,9 @@ class Process(Covariance):
 
     @cached_property
     def shares(self) -> ComplexArray:
-        """The share of each pole in the stationary covariance, slope units squared: 1 / (a'(lambda) a(-lambda))."""
-        poles = self.poles
+        poles = self.poles  # shares are proportional to 1 / (a'(lambda) a(-lambda))
         shares = np.array([1 / (np.prod(p - np.delete(poles, k)) * np.prod(-p - poles)) for k, p in enumerate(poles)])
         return np.asarray(shares * (self.variance / shares.sum().real))
-
-
-def _pair(omega: float, damping: float) -> list[complex]:
-    root = omega * complex(damping**2 - 1) ** 0.5
-    return [-omega * damping + root, -omega * damping - root]
 
 
 @dataclass(frozen=True)
@@ -207,15 +193,8 @@ class ProcessSum:
         return all(process.is_stationary for process in self.processes)
 
     def state_space(self, step_s: float, start_variance: float = 0.0) -> StateSpace:
-        """The model sampled at the fast rate, exactly.
-
-        Parameters
-        ----------
-        step_s:
-            Fast step, s.
-        start_variance:
-            Variance of a random walk's start, slope units squared.
-        """
+        """The model sampled at the fast rate, exactly; ``start_variance`` is that of a random walk's start, slope units
+        squared."""
         parts = [_sampled(process, step_s, start_variance) for process in self.processes]
         A, W, P = (linalg.block_diag(*(part[k] for part in parts)) for k in (0, 1, 2))
         C = np.concatenate([np.eye(1, len(part[0])) for part in parts], axis=1)

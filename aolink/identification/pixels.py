@@ -199,21 +199,12 @@ def _frequencies(space: Space) -> list[int]:
 
 def by_pixels(
     found: Sequence[Candidate], rig_of: RigOf, exposures: Sequence[Exposure], tell: Tell = lambda done, of: None
-) -> list[Candidate]:  # fmt: skip
+) -> list[Candidate]:
     """The candidates that the pixels do not rule out, the one with the highest evidence first.
 
-    Where `profile` cannot work on the rig, or there is one candidate only, they are all returned in their order.
-
-    Parameters
-    ----------
-    found:
-        Candidates, in the order to keep where the pixels cannot decide.
-    rig_of:
-        A function that gives the rig with a candidate's parameters.
-    exposures:
-        The exposures of the recording, with pixels.
-    tell:
-        Called with the exposures that have been used, and how many there are.
+    Where `profile` cannot work on the rig, or there is one candidate only, they are all returned in their order, which
+    is also the one to keep where the pixels cannot decide. ``rig_of`` gives the rig with a candidate's parameters;
+    ``tell`` is called with the exposures, which have pixels, that have been used, and how many there are.
     """
     if len(found) < 2:
         return list(found)
@@ -240,7 +231,7 @@ def by_pixels(
 
 def refined(
     space: Space, x: FloatArray, rig_of: RigOf, exposures: Sequence[Exposure], tell: Tell = lambda done, of: None
-) -> FloatArray:  # fmt: skip
+) -> FloatArray:
     """Parameters in which damping and frequency of each vibration are where the pixels' evidence is highest.
 
     First the damping, then the frequency is moved to the vertex of the parabola through five evidences. Where `profile`

@@ -120,15 +120,16 @@ class Readings:
 
     def part(self, first: int, end: int) -> Readings:
         """The slots from ``first`` up to ``end``."""
-        some = slice(first, end)
-        names = ("mean", "square", "mean_noise", "square_noise", "centre", "usable", "response")
         steps = slice(first * self.period_steps, end * self.period_steps)
-        return replace(self, inputs=self.inputs[:, :, steps], **{name: getattr(self, name)[:, some] for name in names})
+        own = {name: getattr(self, name)[:, first:end] for name in _OF_SLOTS}
+        return replace(self, inputs=self.inputs[:, :, steps], **own)
 
     def of_outputs(self, which: Sequence[int]) -> Readings:
         """The readings of some of the outputs."""
-        names = ("mean", "square", "mean_noise", "square_noise", "centre", "usable", "response", "inputs")
-        return replace(self, **{name: getattr(self, name)[list(which)] for name in names})
+        return replace(self, **{name: getattr(self, name)[list(which)] for name in (*_OF_SLOTS, "inputs")})
+
+
+_OF_SLOTS = ("mean", "square", "mean_noise", "square_noise", "centre", "usable", "response")
 
 
 def readings(
@@ -174,10 +175,8 @@ def readings(
             density[:, k], mask[:, k] = found.density, found.mask
             if found.usable is not None:
                 mask[~np.repeat(found.usable, rig.plant.n_outputs), k] = False
-    if mask.any(axis=(0, 2)).sum() < FEWEST:
-        raise IdentificationError(
-            f"{int(mask.any(axis=(0, 2)).sum())} exposures show a spot, {FEWEST} or more are needed"
-        )
+    if (showing := int(mask.any(axis=(0, 2)).sum())) < FEWEST:
+        raise IdentificationError(f"{showing} exposures show a spot, {FEWEST} or more are needed")
     response = np.zeros((rig.n_outputs, slots, n_steps + 1))
     if plant_known:
         response = _response(rig, inputs, slots, n_steps, period, exposures[0].start_offset)
@@ -185,9 +184,8 @@ def readings(
     blank = Readings(
         step_s=rig.timing.fast_step_s, n_steps=n_steps, period_steps=period, mean=empty, square=empty,
         mean_noise=empty, square_noise=empty, centre=empty, usable=np.asarray(mask.any(axis=2)), response=response,
-        inputs=np.repeat(inputs, rig.plant.n_outputs, axis=0), offset=exposures[0].start_offset,
-        motion=0.0, follows=False,
-        reach=(rig.sensor.field[1] - rig.sensor.field[0]) / 2,
+        inputs=np.repeat(inputs, rig.plant.n_outputs, axis=0), offset=exposures[0].start_offset, motion=0.0,
+        follows=False, reach=(rig.sensor.field[1] - rig.sensor.field[0]) / 2,
     )  # fmt: skip
     seen = _lit(rig.sensor.profile, density, mask)
     variances = np.full(rig.n_outputs, rig.sensor.kernel.variance)
@@ -242,14 +240,11 @@ def _inputs(rig: Rig, exposures: Sequence[Exposure], steps: int) -> FloatArray:
     first = exposures[0].first_step
     u = np.full((steps, rig.n_inputs), np.nan)
     for each in exposures:
-        for start, values in (
-            (each.first_step - len(each.lead_inputs), each.lead_inputs),
-            (each.first_step, each.inputs),
-        ):
-            begin = max(start - first, 0)
-            end = min(start - first + len(values), steps)
-            if end > begin:
-                u[begin:end] = values[begin - (start - first) : end - (start - first)]
+        values = np.concatenate([each.lead_inputs, each.inputs])
+        start = each.first_step - len(each.lead_inputs) - first
+        begin, end = max(start, 0), min(start + len(values), steps)
+        if end > begin:
+            u[begin:end] = values[begin - start : end - start]
     known = np.isfinite(u).all(axis=1)
     held = np.maximum.accumulate(np.where(known, np.arange(steps), 0))
     u = np.nan_to_num(u[held])
@@ -290,7 +285,8 @@ def _measured(seen: _Seen, variances: FloatArray, blank: Readings) -> Readings:
     best = found
     for _ in range(_ROUNDS):
         place = best.mean + best.centre - expected  # the motion that the inputs do not explain
-        still = expected + _mean(place, best.usable)[:, None]
+        mean = (place * best.usable).sum(axis=1) / np.maximum(best.usable.sum(axis=1), 1)
+        still = expected + mean[:, None]
         follows = expected + before(place, best.usable)
         tried = [
             _at(seen, variances, blank, centre, _motion_about(sensor, best, centre))
@@ -302,10 +298,6 @@ def _measured(seen: _Seen, variances: FloatArray, blank: Readings) -> Readings:
         if abs(best.motion - last) < 0.02 * last:
             break
     return best
-
-
-def _mean(values: FloatArray, usable: BoolArray) -> FloatArray:
-    return np.asarray((values * usable).sum(axis=1) / np.maximum(usable.sum(axis=1), 1))
 
 
 def before(values: FloatArray, usable: BoolArray) -> FloatArray:

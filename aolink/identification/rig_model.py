@@ -87,8 +87,8 @@ def rig_model(rig: Rig, output: int) -> RigModel:
     driven = np.abs(np.diagonal(Q)) * np.abs(seen) ** 2 > 0
     if (driven & ~walks & (np.abs(mu) >= 1)).any():
         raise IdentificationError(
-            "the rig file's disturbance grows or rings without end: it has no stationary variance; give a"
-            " resonance a damping"
+            "the rig file's disturbance grows or rings without end: it has no stationary variance; give a resonance a"
+            " damping"
         )
     processes: list[Covariance] = []
     held = np.flatnonzero(driven & ~walks)

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from aolink.identification.models import IdentifiedPlant, Process, ProcessSum
+from aolink.identification.models import IdentifiedPlant, Process, ProcessSum, StateSpace
 from aolink.rig import Rig, parse_rig
 from aolink.rig.edit import with_tables, with_value
 
@@ -42,12 +42,9 @@ def identified_text(
     step = rig.timing.fast_step_s
     if plant is not None:
         space, B = plant.state_space(step)
-        values, vectors = np.linalg.eigh(space.W)
-        kept = values > values.max() * 1e-12
-        for key, value in (
-            ("A", _rows(space.A)), ("B", _rows(B)), ("B_w", _rows(vectors[:, kept])), ("C", _rows(space.C)),
-            ("process_noise", np.diag(values[kept]).tolist()), ("initial_covariance", "stationary"),
-        ):  # fmt: skip
+        own, noises = _matrices(space)
+        noise_table = {"process_noise": np.diag(noises).tolist(), "initial_covariance": "stationary"}
+        for key, value in ({"A": own.pop("A"), "B": _rows(B)} | own | noise_table).items():
             text = with_value(text, f"plant.{key}", value, may_be_new=True, comment=_COMMENT)
     else:
         written = tomllib.loads(rig.toml)["plant"]["process_noise"]
@@ -59,18 +56,14 @@ def identified_text(
     if wider:
         sigma = math.sqrt(rig.sensor.kernel.sigma**2 + 2 * wider)
         text = with_value(text, "sensor.kernel.sigma", _written(sigma), comment=_COMMENT)
-    tables = for_outputs([as_tables(model, step) for model in models])
+    tables = for_outputs([[_as_table(process, step) for process in model.processes] for model in models])
     text = with_tables(text, "disturbance.model", tables, _COMMENT) if tables else text
     parse_rig(text)
     return text
 
 
-def as_tables(model: ProcessSum, step_s: float) -> list[dict[str, Any]]:
-    """A table of ``[[disturbance.model]]`` for each process, for a plant of one output."""
-    return [_as_table(process, step_s) for process in model.processes]
-
-
 def _as_table(process: Process, step_s: float) -> dict[str, Any]:
+    """A table of ``[[disturbance.model]]``, for a plant of one output."""
     if process.kind == "random-walk":
         return {"kind": "random-walk", "step_sd": _written(math.sqrt(process["intensity"] * step_s))}
     if process.kind == "ornstein-uhlenbeck":
@@ -79,14 +72,15 @@ def _as_table(process: Process, step_s: float) -> dict[str, Any]:
     if process.kind == "resonance":
         names = ("frequency_hz", "damping", "sd")
         return {"kind": "resonance"} | {name: _written(process[name]) for name in names}
-    space = ProcessSum((process,)).state_space(step_s)
+    own, noises = _matrices(ProcessSum((process,)).state_space(step_s))
+    return {"kind": "matrices", **own, "process_noise": noises}
+
+
+def _matrices(space: StateSpace) -> tuple[dict[str, Any], list[float]]:
+    """A, B_w and C of a process with independent noises, and the variances of these."""
     values, vectors = np.linalg.eigh(space.W)
     kept = values > values.max() * 1e-12
-    return {
-        "kind": "matrices",
-        "A": _rows(space.A), "B_w": _rows(vectors[:, kept]), "C": _rows(space.C),
-        "process_noise": values[kept].tolist(),
-    }  # fmt: skip
+    return {"A": _rows(space.A), "B_w": _rows(vectors[:, kept]), "C": _rows(space.C)}, values[kept].tolist()
 
 
 def for_outputs(tables: Sequence[Sequence[dict[str, Any]]]) -> list[dict[str, Any]]:
@@ -98,9 +92,8 @@ def for_outputs(tables: Sequence[Sequence[dict[str, Any]]]) -> list[dict[str, An
         own = [[1.0] if k == o else [0.0] for k in range(len(tables))]
         for part in parts:
             if part["kind"] == "matrices":
-                out.append(
-                    part | {"C": [row if k == o else [0.0] * len(row) for k in range(len(tables)) for row in part["C"]]}
-                )
+                own_rows = [row if k == o else [0.0] * len(row) for k in range(len(tables)) for row in part["C"]]
+                out.append(part | {"C": own_rows})
             else:
                 size = {name: [part[name]] for name in ("sd", "step_sd") if name in part}
                 out.append(part | size | {"modes": own})

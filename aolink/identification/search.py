@@ -65,15 +65,11 @@ class Space:
     def names(self) -> tuple[str, ...]:
         """Names of the parameters, with the kind before them where there are several processes."""
         several = len(self.kinds) > 1
-        names = [
-            f"{kind}{'' if self.kinds.count(kind) == 1 else self.kinds[: k + 1].count(kind)}.{name}"
-            if several
-            else name
-            for k, kind in enumerate(self.kinds)
-            for name in PARAMETERS[kind]
-        ]
-        names = [f"plant.{name}" for name in self._of_plant] + names
-        return (*names, *(["noise"] if self.with_noise else []), *(["kernel"] if self.with_kernel else []))
+        names = [f"plant.{name}" for name in self._of_plant]
+        for k, kind in enumerate(self.kinds):
+            number = "" if self.kinds.count(kind) == 1 else self.kinds[: k + 1].count(kind)
+            names += [f"{kind}{number}.{name}" if several else name for name in PARAMETERS[kind]]
+        return (*names, *["noise"] * self.with_noise, *["kernel"] * self.with_kernel)
 
     @property
     def _of_plant(self) -> tuple[str, ...]:
@@ -164,12 +160,10 @@ def space_of(
         raise IdentificationError(
             f"a plant is identified where one input moves one output, here {one.inputs.shape[1]} move a copy of it"
         )
-    of_plant = (
-        []
-        if plant is None
-        else [limits | {"gain": (1e-3 * one.reach / span, 1e3 * one.reach / span), "damping": (1e-4, 30.0)}]
-    )
-    bounds = [each[name] for each in of_plant for name in PLANTS[plant or ""]]
+    bounds = []
+    if plant is not None:
+        own = limits | {"gain": (1e-3 * one.reach / span, 1e3 * one.reach / span), "damping": (1e-4, 30.0)}
+        bounds = [own[name] for name in PLANTS[plant]]
     bounds += [limits[name.removeprefix("second_")] for kind in kinds for name in PARAMETERS[kind]]
     bounds += [(0.01, 100.0)] * with_noise + [(0.25, 4.0)] * with_kernel
     return Space(
@@ -208,12 +202,8 @@ def maxima(space: Space, seen: Sequence[Readings]) -> list[Maximum]:
     values = [space.log_likelihood(point, of) for point in points]
     order = np.argsort(values)[::-1]
     chosen: list[FloatArray] = []
-    for k in order:
-        if (
-            len(chosen) < _STARTS
-            and math.isfinite(values[k])
-            and not any(_near(space, points[k], o, 0.04) for o in chosen)
-        ):
+    for k in order[np.isfinite(np.array(values)[order])]:
+        if len(chosen) < _STARTS and not any(_near(space, points[k], o, 0.04) for o in chosen):
             chosen.append(points[k])
     found: list[Maximum] = []
     for start in chosen:
@@ -320,7 +310,7 @@ def _add(space: Space, found: list[Maximum], new: Maximum) -> None:
 
 def climb(
     space: Space, start: FloatArray, of: Sequence[Likelihood], enough: float = 1e-3, fixed: Sequence[int] = ()
-) -> Maximum:  # fmt: skip
+) -> Maximum:
     """The local maximum that a start leads to, to ``enough`` nats, where the ``fixed`` parameters stay as they are."""
     nodes = max(each.nodes(space.model(start)) for each in of)
     nodes += 4 if nodes < of[0].seen.n_steps - 4 else 0
@@ -359,12 +349,8 @@ def _grid(space: Space, seen: Sequence[Readings]) -> list[tuple[float, ...]]:
     low, high = next(
         (np.exp(space.bounds[k]) for k, name in enumerate(at) if name.endswith("frequency_hz")), (1.0, 1.0)
     )
-    first = max(low, 0.05 / period)
-    frequencies = np.arange(first, high + _SPACING / period / 2, _SPACING / period)
-    frequencies = np.minimum(frequencies, high)
-
-    def pairs() -> list[tuple[float, float]]:
-        return [(f, min(_DECAY / (2 * math.pi * f * period), 0.5)) for f in frequencies]
+    frequencies = np.arange(max(low, 0.05 / period), high + _SPACING / period / 2, _SPACING / period)
+    pairs = [(f, min(_DECAY / (2 * math.pi * f * period), 0.5)) for f in np.minimum(frequencies, high)]
 
     def points(kind: str) -> list[tuple[float, ...]]:
         if kind == "random-walk":
@@ -374,12 +360,11 @@ def _grid(space: Space, seen: Sequence[Readings]) -> list[tuple[float, ...]]:
         if kind == "second-order":
             return [(c * exposure, c * exposure * d, sd) for c in (0.3, 3.0, 30.0) for d in (0.1, 0.5)]
         if kind == "resonance":
-            return [(f, z, sd) for f, z in pairs()]
+            return [(f, z, sd) for f, z in pairs]
         if kind == "ar3":
-            return [(f, z, c * exposure, sd) for f, z in pairs() for c in (0.1, 2.0)]
-        return [
-            (f, z, g, y, sd) for (f, z), (g, y) in itertools.combinations(pairs()[::2], 2)
-        ]  # ar4: two pairs, whose order does not matter
+            return [(f, z, c * exposure, sd) for f, z in pairs for c in (0.1, 2.0)]
+        # ar4: two pairs, whose order does not matter.
+        return [(f, z, g, y, sd) for (f, z), (g, y) in itertools.combinations(pairs[::2], 2)]
 
     each = [points(kind) for kind in space.kinds]
     if space.plant is not None:
@@ -391,10 +376,8 @@ def _grid(space: Space, seen: Sequence[Readings]) -> list[tuple[float, ...]]:
     for product in itertools.product(*each):
         # The order of the frequencies of equal processes does not matter.
         own = product[1:] if space.plant is not None else product
-        if all(
-            a[0] < b[0] or kind != other
-            for (a, kind), (b, other) in itertools.pairwise(zip(own, space.kinds, strict=True))
-        ):
+        beside = itertools.pairwise(zip(own, space.kinds, strict=True))
+        if all(a[0] < b[0] or kind != other for (a, kind), (b, other) in beside):
             grid.append(tuple(math.log(value) for part in product for value in part))
     return grid
 

@@ -127,15 +127,23 @@ def _allowed(space: Space, top: Maximum, other: Maximum, seen: Sequence[Readings
     """The most by which ``other`` is below the highest maximum if it is the truth, nats, except in 1 of 20 cases."""
     below = np.zeros(_DRAWS)
     for number, each in enumerate(seen):
-        noise, _ = space.others(other.x)
-        drawn = simulated(
-            replace(each, response=space.response(other.x, each)), space.model(other.x), _DRAWS, number, noise
-        )
-        likelihood = Likelihood(drawn, SHORT_RUN)
+        likelihood = _drawn(space, other.x, each, number)
         for sign, at in ((1, top), (-1, other)):
-            values = space.driven(at.x, likelihood, _DRAWS).of_outputs(space.model(at.x), *space.others(at.x), at.nodes)
-            below += sign * values.reshape(_DRAWS, -1).sum(axis=1)
+            below += sign * _of_draws(space, at.x, likelihood, at.nodes)
     return float(np.quantile(below, 0.95))
+
+
+def _drawn(space: Space, x: FloatArray, seen: Readings, seed: int) -> Likelihood:
+    """The likelihood of `_DRAWS` recordings like ``seen`` that a model makes."""
+    noise, _ = space.others(x)
+    own = replace(seen, response=space.response(x, seen))
+    return Likelihood(simulated(own, space.model(x), _DRAWS, seed, noise), SHORT_RUN)
+
+
+def _of_draws(space: Space, x: FloatArray, drawn: Likelihood, nodes: int) -> FloatArray:
+    """Log-likelihood of a model in each of these recordings, (draws,)."""
+    values = space.driven(x, drawn, _DRAWS).of_outputs(space.model(x), *space.others(x), nodes)
+    return np.asarray(values.reshape(_DRAWS, -1).sum(axis=1))
 
 
 def _curvature(space: Space, at: Maximum, of: Sequence[Likelihood]) -> FloatArray:
@@ -187,21 +195,12 @@ def _factors(space: Space, top: Maximum, seen: Sequence[Readings], H: FloatArray
     low, high = np.array(space.bounds).T
     J = np.zeros((n, n))
     for number, each in enumerate(seen):
-        noise, _ = space.others(top.x)
-        own = replace(each, response=space.response(top.x, each))
-        drawn = simulated(own, space.model(top.x), _DRAWS, number, noise)
-        likelihood = Likelihood(drawn, SHORT_RUN)
+        likelihood = _drawn(space, top.x, each, number)
         scores = np.empty((n, _DRAWS))
         for k in range(n):
             h = 0.1 / math.sqrt(H[k, k])
             ends = [np.clip(top.x + sign * h * np.eye(n)[k], low, high) for sign in (1, -1)]
-            two = [
-                space.driven(x, likelihood, _DRAWS)
-                .of_outputs(space.model(x), *space.others(x), top.nodes)
-                .reshape(_DRAWS, -1)
-                .sum(axis=1)
-                for x in ends
-            ]
+            two = [_of_draws(space, x, likelihood, top.nodes) for x in ends]
             scores[k] = (two[0] - two[1]) / (ends[0][k] - ends[1][k])
         J += np.atleast_2d(np.cov(np.nan_to_num(scores)))
     inverse = np.linalg.inv(H)
@@ -244,13 +243,8 @@ def _piece(space: Space, at: Maximum, k: int, least: float, of: Sequence[Likelih
             else:
                 outside = moved
                 slope = (math.sqrt(loss) - math.sqrt(loss_inside)) / (outside - inside)
-                step = float(
-                    np.clip(
-                        (math.sqrt(depth) - math.sqrt(loss_inside)) / slope,
-                        0.1 * (outside - inside),
-                        0.9 * (outside - inside),
-                    )
-                )
+                step = (math.sqrt(depth) - math.sqrt(loss_inside)) / slope
+                step = float(np.clip(step, 0.1 * (outside - inside), 0.9 * (outside - inside)))
         ends.append(math.exp(at.x[k] + sign * moved))
         opens.append(opened)
     return Piece(ends[0], ends[1], math.exp(at.x[k]), *opens)
@@ -293,19 +287,12 @@ def _highest(
 def _joined(pieces: Sequence[Piece]) -> tuple[Piece, ...]:
     """Pieces from low to high, with overlapping ones joined; ``best`` is that of the one among them that was given
     first."""
-    out: list[Piece] = []
-    rank = {id(piece): number for number, piece in enumerate(pieces)}
-    ranks: list[int] = []
-    for piece in sorted(pieces, key=lambda each: each.low):
-        if out and piece.low <= out[-1].high:
-            last, better = out[-1], rank[id(piece)] < ranks[-1]
-            higher = piece.high > last.high
-            out[-1] = Piece(
-                last.low, max(last.high, piece.high), piece.best if better else last.best, last.open_low,
-                piece.open_high if higher else last.open_high,
-            )  # fmt: skip
-            ranks[-1] = min(ranks[-1], rank[id(piece)])
-        else:
-            out.append(piece)
-            ranks.append(rank[id(piece)])
-    return tuple(out)
+    out: list[tuple[int, Piece]] = []
+    for rank, piece in sorted(enumerate(pieces), key=lambda each: each[1].low):
+        if out and piece.low <= out[-1][1].high:
+            first, last = out.pop()
+            high, open_high = max((last.high, last.open_high), (piece.high, piece.open_high), key=lambda end: end[0])
+            best = min((first, last.best), (rank, piece.best))[1]
+            rank, piece = min(first, rank), Piece(last.low, high, best, last.open_low, open_high)
+        out.append((rank, piece))
+    return tuple(piece for _, piece in out)

@@ -19,10 +19,7 @@ _FEWEST_POINTS = 24
 def simulated(seen: Readings, model: ProcessSum, count: int, seed: int, noise: float = 1.0) -> Readings:
     """Readings like ``seen`` with other disturbances and noise: ``count`` draws of each output, draw by draw.
 
-    Parameters
-    ----------
-    noise:
-        Factor of the pixels' noise variance.
+    ``noise`` is the factor of the pixels' noise variance.
     """
     random = np.random.default_rng(seed)
     outputs = len(seen.mean)

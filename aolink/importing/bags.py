@@ -33,8 +33,6 @@ _LOSSY = "the pictures are compressed with JPEG, after a gamma curve"
 
 @dataclass(frozen=True, eq=False)
 class _Stamped:
-    """A picture of a bag."""
-
     time_ns: int
     """The picture's own time stamp, or 0 where it has none."""
     arrival_ns: int
@@ -57,10 +55,9 @@ def mcap_film(path: Path, topic: str | None) -> Film:
         disordered = set[str]()
         indexed = summary is not None and bool(summary.channels and summary.chunk_indexes)
         if indexed and summary is not None:
-            kinds = {
-                (each.topic, _kind(summary.schemas.get(each.schema_id), each)) for each in summary.channels.values()
-            }
-            indexed = all(each.schema_id in summary.schemas or not each.schema_id for each in summary.channels.values())
+            channels = summary.channels.values()
+            kinds = {(each.topic, _kind(summary.schemas.get(each.schema_id), each)) for each in channels}
+            indexed = all(each.schema_id in summary.schemas or not each.schema_id for each in channels)
         if not indexed:  # the summary is optional, and so are the channels and the schemas in it
             latest: dict[str, int] = {}
             for schema, channel, message in _linear(file).iter_messages(log_time_order=False):
@@ -163,8 +160,7 @@ def _film(path: Path, topic: str, messages: Callable[[], Iterator[_Stamped]]) ->
     return Film(
         name=f"{path.name}:{topic}", shape=(int(first.shape[0]), int(first.shape[1])), dtype=first.dtype,
         count=len(times), frames=lambda: (grey(each.picture, path) for each in messages()), start_ns=int(times[0]),
-        times_ns=times,
-        nonlinear=_LOSSY if lossy else "",
+        times_ns=times, nonlinear=_LOSSY if lossy else "",
         notes=() if stamped else (f"{why}: those of their arrival are used",),
     )  # fmt: skip
 
@@ -210,16 +206,10 @@ def _foxglove_compressed(data: bytes, arrival_ns: int) -> _Stamped:
     return _Stamped(image.timestamp.ToNanoseconds(), arrival_ns, *compressed_picture(image.data))
 
 
-def _ros1(kind: str) -> Callable[[bytes, int], _Stamped]:
+def _ros_reader(kind: str, store: str, encoding: str) -> Callable[[bytes, int], _Stamped]:
     def read(data: bytes, arrival_ns: int) -> _Stamped:
-        return _ros(_typestore("ROS1_NOETIC").deserialize_ros1(data, f"sensor_msgs/msg/{kind}"), arrival_ns)
-
-    return read
-
-
-def _ros2(kind: str) -> Callable[[bytes, int], _Stamped]:
-    def read(data: bytes, arrival_ns: int) -> _Stamped:
-        return _ros(_typestore("LATEST").deserialize_cdr(data, f"sensor_msgs/msg/{kind}"), arrival_ns)
+        decoded = getattr(_typestore(store), f"deserialize_{encoding}")
+        return _ros(decoded(data, f"sensor_msgs/msg/{kind}"), arrival_ns)
 
     return read
 
@@ -244,9 +234,8 @@ def _ros(image: Any, arrival_ns: int) -> _Stamped:
 _DECODERS: dict[str, Callable[[bytes, int], _Stamped]] = {
     "foxglove.RawImage in protobuf": _foxglove_raw,
     "foxglove.CompressedImage in protobuf": _foxglove_compressed,
-    "sensor_msgs/Image in ros1": _ros1("Image"),
-    "sensor_msgs/CompressedImage in ros1": _ros1("CompressedImage"),
-    "sensor_msgs/msg/Image in cdr": _ros2("Image"),
-    "sensor_msgs/msg/CompressedImage in cdr": _ros2("CompressedImage"),
 }
+for _name in ("Image", "CompressedImage"):
+    _DECODERS[f"sensor_msgs/{_name} in ros1"] = _ros_reader(_name, "ROS1_NOETIC", "ros1")
+    _DECODERS[f"sensor_msgs/msg/{_name} in cdr"] = _ros_reader(_name, "LATEST", "cdr")
 """Decoders of a channel, by the schema and the encoding of its messages."""

@@ -51,10 +51,7 @@ _FEWEST = 10
 def imported(film: Film, rig: Rig, settings: FilmSettings, account: FilmAccount) -> Iterator[ImportedExposure]:
     """The exposures of a film, one after the other; ``account`` is filled in on the way.
 
-    Raises
-    ------
-    ImportingError
-        The film does not fit the rig file.
+    Raises `ImportingError` where the film does not fit the rig file.
     """
     periods, notes = frame_times(film, rig, settings)
     frame_ns = rig.timing.frame_period_steps * rig.timing.fast_step_ns

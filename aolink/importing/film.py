@@ -91,12 +91,8 @@ class Film:
 def grey(picture: FilmFrame, what: object) -> FilmFrame:
     """A picture (rows, columns) as it is, one with three or four channels as the mean of its colours.
 
-    The mean is proportional to light where the colours are. A pixel saturated in one colour is saturated.
-
-    Raises
-    ------
-    ImportingError
-        The picture has another shape.
+    The mean is proportional to light where the colours are. A pixel saturated in one colour is saturated. Raises
+    `ImportingError` where the picture has another shape.
     """
     if picture.ndim == 3 and picture.shape[2] in (3, 4):
         red, green, blue = (picture[..., k] for k in range(3))  # far faster than along the last axis
@@ -113,13 +109,8 @@ def grey(picture: FilmFrame, what: object) -> FilmFrame:
 def array_film(frames: NDArray[Any], name: str, **known: Any) -> Film:
     """A film of frames in memory, (frames, rows, columns).
 
-    Colours, (frames, rows, columns, 3 or 4), become grey; films of spots, (spots, frames, rows, columns), stand side
-    by side.
-
-    Raises
-    ------
-    ImportingError
-        The array has another shape, or does not hold numbers.
+    Colours, (frames, rows, columns, 3 or 4), become grey; films of spots, (spots, frames, rows, columns), stand side by
+    side. Raises `ImportingError` where the array has another shape, or does not hold numbers.
     """
     # A spot's window is a square, so one of 3 or 4 columns has no more rows.
     colours = frames.ndim == 4 and frames.shape[3] in (3, 4) and frames.shape[2] > 4

@@ -41,12 +41,8 @@ def first_rig(film: Film, settings: FilmSettings, name: str, progress: Callable[
     """A rig file for the objects of a film, ``settings.track`` of them: for an import with these settings.
 
     The slope unit is half a window. The plant has a copy for each object and direction; its input is the shift of the
-    window that follows the object.
-
-    Raises
-    ------
-    ImportingError
-        There are fewer objects, or the frame rate is not known or contradicts the film's times.
+    window that follows the object. Raises `ImportingError` where there are fewer objects, or the frame rate is not
+    known or contradicts the film's times.
     """
     if film.slopes:
         raise ImportingError(f"{film.name} has slopes and no pictures: a first rig file is made from pictures")

@@ -132,10 +132,8 @@ def mended(values: FloatArray, defects: BoolArray) -> FloatArray:
 def frame_times(film: Film, rig: Rig, settings: FilmSettings) -> tuple[NDArray[np.int64], list[str]]:
     """Number of each frame in frame periods from the first on, (count,), and notes on what was assumed.
 
-    Raises
-    ------
-    ImportingError
-        Rate, times or exposure time contradict each other or the rig file; the message says what to change.
+    Raises `ImportingError` where rate, times or exposure time contradict each other or the rig file; the message says
+    what to change.
     """
     timing, K = rig.timing, settings.frames_per_exposure
     periods, rate, notes = film_rate(film, settings)
@@ -190,10 +188,7 @@ def nonlinear_note(film: Film) -> str:
 def film_rate(film: Film, settings: FilmSettings) -> tuple[NDArray[np.int64], float | None, list[str]]:
     """`film_periods`, frames a second where they are known, and notes on what was taken.
 
-    Raises
-    ------
-    ImportingError
-        The rate and the times contradict each other, or the times are damaged.
+    Raises `ImportingError` where the rate and the times contradict each other, or the times are damaged.
     """
     rate, notes = film.rate_hz, []
     if settings.rate_hz is not None:
@@ -213,10 +208,7 @@ def film_periods(film: Film) -> tuple[NDArray[np.int64], float | None]:
     """Number of each frame in frame periods from the first on, (count,), and frames a second, by the film's times;
     without times no frame is missing, and the rate is None.
 
-    Raises
-    ------
-    ImportingError
-        The times do not follow each other at a steady rate.
+    Raises `ImportingError` where the times do not follow each other at a steady rate.
     """
     periods = np.arange(film.count, dtype=np.int64)
     if film.times_ns is None or film.count < 2:
@@ -280,11 +272,9 @@ class Group:
 
 
 def grouped(
-    film: Film,
-    count: int,
-    periods: NDArray[np.int64],
+    film: Film, count: int, periods: NDArray[np.int64],
     light: Callable[[FilmFrame], tuple[FloatArray, NDArray[np.bool_]]],
-) -> Iterator[Group]:
+) -> Iterator[Group]:  # fmt: skip
     """Frames by exposures, each frame's ``light`` summed as it comes; a film that lost a frame goes on with the next
     whole exposure."""
     held = first = 0
@@ -306,7 +296,7 @@ def grouped(
 
 def rig_frame(
     film: Film, rig: Rig, settings: FilmSettings, period: int, pixels: NDArray[np.uint16], mask: NDArray[np.bool_]
-) -> Frame:  # fmt: skip
+) -> Frame:
     """The frame of an exposure that begins the given number of the rig's frame periods after the film."""
     timing = rig.timing
     first = period * timing.frame_period_steps

@@ -112,11 +112,7 @@ def fit_motion(places: FloatArray) -> Motion:
 
     A random walk, an Ornstein-Uhlenbeck process, and a vibration without and with a random walk beside it are fitted,
     each without and with a drift. The Bayesian information criterion, by the same places, says which one is taken.
-
-    Raises
-    ------
-    ImportingError
-        There are too few places.
+    Raises `ImportingError` where there are too few places.
     """
     places = np.ascontiguousarray(places, dtype=np.float64)
     count = int(np.isfinite(places).sum())
@@ -248,12 +244,8 @@ def _inverse_curvature(places: FloatArray, fit: _Fit) -> FloatArray:
     n = len(fit.free)
     h = np.diag([_width(k, fit.values, fit.free, len(places)) / 10 for k in fit.free])
     signs = [(a, b) for a in (1, -1) for b in (1, -1)]
-    H = np.array(
-        [
-            [sum(a * b * _cost(places, fit.free, fit.values + a * h[i] + b * h[j]) for a, b in signs) for j in range(n)]
-            for i in range(n)
-        ]
-    ) / (4 * np.outer(np.diagonal(h), np.diagonal(h)))
+    cost = [[sum(a * b * _cost(places, fit.free, fit.values + a * p + b * q) for a, b in signs) for q in h] for p in h]
+    H = np.array(cost) / (4 * np.outer(np.diagonal(h), np.diagonal(h)))
     if not np.isfinite(H).all():  # an angle at the end of its range
         return np.full(n, np.nan)
     return np.asarray(np.clip(np.diagonal(np.linalg.pinv(H)), 0.0, None))

@@ -24,7 +24,7 @@ from aolink.errors import AolinkError, FrameError, ImportingError
 from aolink.extensions import needs_extra
 from aolink.importing.film import Film, FilmFrame, array_film, grey
 from aolink.limits import load_archive, unpacked
-from aolink.optics.frame_file import fits_arrays, parse_fits_array, read_fits
+from aolink.optics.frame_file import fits_arrays, read_fits
 from aolink.optics.pictures import image_pixels, opened_image, read_picture
 
 _PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".npy", ".fits", ".fit", ".pgm")
@@ -42,6 +42,9 @@ _COMPRESSED = "JPEG and video hold light after a gamma curve and lossy compressi
 def open_film(source: str | Path, topic: str | None = None) -> Film:
     """Open a film, by the kind of its source.
 
+    Raises `ImportingError` where the source cannot be read, holds no film, or needs a package that is not installed;
+    the message says which.
+
     Parameters
     ----------
     source:
@@ -49,11 +52,6 @@ def open_film(source: str | Path, topic: str | None = None) -> Film:
         .fits file), or a folder of pictures.
     topic:
         The channel with the pictures, where an MCAP file or a bag has several; of AO telemetry the wavefront sensor.
-
-    Raises
-    ------
-    ImportingError
-        The source cannot be read, holds no film, or needs a package that is not installed; the message says which.
     """
     path = Path(source)
     if not path.exists():
@@ -281,7 +279,7 @@ def _picture(path: Path) -> FilmFrame:
     if path.suffix.lower() not in (".fits", ".fit"):
         return read_picture(path)
     try:
-        _, stored, scale, zero = parse_fits_array(read_fits(path, ImportingError))
+        _, stored, scale, zero = next(fits_arrays(read_fits(path, ImportingError)))
     except FrameError as error:
         raise ImportingError(f"{path}: {error}") from None
     return _values(stored, scale, zero)
@@ -413,6 +411,4 @@ def _aot(path: Path, topic: str | None) -> Film:
     return telemetry.aot_film(path, topic)
 
 
-_READERS: dict[str, Callable[[Path], Film]] = {
-    ".npy": _npy, ".npz": _npz, ".tif": _tiff, ".tiff": _tiff,
-}  # fmt: skip
+_READERS: dict[str, Callable[[Path], Film]] = {".npy": _npy, ".npz": _npz, ".tif": _tiff, ".tiff": _tiff}

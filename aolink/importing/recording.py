@@ -32,14 +32,8 @@ def import_film(
 ) -> FilmAccount:  # fmt: skip
     """Write the exposures of a film as a recording of a rig. The same film and settings give the same bytes.
 
-    ``sources`` are files that it never replaces.
-
-    Raises
-    ------
-    ImportingError
-        The film does not fit the rig file; no file is left then.
-    RecordingError
-        ``path`` exists and not ``overwrite``, or cannot be written.
+    ``sources`` are files that it never replaces. Raises `ImportingError` where the film does not fit the rig file (no
+    file is left then); `RecordingError` where ``path`` exists and not ``overwrite``, or cannot be written.
     """
     check_target(path, overwrite=overwrite, sources=sources, error=RecordingError)
     account = FilmAccount()

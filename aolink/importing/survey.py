@@ -151,10 +151,7 @@ def survey(
 ) -> Survey:
     """Follow the objects through the whole film and fit their images in single frames.
 
-    Raises
-    ------
-    ImportingError
-        None of the objects can be followed.
+    Raises `ImportingError` where none of the objects can be followed.
     """
     light = FilmLight(film, settings, objects.defects)
     tracker = Tracker(objects, trackpy_locator(objects.sd))

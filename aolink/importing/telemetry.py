@@ -23,12 +23,7 @@ def aot_film(path: Path, uid: str | None = None) -> Film:
 
     Where none has pictures, the result is the slopes of the first sensor that has them. A command is held until the
     next one of its loop: by the times of both, otherwise by the loop's rate, otherwise one for each frame, after the
-    loop's delay.
-
-    Raises
-    ------
-    ImportingError
-        The file is not of this format, or has neither pictures nor slopes.
+    loop's delay. Raises `ImportingError` where the file is not of this format, or has neither pictures nor slopes.
     """
     with needs_extra("aot", ImportingError):
         import aotpy

@@ -128,12 +128,8 @@ class Tracker:
                 own[k] -= peak[other] * _gaussian(found[other] - corners[k], self._sd, pixels)
             begin = np.clip(found - corners, 0, 2 * half)
             found = corners + weighted_centroid(own, WEIGHT * self._sd, start=begin)
-            brightness = np.array(
-                [
-                    (one * _gaussian(place, WEIGHT * self._sd, pixels)).sum()
-                    for one, place in zip(own, found - corners, strict=True)
-                ]
-            )
+            under = (_gaussian(place, WEIGHT * self._sd, pixels) for place in found - corners)
+            brightness = np.array([(one * weight).sum() for one, weight in zip(own, under, strict=True)])
         if self._locate is not None:
             found = np.where(crowded[:, None], found, self._nearest(light, found))
         return found, brightness
@@ -224,10 +220,7 @@ def trackpy_locator(sd: float) -> Callable[[FloatArray], FloatArray] | None:
 def find_objects(film: Film, settings: FilmSettings) -> Objects:
     """The brightest objects of a film's first frames, as many as requested.
 
-    Raises
-    ------
-    ImportingError
-        There are fewer.
+    Raises `ImportingError` where there are fewer.
     """
     if settings.places and len(settings.places) != settings.track:
         raise ImportingError(f"{len(settings.places)} places are given for --track {settings.track}: give one for each")

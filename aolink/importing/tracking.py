@@ -44,10 +44,7 @@ def tracked(
 ) -> Iterator[ImportedExposure]:
     """The exposures of a film's objects, each in a window of its own.
 
-    Raises
-    ------
-    ImportingError
-        The rig file describes another number of spots, or the film shows fewer objects.
+    Raises `ImportingError` where the rig file describes another number of spots, or the film shows fewer objects.
     """
     sensor = rig.sensor
     if sensor.directions == 1 or sensor.spots != settings.track or sensor.spot_light is not None:

@@ -54,10 +54,8 @@ def blockwise(
 def alike(A: FloatArray, *columns: FloatArray) -> Indices | None:
     """States of block-diagonal systems that are all equal, each with one column of its own in other matrices.
 
-    Returns
-    -------
-    (systems, n): system a has the states ``order[a]``, and column a of each of ``columns``, (n_states, systems).
-    None where A has no such blocks.
+    In the result, (systems, n), system a has the states ``order[a]``, and column a of each of ``columns``, (n_states,
+    systems). None where A has no such blocks.
     """
     parts = components(A)
     if len({len(part) for part in parts}) > 1 or any(each.shape[1] != len(parts) for each in columns):

@@ -16,12 +16,7 @@ def chi_square_quantile(share: float, degrees: int) -> float:
     """The value below which a chi-square variable with a number of degrees of freedom stays with probability ``share``.
 
     Newton's iteration on the regularised incomplete gamma function, P(a, x) = share with a = degrees / 2: the quantile
-    is 2 x.
-
-    Raises
-    ------
-    ValueError
-        ``share`` is not between 0 and 1, or ``degrees`` not positive.
+    is 2 x. Raises `ValueError` where ``share`` is not between 0 and 1, or ``degrees`` not positive.
     """
     if not (0 < share < 1 and degrees > 0):
         raise ValueError(f"a share between 0 and 1 of a positive number of degrees, not {share:g} of {degrees}")

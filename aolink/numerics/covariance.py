@@ -35,15 +35,12 @@ def lower_inverse(root: FloatArray) -> FloatArray:
 
 
 def in_correlation_steps(covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Covariances as standard deviations in single precision and multiples of `CORRELATION_STEP` between them.
+    """Covariances as standard deviations (..., n) in single precision and multiples of `CORRELATION_STEP` between them:
+    whole numbers of steps (..., n, n), of which the upper triangle mirrors the lower.
 
     Rounding changes each correlation by half a step at most, and so an eigenvalue of n of them by n / 2 steps at most
     (Gershgorin). Variances are larger by that share of themselves: what is positive semidefinite remains so. A variance
     below zero is rounding, and becomes zero.
-
-    Returns
-    -------
-    Standard deviations (..., n), and whole numbers of steps (..., n, n), of which the upper triangle mirrors the lower.
     """
     n = covariance.shape[-1]
     # One step more than those of n - 1 correlations, which is more than single precision's rounding.

@@ -89,10 +89,7 @@ def congruence_one_thread(a: FloatArray, p: FloatArray) -> FloatArray:
 def inverse_by_cholesky(a: FloatArray) -> FloatArray:
     """Inverse of a symmetric positive definite matrix, symmetric to the last bit.
 
-    Raises
-    ------
-    numpy.linalg.LinAlgError
-        The matrix is not positive definite.
+    Raises `numpy.linalg.LinAlgError` where the matrix is not positive definite.
     """
     lower, _ = scipy.linalg.lapack.dpotri(_cholesky_factor(a), lower=1, overwrite_c=1)
     whole = lower + lower.T

@@ -17,11 +17,8 @@ _ITERATIONS = 20
 def centre_of_gravity(windows: FloatArray, threshold: FloatArray | float = 0.0) -> FloatArray:
     """First moments, (n, 2).
 
-    Parameters
-    ----------
-    threshold:
-        Threshold that is subtracted from each window, after which only values above zero count; one for all windows or
-        (n,). With zero all pixels count, negative ones as well, so that the noise's mean stays zero.
+    ``threshold``, one for all windows or (n,), is subtracted from each, after which only values above zero count. With
+    zero all pixels count, negative ones as well, so that the noise's mean stays zero.
     """
     if np.any(threshold):
         windows = np.maximum(windows - np.broadcast_to(threshold, len(windows))[:, None, None], 0.0)
@@ -37,14 +34,8 @@ def weighted_centroid(windows: FloatArray, weight_sd: float, start: FloatArray |
     """Weighted centre of gravity: a Gaussian weight is moved to the centroid that it gives, again and again, (n, 2).
 
     The centroid under a weight at distance d from a Gaussian spot is off by a share of d; repeated, the weight ends on
-    the spot. Thomas et al., Mon. Not. R. Astron. Soc. 371, 323 (2006).
-
-    Parameters
-    ----------
-    weight_sd:
-        Standard deviation of the weight, pixels.
-    start:
-        First position of the weight, (n, 2); each window's brightest pixel where None.
+    the spot. Thomas et al., Mon. Not. R. Astron. Soc. 371, 323 (2006). ``weight_sd`` is in pixels; ``start``, (n, 2),
+    is the weight's first position; each window's brightest pixel where None.
     """
     rows, columns = windows.shape[1:]
     x, y = np.arange(columns), np.arange(rows)

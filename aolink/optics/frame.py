@@ -28,16 +28,10 @@ _LARGEST_TABLE = 4_000_000
 
 
 def frame_density(sensor: BaseSensor, path: FloatArray) -> FloatArray:
-    """Mean density in each pixel of a frame.
+    """Mean density in each pixel of a frame, (rows, columns); the spot of a partly lit lenslet has that share of the
+    light.
 
-    Parameters
-    ----------
-    path:
-        Positions of all spots at each fast step, slope units, (n_outputs, n_steps), in the sensor's order.
-
-    Returns
-    -------
-    Densities, (rows, columns); the spot of a partly lit lenslet has that share of the light.
+    ``path`` is the positions of all spots at each fast step, slope units, (n_outputs, n_steps), in the sensor's order.
     """
     edges = sensor.profile.edges
     if sensor.directions == 1:
@@ -64,21 +58,13 @@ def spot_windows(sensor: BaseSensor, frame: NDArray[Scalar]) -> NDArray[Scalar]:
 
 
 def spots_density(kernel: Kernel, edges: FloatArray, path: FloatArray) -> FloatArray:
-    """Mean density in the pixels of one square window for each spot.
+    """Mean density in the pixels of one square window for each spot, one over slope units squared, (spots, rows,
+    columns).
 
     The density is (1/N) sum_i of the round kernel integrated over each pixel: the kernel is a product of its two
-    directions, so the sum over the fast steps is one matrix product of their masses.
-
-    Parameters
-    ----------
-    edges:
-        Edges of equal rows and of equal columns, slope units, (pixels + 1,).
-    path:
-        x and y at each fast step, slope units, (spots, 2, n_steps).
-
-    Returns
-    -------
-    One over slope units squared, (spots, rows, columns).
+    directions, so the sum over the fast steps is one matrix product of their masses. ``edges`` are those of equal rows
+    and of equal columns, slope units, (pixels + 1,); ``path`` is x and y at each fast step, slope units, (spots, 2,
+    n_steps).
     """
     n, n_steps = len(edges) - 1, path.shape[-1]
     light = np.empty((len(path), n, n))

@@ -24,10 +24,7 @@ _TYPES = {8: "u1", 16: ">i2", 32: ">i4", 64: ">i8", -32: ">f4", -64: ">f8"}
 def read_frame(path: str | Path) -> FloatArray:
     """The picture in a .fits, .fits.gz or .npy file, (rows, columns).
 
-    Raises
-    ------
-    FrameError
-        The file cannot be read or holds no two-dimensional picture.
+    Raises `FrameError` where the file cannot be read or holds no two-dimensional picture.
     """
     path = Path(path)
     try:
@@ -58,14 +55,8 @@ def read_fits(path: Path, error: type[AolinkError]) -> bytes:
 
 
 def parse_fits(data: bytes) -> FloatArray:
-    """The primary image of a FITS file with two axes.
-
-    Raises
-    ------
-    FrameError
-        The data are not such a file.
-    """
-    _, stored, scale, zero = parse_fits_array(data)
+    """The primary image of a FITS file with two axes. Raises `FrameError` where the data are not such a file."""
+    _, stored, scale, zero = next(fits_arrays(data))
     if stored.ndim != 2:
         raise FrameError(
             f"its primary image has the shape {stored.shape}, expected two axes: take the picture out of it"
@@ -73,30 +64,16 @@ def parse_fits(data: bytes) -> FloatArray:
     return np.asarray(stored * scale + zero)
 
 
-def parse_fits_array(data: bytes) -> tuple[dict[str, str], NDArray[Any], float, float]:
-    """The first array of a FITS file, primary or in an image extension; Pence et al., Astron. Astrophys. 524, A42
-    (2010).
+def fits_arrays(data: bytes) -> Iterator[tuple[dict[str, str], NDArray[Any], float, float]]:
+    """The arrays of a FITS file, primary or in image extensions, one after the other; at least one. Pence et al.,
+    Astron. Astrophys. 524, A42 (2010).
 
-    Returns
-    -------
+    Raises `FrameError` where the data are not a FITS file, have no array, or are damaged.
+
+    Yields
+    ------
     The values of the primary header and of the array's own as text, by their keys; the array as it is stored, its axes
     in NumPy's order; and BSCALE and BZERO, so that the values are ``array * BSCALE + BZERO``.
-
-    Raises
-    ------
-    FrameError
-        The data are not a FITS file, or have no array.
-    """
-    return next(fits_arrays(data))
-
-
-def fits_arrays(data: bytes) -> Iterator[tuple[dict[str, str], NDArray[Any], float, float]]:
-    """The arrays of a FITS file one after the other, each as `parse_fits_array` gives the first; at least one.
-
-    Raises
-    ------
-    FrameError
-        The data are not a FITS file, have no array, or are damaged.
     """
     if not data[:9] == b"SIMPLE  =":
         raise FrameError("it is not a FITS file: it does not begin with SIMPLE")

@@ -60,40 +60,20 @@ def pixel_masses(variance: FloatArray | float, edges: FloatArray, positions: Flo
 
 
 def pixel_mass(kernel: Kernel, edges: FloatArray, positions: FloatArray) -> FloatArray:
-    """Share of a resting spot's light that each pixel gets.
+    """Share of a resting spot's light that each pixel gets: the integral of Psi(w - position) over it, (..., pixels).
 
-    Parameters
-    ----------
-    edges:
-        Pixel edges, slope units, (pixels + 1,).
-    positions:
-        Positions of the spot, slope units, (...).
-
-    Returns
-    -------
-    Integral of Psi(w - position) over each pixel, (..., pixels); the sum is one where all light meets the sensor.
-
-    References
-    ----------
-    Psi is the kernel of Mishra & Wen, section VI, with its constant corrected to 1/(sigma sqrt(pi)) for unit mass.
+    The sum is one where all light meets the sensor. Edges are (pixels + 1,), positions (...), slope units. Psi is the
+    kernel of Mishra & Wen, section VI, with its constant corrected to 1/(sigma sqrt(pi)) for unit mass.
     """
     return pixel_masses(kernel.variance, edges, positions, 0)[0]
 
 
 def exposure_density(kernel: Kernel, edges: FloatArray, path: FloatArray) -> FloatArray:
-    """Mean density in each pixel after an exposure, without noise.
+    """Mean density in each pixel after an exposure, without noise, one over slope units, (..., pixels).
 
-    Parameters
-    ----------
-    edges:
-        Edges of equal pixels, slope units, (pixels + 1,).
-    path:
-        Spot position at each fast step, slope units, (..., n_steps).
-
-    Returns
-    -------
-    (1/N) sum_i of the kernel integrated over each pixel, divided by the pixel's width: one over slope
-    units, (..., pixels). Mishra & Wen (3) with the 1/T_e that (5) needs.
+    (1/N) sum_i of the kernel integrated over each pixel, divided by the pixel's width: Mishra & Wen (3) with the 1/T_e
+    that (5) needs. Edges of equal pixels are (pixels + 1,), the spot's positions at each fast step (..., n_steps),
+    slope units.
     """
     return np.asarray(pixel_mass(kernel, edges, path).mean(axis=-2) / np.diff(edges))
 

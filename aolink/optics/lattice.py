@@ -34,10 +34,7 @@ _FEWEST_SPOTS, _SEED = 7, 4
 _NEAR = 0.25
 # Steps from a node to half of its neighbours, as (columns, rows); the other half are their opposites. The first
 # step of a hexagonal lattice goes along the row and the second one 60 degrees from it.
-_MOVES: dict[Kind, IntArray] = {
-    "square": np.array([(1, 0), (0, 1)]),
-    "hexagonal": np.array([(1, 0), (0, 1), (-1, 1)]),
-}
+_MOVES: dict[Kind, IntArray] = {"square": np.array([(1, 0), (0, 1)]), "hexagonal": np.array([(1, 0), (0, 1), (-1, 1)])}
 _ANGLE: dict[Kind, float] = {"square": math.pi / 2, "hexagonal": math.pi / 3}
 # The search takes differences to this many neighbours, from this many spots, tries this many of the commonest
 # differences as steps, and follows this many of the lattices that they suggest.
@@ -133,20 +130,11 @@ class Lattice:
 def find_lattice(frame: NDArray[np.generic]) -> Lattice:
     """Find the spots of a Shack-Hartmann frame and the square or hexagonal lattice that they lie on.
 
-    Background and single hot pixels are removed, and maxima above the noise are found. The differences between
-    neighbouring maxima suggest lattices; each one is followed from spot to spot over the largest connected group, and
-    from there to all other spots that lie on its nodes. The lattice that explains most spots is taken. Spots may be
-    missing anywhere, and the groups that remain need not touch.
-
-    Parameters
-    ----------
-    frame:
-        Counts of any real type and scale, (rows, columns).
-
-    Raises
-    ------
-    FrameError
-        There are no spots, or they do not lie on a lattice.
+    The frame has counts of any real type and scale, (rows, columns). Background and single hot pixels are removed, and
+    maxima above the noise are found. The differences between neighbouring maxima suggest lattices; each one is followed
+    from spot to spot over the largest connected group, and from there to all other spots that lie on its nodes. The
+    lattice that explains most spots is taken. Spots may be missing anywhere, and the groups that remain need not touch.
+    Raises `FrameError` where there are no spots, or they do not lie on a lattice.
     """
     flat, background = flatten(frame)
     most, rejected = 0, ""
@@ -409,12 +397,8 @@ def _fit(kind: Kind, spots: FloatArray, nodes: IntArray, background: float) -> L
 def match(lattice: Lattice, reference: Lattice) -> Lattice:
     """The lattice with its nodes counted as the reference counts them, and the spots that both have.
 
-    Spots correspond up to whole steps of the lattice: the correspondence that moves the spots least is taken.
-
-    Raises
-    ------
-    FrameError
-        The two lattices do not belong to one instrument, or share too few spots.
+    Spots correspond up to whole steps of the lattice: the correspondence that moves the spots least is taken. Raises
+    `FrameError` where the two lattices do not belong to one instrument, or share too few spots.
     """
     back = np.linalg.inv(reference.steps)
     # The two may have chosen different directions of a lattice as its rows: 44 and -46 degrees are one square grid.

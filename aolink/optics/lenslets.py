@@ -75,17 +75,9 @@ class Lenslets:
         return self.is_lit(points).reshape(per_side, per_side)
 
     def mean_slopes(self, gradient: Callable[[FloatArray], FloatArray]) -> FloatArray:
-        """Mean gradient over the lit part of each lenslet.
-
-        Parameters
-        ----------
-        gradient:
-            Function from points (..., 2), m, to gradients (..., 2, *more), of one wavefront or of many at once.
-
-        Returns
-        -------
-        Slopes, (spots, 2, *more); NaN for lenslets in the dark.
-        """
+        """Mean gradient over the lit part of each lenslet, (spots, 2, *more); NaN for lenslets in the dark.
+        ``gradient`` is a function from points (..., 2), m, to gradients (..., 2, *more), of one wavefront or of many at
+        once."""
         nodes, weights = np.polynomial.legendre.leggauss(_SMOOTH_POINTS)
         smooth, smooth_weight = _square(nodes * self.pitch_m / 2), np.outer(weights, weights).ravel() / 4
         fine, slopes = _square(self.offsets_m()), []

@@ -48,10 +48,7 @@ class Maxima:
 def flatten(frame: NDArray[np.generic]) -> tuple[FloatArray, FloatArray]:
     """A frame without its background and its isolated hot pixels, and that background, each (rows, columns).
 
-    Raises
-    ------
-    FrameError
-        The frame is not a picture, or has pixels that are not numbers.
+    Raises `FrameError` where the frame is not a picture, or has pixels that are not numbers.
     """
     if frame.ndim != 2 or min(frame.shape) < _BLOCK or frame.dtype.kind not in "biuf":
         raise FrameError(
@@ -68,7 +65,7 @@ def flatten(frame: NDArray[np.generic]) -> tuple[FloatArray, FloatArray]:
     blocks = [[np.median(part) for part in np.array_split(strip, columns, 1)] for strip in np.array_split(counts, rows)]
     smooth = ndimage.zoom(
         np.array(blocks), (counts.shape[0] / rows, counts.shape[1] / columns), order=1, mode="nearest", grid_mode=True
-    )  # fmt: skip
+    )
     flat = counts - smooth
     ring = np.ones((3, 3), dtype=np.bool_)
     ring[1, 1] = False
@@ -208,12 +205,8 @@ def spot_sd(flat: FloatArray, places: FloatArray, pitch: float) -> float:
 
 
 def cut_windows(frame: FloatArray, middles: FloatArray, half: int) -> tuple[FloatArray, FloatArray]:
-    """Square windows of 2 half + 1 pixels about the pixels nearest to ``middles``, zero beyond the frame.
-
-    Returns
-    -------
-    (n, side, side), and the middle of each window's first pixel on the frame as (x, y), (n, 2).
-    """
+    """Square windows of 2 half + 1 pixels about the pixels nearest to ``middles``, zero beyond the frame, (n, side,
+    side), and the middle of each window's first pixel on the frame as (x, y), (n, 2)."""
     side = 2 * half + 1
     corners = np.rint(middles).astype(np.int64) - half
     padded = np.pad(frame, side)

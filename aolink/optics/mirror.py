@@ -35,17 +35,8 @@ class Membrane:
             raise ValueError(f"a pad reaches {reach:.4g} m from the middle, the membrane ends at {self.radius_m:.4g} m")
 
     def influence(self, points_m: FloatArray) -> FloatArray:
-        """Deflection for a pressure of 1 Pa on each pad.
-
-        Parameters
-        ----------
-        points_m:
-            Points on the membrane, m, (..., 2).
-
-        Returns
-        -------
-        Deflections, m/Pa, (..., actuators), positive towards the actuators.
-        """
+        """Deflection for a pressure of 1 Pa on each pad, m/Pa, (..., actuators), positive towards the actuators, at
+        points on the membrane, m, (..., 2)."""
         z, source, pad = self._scaled(points_m)
         away = np.abs(z - source)
         direct = np.where(away > pad, -np.log(np.maximum(away, pad)), (1 - (away / pad) ** 2) / 2 - math.log(pad))
@@ -103,12 +94,8 @@ class VoltageLaw:
 
 
 def second_order(frequency_hz: float, damping: float, fast_step_s: float) -> tuple[FloatArray, FloatArray]:
-    """A resonance with unit gain at rest, driven by an input that is held over each fast step.
-
-    Returns
-    -------
-    A (2, 2) and B (2, 1) of the state (position, velocity times the fast step), exactly discretised.
-    """
+    """A resonance with unit gain at rest, driven by an input that is held over each fast step: A (2, 2) and B (2, 1) of
+    the state (position, velocity times the fast step), exactly discretised."""
     omega = 2 * math.pi * frequency_hz * fast_step_s
     A = np.asarray(scipy.linalg.expm(np.array([[0.0, 1.0], [-(omega**2), -2 * damping * omega]])))
     return A, (np.eye(2) - A)[:, :1]

@@ -24,12 +24,8 @@ if TYPE_CHECKING:
 def read_picture(path: Path) -> NDArray[Any]:
     """A picture as numbers, (rows, columns) or (rows, columns, 3 or 4), of its own type.
 
-    ``.npy`` is taken as it is; otherwise any format of Pillow's: 8 bits grey or colour, 16 bits grey, floats.
-
-    Raises
-    ------
-    RestorationError
-        The file cannot be read as a picture.
+    ``.npy`` is taken as it is; otherwise any format of Pillow's: 8 bits grey or colour, 16 bits grey, floats. Raises
+    `RestorationError` where the file cannot be read as a picture.
     """
     if path.suffix == ".npy":
         return _load(path, "picture")
@@ -81,10 +77,8 @@ def finite_pixels(picture: NDArray[Any]) -> BoolArray | None:
 def write_picture(path: Path, picture: NDArray[Any], *, overwrite: bool = False, sources: Iterable[Path] = ()) -> None:
     """Write a picture that `read_picture` reads back; ``sources`` are files that it never replaces.
 
-    Raises
-    ------
-    RestorationError
-        The file exists and ``overwrite`` is False, or it cannot be written, or its format cannot hold the picture.
+    Raises `RestorationError` where the file exists and ``overwrite`` is False, or it cannot be written, or its format
+    cannot hold the picture.
     """
     from PIL import Image
 
@@ -93,7 +87,10 @@ def write_picture(path: Path, picture: NDArray[Any], *, overwrite: bool = False,
         if path.suffix == ".npy":
             np.save(data, picture)
         else:
-            Image.fromarray(picture).save(data, format=_format(path))
+            kind = Image.registered_extensions().get(path.suffix.lower())
+            if kind is None:
+                raise ValueError(f"unknown file extension: {path.suffix}")
+            Image.fromarray(picture).save(data, format=kind)
     except (ValueError, TypeError, KeyError, OSError) as error:
         raise RestorationError(
             f"{path} cannot be written ({error}): a picture of type {picture.dtype} fits in a .npy file"
@@ -102,23 +99,10 @@ def write_picture(path: Path, picture: NDArray[Any], *, overwrite: bool = False,
         partial.write_bytes(data.getbuffer())
 
 
-def _format(path: Path) -> str:
-    """Pillow's name of the format for a file name. Raises ValueError."""
-    from PIL import Image
-
-    kind = Image.registered_extensions().get(path.suffix.lower())
-    if kind is None:
-        raise ValueError(f"unknown file extension: {path.suffix}")
-    return kind
-
-
 def read_psf(path: Path) -> FloatArray:
     """A PSF as numbers, from ``.npy`` or from text with commas or spaces; one row or column is a PSF along the rows.
 
-    Raises
-    ------
-    RestorationError
-        The file cannot be read as a PSF.
+    Raises `RestorationError` where the file cannot be read as a PSF.
     """
     if path.suffix == ".npy":
         values = _load(path, "PSF")

@@ -21,22 +21,11 @@ _MOST_TERMS = 30
 def pixel_mass_2d(
     covariance: FloatArray, x_edges: FloatArray, y_edges: FloatArray, positions: FloatArray
 ) -> FloatArray:
-    """Share of a resting spot's light that each pixel gets.
+    """Share of a resting spot's light that each pixel gets, (..., rows, columns).
 
-    It is computed along x by quadrature within each column, and along y given x by error functions.
-
-    Parameters
-    ----------
-    covariance:
-        Covariance of the kernel, slope units squared, (2, 2).
-    x_edges, y_edges:
-        Edges of columns and rows, slope units, (columns + 1,) and (rows + 1,).
-    positions:
-        Positions of the spot, slope units, (..., 2).
-
-    Returns
-    -------
-    (..., rows, columns)
+    It is computed along x by quadrature within each column, and along y given x by error functions. The kernel's
+    covariance is (2, 2), slope units squared; edges of columns and rows, (columns + 1,) and (rows + 1,), and the spot's
+    positions, (..., 2), are in slope units.
     """
     (xx, xy), (_, yy) = covariance
     nodes, weights = _QUADRATURE
@@ -53,18 +42,11 @@ def pixel_mass_2d(
 def exposure_density_2d(
     covariance: FloatArray, x_edges: FloatArray, y_edges: FloatArray, paths: FloatArray
 ) -> FloatArray:
-    """Mean density in the pixels about each spot after an exposure, without noise.
+    """Mean density in the pixels about each spot after an exposure, without noise, one over slope units squared,
+    (spots, rows, columns).
 
-    Parameters
-    ----------
-    covariance, x_edges, y_edges:
-        As in `pixel_mass_2d`.
-    paths:
-        Positions at each fast step, slope units, (spots, n_steps, 2).
-
-    Returns
-    -------
-    One over slope units squared, (spots, rows, columns).
+    Covariance and edges are as in `pixel_mass_2d`; ``paths`` are positions at each fast step, slope units, (spots,
+    n_steps, 2).
     """
     # Spot by spot: the quadrature of all at once would not fit into memory.
     light = np.stack([pixel_mass_2d(covariance, x_edges, y_edges, path).mean(axis=0) for path in paths])
@@ -72,16 +54,8 @@ def exposure_density_2d(
 
 
 def kernel_moments_2d(covariance: FloatArray, pixel: tuple[float, float], highest: int) -> FloatArray:
-    """Moments E[x^p y^q] of a resting spot about its position, as sums over pixel centres give them, by p and q.
-
-    Parameters
-    ----------
-    pixel:
-        Width and height of a pixel, slope units.
-
-    Returns
-    -------
-    (highest + 1, highest + 1); entries with p + q > highest are zero.
+    """Moments E[x^p y^q] of a resting spot about its position, as sums over pixel centres give them, by p and q:
+    (highest + 1, highest + 1); entries with p + q > highest are zero. ``pixel`` is its width and height, slope units.
     """
     total = np.array(covariance, dtype=np.float64)
     gaussian = np.zeros((highest + 1, highest + 1))

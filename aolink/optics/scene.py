@@ -55,12 +55,8 @@ class SceneSensor:
 
 
 def scene_motion(n_outputs: int) -> FloatArray:
-    """Matrix of the scene's motion, which is the spots' mean displacement along x and y, or along x for a line sensor.
-
-    Returns
-    -------
-    The matrix, (1 or 2, n_outputs); its product with the rig's outputs is the scene's displacement, slope units.
-    """
+    """Matrix (1 or 2, n_outputs) whose product with the rig's outputs is the scene's displacement, slope units: the
+    spots' mean displacement along x and y, or along x for a line sensor."""
     return np.eye(1) if n_outputs == 1 else np.tile(np.eye(2), (1, n_outputs // 2)) / (n_outputs // 2)
 
 

@@ -90,7 +90,7 @@ class BaseSensor(ABC):
     @property
     @abstractmethod
     def peak_density(self) -> float:
-        """Density of a pixel at whose middle a spot rests."""
+        """Density of a pixel at whose middle a spot rests, one over ``pixel_size``."""
 
     @property
     def lit(self) -> Indices:
@@ -132,27 +132,22 @@ class Sensor(BaseSensor):
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Rows and columns of a frame."""
         return (1, self.pixels)
 
     @property
     def pixel_width(self) -> float:
-        """D, slope units."""
         return (self.field[1] - self.field[0]) / self.pixels
 
     @property
     def pixel_size(self) -> float:
-        """D, slope units."""
         return self.pixel_width
 
     @property
     def profile(self) -> Sensor:
-        """The sensor itself."""
         return self
 
     @property
     def peak_density(self) -> float:
-        """Density of a pixel at whose middle a spot rests, one over slope units."""
         return math.erf(self.pixel_width / 2 / self.kernel.sigma) / self.pixel_width
 
     @property
@@ -187,27 +182,22 @@ class SpotSensor(BaseSensor):
 
     @cached_property
     def lit(self) -> Indices:
-        """Windows that have a spot, counted along the rows of the grid, (spots,)."""
         return super().lit if self.light is None else np.flatnonzero(self.light)
 
     @cached_property
     def spot_light(self) -> FloatArray | None:
-        """Share of each spot's lenslet that is lit, (spots,); None where all are fully lit."""
         return None if self.light is None else np.array(self.light)[self.lit]
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Rows and columns of a frame."""
         return (self.grid[0] * self.window[0], self.grid[1] * self.window[1])
 
     @property
     def pixel_width(self) -> float:
-        """Side of a pixel, slope units."""
         return (self.field[1] - self.field[0]) / self.window[1]
 
     @property
     def pixel_size(self) -> float:
-        """Area of a pixel, slope units squared."""
         return self.pixel_width**2
 
     @cached_property
@@ -220,20 +210,14 @@ class SpotSensor(BaseSensor):
         side, across = self.pixel_width, self.window[0]
         roundings = (across - 1) * side**3 / (12 * self.counts_per_density**2)
         return Sensor(
-            kind="line",
-            pixels=self.window[1],
-            field=self.field,
+            kind="line", pixels=self.window[1], field=self.field, kernel=self.kernel,
             noise_density=self.noise_density * (self.field[1] - self.field[0]) + roundings,
-            kernel=self.kernel,
-            bit_depth=self.bit_depth + (across - 1).bit_length(),
-            black_level=across * self.black_level,
-            counts_per_density=self.counts_per_density / side,
-            photoelectrons=self.photoelectrons,
-        )
+            bit_depth=self.bit_depth + (across - 1).bit_length(), black_level=across * self.black_level,
+            counts_per_density=self.counts_per_density / side, photoelectrons=self.photoelectrons,
+        )  # fmt: skip
 
     @property
     def peak_density(self) -> float:
-        """Density of a pixel at whose middle a spot rests, one over slope units squared."""
         half = self.pixel_width / 2
         if self.kernel.matrix is None:
             return (math.erf(half / self.kernel.sigma) / self.pixel_width) ** 2

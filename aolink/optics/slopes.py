@@ -81,13 +81,13 @@ class FrameSlopes:
 
 
 def measure_slopes(
-    frame: NDArray[np.generic],
-    reference: NDArray[np.generic],
-    *,
-    pitch_m: float | None = None,
+    frame: NDArray[np.generic], reference: NDArray[np.generic], *, pitch_m: float | None = None,
     focal_m: float | None = None,
-) -> FrameSlopes:
+) -> FrameSlopes:  # fmt: skip
     """Slopes and wavefront of a frame against its reference, from the displacements of their spots.
+
+    Raises `FrameError` where a frame has no spots, they do not lie on a grid, or the two grids do not belong to one
+    instrument.
 
     Parameters
     ----------
@@ -96,11 +96,6 @@ def measure_slopes(
     pitch_m, focal_m:
         Distance from a lenslet's middle to the next one's, and focal length, m; the pitch in pixels is the reference's
         own. Where both are None, slopes are left in pixels.
-
-    Raises
-    ------
-    FrameError
-        A frame has no spots, they do not lie on a grid, or the two grids do not belong to one instrument.
     """
     if frame.shape != reference.shape:
         raise FrameError(f"the frame has {frame.shape} pixels, the reference {reference.shape}: take one camera's")

@@ -51,34 +51,24 @@ class Psi:
 
 
 def light_in_windows(psi: Psi, side: int, path_px: FloatArray) -> FloatArray:
-    """Share of each spot's light in the pixels of its window, averaged over its path.
+    """Share of each spot's light in the pixels of its window, averaged over its path, (spots, side, side).
 
-    Parameters
-    ----------
-    side:
-        Pixels along each side of a window.
-    path_px:
-        x and y at each fast step, pixels, 0 at the middle of the first pixel, (spots, 2, n_steps).
-
-    Returns
-    -------
-    Shares, (spots, side, side); a spot that is wholly in its window sums to one.
+    A spot that is wholly in its window sums to one. ``path_px`` is x and y at each fast step, pixels, 0 at the middle
+    of the first pixel, (spots, 2, n_steps).
     """
     if psi.shape == "image":
         return _image_windows(psi, side, path_px)
     light = np.empty((len(path_px), side, side))
     for k in range(0, len(path_px), _AT_ONCE):
         some = slice(k, k + _AT_ONCE)
-        masses = _delta_masses(side, path_px[some]) if psi.shape == "delta" else _sinc2_masses(psi, side, path_px[some])
+        if psi.shape == "delta":  # one in the pixel where the spot is
+            masses = np.asarray(np.floor(path_px[some] + 0.5)[..., None] == np.arange(side), dtype=np.float64)
+        else:
+            masses = _sinc2_masses(psi, side, path_px[some])
         # Both kernels are products of their two directions: the sum over the steps is a matrix product.
         np.matmul(masses[:, 1].swapaxes(1, 2), masses[:, 0], out=light[some])
     light /= path_px.shape[-1]
     return light
-
-
-def _delta_masses(side: int, positions: FloatArray) -> FloatArray:
-    """One in the pixel where the spot is, (..., n_steps, side)."""
-    return np.asarray((np.floor(positions + 0.5)[..., None] == np.arange(side)), dtype=np.float64)
 
 
 def _sinc2_masses(psi: Psi, side: int, positions: FloatArray) -> FloatArray:

@@ -41,10 +41,7 @@ class Layer:
 class FrozenFlow:
     """One layer's wavefront as a sum of plane waves: a wavefront in metres of path for any point and time.
 
-    Parameters
-    ----------
-    shortest_m:
-        Waves shorter than this are left out.
+    Waves shorter than ``shortest_m`` are left out.
     """
 
     def __init__(self, layer: Layer, rng: np.random.Generator, shortest_m: float, waves: int = _WAVES) -> None:

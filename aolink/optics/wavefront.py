@@ -23,21 +23,12 @@ class SpotReconstructor:
     """A least-squares reconstructor of a wavefront's values at spots anywhere, sparse, factored once for a pattern of
     spots.
 
-    It has Southwell's geometry (J. Opt. Soc. Am. 70, 998 (1980)) on the graph of neighbours, for any lattice:
-    along each edge the wavefront changes by the mean slope of its two spots times the vector from one to the other. It
-    is exact for wavefronts of the second degree.
+    It has Southwell's geometry (J. Opt. Soc. Am. 70, 998 (1980)) on the graph of neighbours, for any lattice: along
+    each edge the wavefront changes by the mean slope of its two spots times the vector from one to the other. It is
+    exact for wavefronts of the second degree.
 
-    Parameters
-    ----------
-    positions:
-        Positions of the spots' lenslets, (spots, 2) as (x, y); the wavefront's unit is that of slopes times theirs.
-    edges:
-        Pairs of neighbours, as numbers of spots, (edges, 2).
-
-    Raises
-    ------
-    ValueError
-        There are no spots.
+    ``positions`` of the spots' lenslets are (spots, 2) as (x, y): the wavefront's unit is that of slopes times theirs.
+    ``edges`` are pairs of neighbours, as numbers of spots, (edges, 2). Raises `ValueError` where there are no spots.
     """
 
     def __init__(self, positions: FloatArray, edges: IntArray) -> None:
@@ -97,44 +88,23 @@ def lenslet_zernike_slopes(lenslets: Lenslets, highest: int) -> FloatArray:
 def zernike_slopes(
     positions: FloatArray, indices: tuple[int, ...], radius: float, within: FloatArray | None = None
 ) -> FloatArray:
-    """Slopes of Zernike modes of unit rms at spots anywhere on the pupil, as `modal_reconstructor` takes them.
+    """Slopes of Zernike modes of unit rms at spots anywhere on the pupil, as `modal_reconstructor` takes them, (spots,
+    2, modes).
 
-    Parameters
-    ----------
-    positions:
-        Positions of the spots' lenslets from the middle of the pupil, (spots, 2).
-    radius:
-        Radius of the pupil, in the unit of the positions.
-    within:
-        Points that fill a lenslet evenly, from its middle, (points, 2): the slope is the mean over them. None: at its
-        middle.
-
-    Returns
-    -------
-    (spots, 2, modes)
+    Positions of the spots' lenslets are from the middle of the pupil, (spots, 2), and the pupil's radius is in their
+    unit. ``within`` are points that fill a lenslet evenly, from its middle, (points, 2): the slope is the mean over
+    them. None: at its middle.
     """
     points = (positions[:, None] + (np.zeros((1, 2)) if within is None else within)) / radius
     return np.stack([zernike_gradient(i, points).mean(axis=1) / radius for i in indices], axis=-1)
 
 
 def modal_reconstructor(slopes: FloatArray, weights: FloatArray) -> FloatArray:
-    """The matrix from slopes to coefficients, by least squares.
+    """The matrix from slopes to coefficients, by least squares, (modes, 2 spots), for slopes in the order x of spot 0,
+    y of spot 0, x of spot 1, ...
 
-    Parameters
-    ----------
-    slopes:
-        Slopes of each mode, (spots, 2, modes).
-    weights:
-        Weight of each lenslet's slopes, (spots,), such as its light; zero leaves it out.
-
-    Returns
-    -------
-    (modes, 2 spots), for slopes in the order x of spot 0, y of spot 0, x of spot 1, ...
-
-    Raises
-    ------
-    ValueError
-        The slopes do not determine the modes.
+    ``slopes`` are those of each mode, (spots, 2, modes); ``weights`` that of each lenslet's, (spots,), such as its
+    light: zero leaves it out. Raises `ValueError` where the slopes do not determine the modes.
     """
     both = np.repeat(weights, 2)
     H = np.where(both[:, None] > 0, slopes.reshape(len(both), -1), 0.0)

@@ -37,24 +37,10 @@ else:  # the type checker would accept any name
     )
 
 __all__ = [
-    "FIGURES",
-    "Overview",
-    "draw_session",
-    "incidents",
-    "new_figure",
-    "overview",
-    "paper",
-    "plot_blur",
-    "plot_errors",
-    "plot_exposure",
-    "plot_latency",
-    "plot_losses",
-    "plot_nis",
-    "plot_pupil",
-    "plot_scene",
-    "save_figure",
-    "write_report",
-]
+    "FIGURES", "Overview", "draw_session", "incidents", "new_figure", "overview", "paper", "plot_blur",
+    "plot_errors", "plot_exposure", "plot_latency", "plot_losses", "plot_nis", "plot_pupil", "plot_scene",
+    "save_figure", "write_report",
+]  # fmt: skip
 
 
 def __dir__() -> list[str]:

@@ -36,30 +36,22 @@ def exposure_with_estimates(
 ) -> tuple[Exposure, dict[str, Estimate]]:
     """An exposure by its number, counted from 0, and its estimates.
 
-    Without names they are those of the baseline and of the estimator with the highest rank.
-
-    Raises
-    ------
-    RecordingError
-        There are no estimates of such a name.
-    ExportError
-        There is no such exposure, or its frame is not of the rig's sensor.
+    Without names they are those of the baseline and of the estimator with the highest rank. Raises `RecordingError`
+    where there are no estimates of such a name; `ExportError` where there is no such exposure, or its frame is not of
+    the rig's sensor.
     """
     if not 0 <= number < len(series):
         there = f"has {len(series)}, counted from 0" if len(series) else "holds none"
         raise ExportError(f"there is no exposure {number}: {series.path} {there}")
     ranked = by_rank(list(series.named(None)))
-    names = series.named(estimators if estimators is not None else _baseline_and_best(ranked))
+    usual = [name for name in dict.fromkeys((BASELINE_ESTIMATOR, *ranked[-1:])) if name in ranked]
+    names = series.named(usual if estimators is None else estimators)
     one = series[number : number + 1]
     exposure, estimates = next(iter(one.with_estimates(names)), (None, []))
     if exposure is None:
         raise ExportError(f"exposure {number} of {series.path} cannot be read; `aolink info --check` says why")
     check_frame(series, exposure)
     return exposure, {name: each for name, each in zip(names, estimates, strict=True) if each is not None}
-
-
-def _baseline_and_best(ranked: Sequence[str]) -> list[str]:
-    return [name for name in dict.fromkeys((BASELINE_ESTIMATOR, *ranked[-1:])) if name in ranked]
 
 
 def plot_exposure(
@@ -180,9 +172,7 @@ def _draw_path(axes: Axes, times: FloatArray, path: FloatArray, sd: FloatArray |
         axes.fill_between(times, path - BAND * sd, path + BAND * sd, color=colour(name), alpha=0.2, linewidth=0)
 
 
-def _draw_spot(
-    axes: Axes, sensor: BaseSensor, exposure: Exposure, estimates: dict[str, Estimate], spot: int
-) -> None:  # fmt: skip
+def _draw_spot(axes: Axes, sensor: BaseSensor, exposure: Exposure, estimates: dict[str, Estimate], spot: int) -> None:
     """Draw the picture of one spot with the paths over it."""
     window = sensor.window_of(spot)
     counts = np.where(exposure.mask[window], exposure.pixels[window].astype(float), np.nan)

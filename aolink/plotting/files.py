@@ -13,7 +13,7 @@ from aolink.exporting.common import Progress, no_progress
 from aolink.files import writing
 from aolink.plotting.devices import plot_latency, plot_losses
 from aolink.plotting.exposure import plot_exposure
-from aolink.plotting.overview import Overview, need_exposures, overview
+from aolink.plotting.overview import need_exposures, overview
 from aolink.plotting.pupil import plot_pupil
 from aolink.plotting.scene import plot_scene
 from aolink.plotting.session import plot_blur, plot_errors, plot_nis
@@ -31,8 +31,6 @@ _DATED = {".svg": "Date", ".pdf": "CreationDate"}
 
 @dataclass(frozen=True)
 class _Figure:
-    """A figure that has a name."""
-
     what: str
     """The content of the figure, in words."""
     height: float
@@ -111,7 +109,9 @@ def save_figure(
         else:
             number = exposure
             if number is None:
-                number = _most_blurred(overview(recording, estimators, progress=progress))
+                view = overview(recording, estimators, progress=progress)
+                need_exposures(view)
+                number = next(iter(view.telling()))
             if what == "scene":
                 plot_scene(recording, number, figure)
             else:
@@ -122,8 +122,3 @@ def save_figure(
         with writing(path, overwrite=overwrite, sources=recording.files, error=ExportError) as partial:
             figure.savefig(partial, format=path.suffix.lower()[1:], metadata=metadata)
     return path
-
-
-def _most_blurred(view: Overview) -> int:
-    need_exposures(view)
-    return next(iter(view.telling()))

@@ -194,25 +194,22 @@ class _Gathered:
 
     def add(self, exposure: Exposure, estimates: Sequence[Estimate | None]) -> None:
         missing = 0.0 if exposure.slopes is not None else 1 - float(np.mean(exposure.mask))
-        self.facts.append(
-            (exposure.frame_id, exposure.first_step, exposure.n_steps, missing, exposure.inputs_assumed)
-        )  # fmt: skip
+        self.facts.append((exposure.frame_id, exposure.first_step, exposure.n_steps, missing, exposure.inputs_assumed))
         truth = None if exposure.truth is None else exposure.truth.path
         known = slice(None) if exposure.truth is None else exposure.truth.known
         found = {"truth": truth} if truth is not None else {}
         for name, estimate in zip(self.names, estimates, strict=True):
             self.status[name].append(_NONE if estimate is None else int(estimate.status))
-            self.errors[name].append(
-                np.nan if estimate is None or truth is None else rms((estimate.path - truth)[known])
-            )
-            nis = (np.nan, np.nan)
+            nis, error = (np.nan, np.nan), np.nan
             if estimate is not None:
+                error = np.nan if truth is None else rms((estimate.path - truth)[known])
                 self.scorers[name].add(exposure, estimate)
                 found[name] = estimate.path
                 if estimate.innovation.shape[1]:
                     self.measurements[name] = estimate.innovation.shape[1]
                     seen = estimate.nis[estimate.nis > 0]
                     nis = (float(estimate.nis[self.axis]), float(seen.mean()) if len(seen) else np.nan)
+            self.errors[name].append(error)
             self.nis[name].append(nis)
         last = self.names[-1] if self.names else ""
         about = truth if truth is not None else found.get(last)
@@ -268,26 +265,17 @@ class _Gathered:
         truth = any(np.isfinite(each).any() for each in self.errors.values())
         nis = {name: np.array(values).reshape(-1, 2).T for name, values in self.nis.items()}
         return Overview(
-            series=self.series,
-            names=self.names,
-            output=self.output,
-            frame_ids=frame_ids.astype(np.int64),
-            first_steps=first_steps.astype(np.int64),
-            n_steps=n_steps.astype(np.int64),
-            missing=missing,
-            assumed=assumed.astype(np.int64),
-            moved=np.array(self.moved),
-            apart=np.array(self.apart),
+            series=self.series, names=self.names, output=self.output, frame_ids=frame_ids.astype(np.int64),
+            first_steps=first_steps.astype(np.int64), n_steps=n_steps.astype(np.int64), missing=missing,
+            assumed=assumed.astype(np.int64), moved=np.array(self.moved), apart=np.array(self.apart),
             errors={name: np.array(values) for name, values in self.errors.items()} if truth else {},
             status={name: np.array(values, dtype=np.int64) for name, values in self.status.items()},
             nis={name: nis[name][0] for name in self.measurements},
             mean_nis={name: nis[name][1] for name in self.measurements},
             measurements=self.measurements,
             scores={name: scorer.result() for name, scorer in self.scorers.items()},
-            spans=spans - (spans[0, 0] if len(spans) else 0),
-            blur=np.array(self.blur),
-            paths=paths,
-        )
+            spans=spans - (spans[0, 0] if len(spans) else 0), blur=np.array(self.blur), paths=paths,
+        )  # fmt: skip
 
 
 def profile_density(sensor: BaseSensor, exposure: Exposure, output: int) -> FloatArray:

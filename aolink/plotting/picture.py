@@ -16,8 +16,6 @@ from aolink.plotting.session import plot_blur, plot_errors
 from aolink.plotting.style import colour
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
     from aolink.series import Series
 
 _SIZE_IN, _DPI = (16.0, 11.5), 110
@@ -83,16 +81,12 @@ def _draw_errors(figure: Any, view: Overview) -> None:
         over_time.set_title("No errors: the recording holds no truth or no estimates", loc="left")
         return
     plot_errors(view, over_time)
-    _draw_overall(whole, view)
-
-
-def _draw_overall(axes: Axes, view: Overview) -> None:
     names = list(view.errors)
     overall = [view.scores[name].path_rmse for name in names]
     places = np.arange(len(names))[::-1]
-    axes.barh(places, overall, color=[colour(name) for name in names])
+    whole.barh(places, overall, color=[colour(name) for name in names])
     for place, value in zip(places, overall, strict=True):
-        axes.annotate(f" {value:.3g}", (value, place), va="center")
-    axes.set_yticks(places, names)
-    axes.set(xlabel="RMSE of the path over the whole session (slope units)")
-    axes.margins(x=0.15)
+        whole.annotate(f" {value:.3g}", (value, place), va="center")
+    whole.set_yticks(places, names)
+    whole.set(xlabel="RMSE of the path over the whole session (slope units)")
+    whole.margins(x=0.15)

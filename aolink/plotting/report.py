@@ -87,10 +87,7 @@ def write_report(
     if not recordings:
         raise ExportError("a report needs a recording")
     sources = [each for recording in recordings for each in recording.files]
-    with (
-        paper(),
-        writing(path, overwrite=overwrite, sources=sources, suffix=path.suffix, error=ExportError) as partial,
-    ):
+    with paper(), writing(path, overwrite=overwrite, sources=sources, suffix=path.suffix, error=ExportError) as partial:
         sessions = [_Session(each, unit, progress or (lambda name, done: None)) for each in recordings]
         partial.write_text(_page(sessions), encoding="utf-8")
     return path
@@ -113,9 +110,7 @@ class _Session:
     def title(self) -> str:
         return f"<h3>{escape(self.name)}</h3>"
 
-    def drawn(
-        self, size: tuple[float, float], caption: str, draw: Callable[[Overview, Figure], object]
-    ) -> str:  # fmt: skip
+    def drawn(self, size: tuple[float, float], caption: str, draw: Callable[[Overview, Figure], object]) -> str:
         """A figure with its caption; where it cannot be drawn, the reason."""
         if self.view is None:
             return _note(self.problem)
@@ -215,32 +210,26 @@ class _Session:
 
 _OVER_SESSION: dict[str, tuple[str, Callable[..., Any]]] = {
     "Blur and paths": ("The camera's blur, and the positions of the spot.", plot_blur),
-    "Consistency": (
-        "NIS of each estimator; dashed: the bounds of 95 % of a consistent estimator's values.", plot_nis
-    ),
+    "Consistency": ("NIS of each estimator; dashed: the bounds of 95 % of a consistent estimator's values.", plot_nis),
     "Errors": ("Error of the path against the truth, a running mean.", plot_errors),
     "Losses": ("What was lost, gated or skipped, and when.", plot_losses),
     "Latencies": ("When each step of the loop was done, and how long an estimate took (dashed).", plot_latency),
-}  # fmt: skip
+}
 """Captions of the figures over the session and the functions that draw them, by their titles."""
 
 
 def _page(sessions: Sequence[_Session]) -> str:
     many = len(sessions) > _SIDE_BY_SIDE
-    title = ", ".join(each.name for each in sessions[:_SIDE_BY_SIDE]) + (
-        f" and {len(sessions) - 3} more" if many else ""
-    )
+    title = ", ".join(each.name for each in sessions[:_SIDE_BY_SIDE])
+    title += f" and {len(sessions) - 3} more" if many else ""
     parts = [f"<h1>{escape(title)}</h1>", _note(f"A report by aolink {version('aolink')}.")]
     if len(sessions) > 1:
         parts += ["<h2>Beside each other</h2>", _comparison(sessions)]
     if many:
         parts.append("<h2>Each of them</h2>")
         for each in sessions:
-            parts += [
-                each.title(),
-                *map(_note, each.lacks()),
-                _row([each.over_session("Blur and paths"), each.scores()]),
-            ]
+            figures = _row([each.over_session("Blur and paths"), each.scores()])
+            parts += [each.title(), *map(_note, each.lacks()), figures]
     else:
         parts.extend(_sections(sessions))
     body = "\n".join(parts)
@@ -281,16 +270,13 @@ def _comparison(sessions: Sequence[_Session]) -> str:
     for each in sessions:
         count = str(len(each.recording))
         known = each.view.scores if each.view is not None else {}
+        begin = [_text(each.name), _text(each.recording.rig.name), _number(count)]
         if not known:
-            rows.append(
-                [_text(each.name), _text(each.recording.rig.name), _number(count), *[_text("none")], *["<td></td>"] * 5]
-            )
+            rows.append([*begin, _text("none"), *["<td></td>"] * 5])
         for name, score in known.items():
-            rows.append([
-                _text(each.name), _text(each.recording.rig.name), _number(count), _text(name),
-                _number(_rounded(score.path_rmse, score)), _number(_rounded(score.end_rmse, score)),
-                _consistency(score.nis), _consistency(score.end_nees), _number(str(score.gated)),
-            ])  # fmt: skip
+            errors = [_number(_rounded(error, score)) for error in (score.path_rmse, score.end_rmse)]
+            consistent = [_consistency(score.nis), _consistency(score.end_nees)]
+            rows.append([*begin, _text(name), *errors, *consistent, _number(str(score.gated))])
     return _table(heads, rows, text_columns=(0, 1, 3))
 
 

@@ -18,9 +18,7 @@ if TYPE_CHECKING:
 _PICTURE_IN = (3.0, 3.2)
 
 
-def plot_scene(
-    recording: Recording, number: int, figure: Figure | SubFigure | None = None
-) -> Figure | SubFigure:  # fmt: skip
+def plot_scene(recording: Recording, number: int, figure: Figure | SubFigure | None = None) -> Figure | SubFigure:
     """Draw the picture sensor's scene of one exposure: as it came, restored, and at rest, as far as these exist.
 
     All have the same grey: black is dark, white an intensity of one. Pixels that never came are red. For a rig without

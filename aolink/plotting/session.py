@@ -76,17 +76,15 @@ def _draw_paths(axes: Axes, view: Overview, name: str, scale: float) -> None:
         times, low, high = (np.concatenate([each, gap], axis=1).ravel() for each in (times * scale, low, high))
         axes.fill_between(
             times, low, high, color=colour(name), alpha=0.35, linewidth=0.3, label=f"{name} (range)", rasterized=True
-        )  # fmt: skip
+        )
         return
     times = np.concatenate([(begin + (end - begin) * paths.places) * scale, gap], axis=1).ravel()
     axes.plot(
         times, np.concatenate([paths.points, gap], axis=1).ravel(), color=colour(name), linewidth=width, label=name
-    )  # fmt: skip
+    )
 
 
-def plot_nis(
-    view: Overview, axes: Axes | None = None, *, one_axis: bool = False, unit: TimeUnit = "s"
-) -> Axes:  # fmt: skip
+def plot_nis(view: Overview, axes: Axes | None = None, *, one_axis: bool = False, unit: TimeUnit = "s") -> Axes:
     """Draw the NIS of each estimator with the interval that holds 95 % of its values if the filter is consistent.
 
     With many axes it is their mean, whose interval is narrower; with ``one_axis`` it is that of the overview's output.
@@ -109,9 +107,7 @@ def plot_nis(
         drawn.setdefault(view.measurements[name], []).append(name)
         gated = np.isin(view.status[name], (Status.GATED, Status.DIVERGED))
         if gated.any():
-            axes.plot(
-                times[gated], values[gated], "x", color=colour(name), markersize=5, label=f"{name}, gated"
-            )  # fmt: skip
+            axes.plot(times[gated], values[gated], "x", color=colour(name), markersize=5, label=f"{name}, gated")
     for degrees, names in drawn.items():
         for bound in nis_bounds(degrees * count):
             axes.axhline(bound / count, color=colour(names[-1]), linewidth=0.7, linestyle="--", zorder=1)

@@ -69,13 +69,9 @@ def legend_above(axes: Axes, columns: int = 5) -> None:
     """A legend over the axes, where it covers no curve; none where nothing has a label."""
     if axes.get_legend_handles_labels()[0]:
         axes.legend(
-            loc="lower left",
-            bbox_to_anchor=(0, 1),
-            borderaxespad=0.2,
-            ncols=columns,
-            columnspacing=1.0,
+            loc="lower left", bbox_to_anchor=(0, 1), borderaxespad=0.2, ncols=columns, columnspacing=1.0,
             handlelength=1.5,
-        )
+        )  # fmt: skip
 
 
 def colour_bar(mapped: Any, axes: Axes, label: str) -> None:

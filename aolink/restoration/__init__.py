@@ -25,23 +25,7 @@ else:  # the type checker would accept any name
 
 
 __all__ = [
-    "METHODS",
-    "Blurred",
-    "Method",
-    "Psf",
-    "Restored",
-    "RestoredPictures",
-    "Scanner",
-    "block_matching",
-    "deblur",
-    "find_method",
-    "first_order",
-    "from_correlation",
-    "largest_zero",
-    "measured_correlation",
-    "motion_psf",
-    "motion_psf_by_root",
-    "non_local_means",
-    "restore",
-    "stable_direction",
-]
+    "METHODS", "Blurred", "Method", "Psf", "Restored", "RestoredPictures", "Scanner", "block_matching", "deblur",
+    "find_method", "first_order", "from_correlation", "largest_zero", "measured_correlation", "motion_psf",
+    "motion_psf_by_root", "non_local_means", "restore", "stable_direction",
+]  # fmt: skip

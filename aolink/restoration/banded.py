@@ -16,14 +16,9 @@ _BLOCK, _PRODUCT = 16, 250_000
 
 
 def smooth_lines(
-    lines: FloatArray,
-    values: FloatArray,
-    correlation: float,
-    variance: float,
-    noise_variance: float,
-    seen: BoolArray | None = None,
-    known: FloatArray | None = None,
-) -> FloatArray:
+    lines: FloatArray, values: FloatArray, correlation: float, variance: float, noise_variance: float,
+    seen: BoolArray | None = None, known: FloatArray | None = None,
+) -> FloatArray:  # fmt: skip
     """Posterior mean of a scene of zero mean, given all pixels of each line.
 
     Minimises |image - C scene|^2 / s^2 + scene' Q scene, with Q the tridiagonal inverse covariance of a first-order

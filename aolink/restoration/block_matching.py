@@ -34,21 +34,10 @@ _BAND = 32
 
 
 def block_matching(image: FloatArray, noise_sd: float) -> FloatArray:
-    """A picture without its white noise of this standard deviation.
+    """A picture (rows, columns) without its white noise of this standard deviation, above zero.
 
     In the first pass the small coefficients of each group are left out. Its result shows in the second pass which
     patches are similar, and how large each coefficient is without noise (Wiener's filter).
-
-    Parameters
-    ----------
-    image:
-        (rows, columns)
-    noise_sd:
-        Above zero.
-
-    Returns
-    -------
-    (rows, columns)
     """
     level = image.mean()
     noisy = (image - level).astype(np.float32)

@@ -129,10 +129,7 @@ def psnr(picture: FloatArray, scene: FloatArray, mask: BoolArray | None = None) 
 def blurred_psnr(sensor: SceneSensor, exposure: Exposure, shift_px: Indices, scene: FloatArray) -> float:
     """`psnr` of the scene before restoration, against the true scene moved by the mean displacement.
 
-    Parameters
-    ----------
-    shift_px:
-        Mean displacement along x, or x and y, whole pixels.
+    ``shift_px`` is the mean displacement along x, or x and y, whole pixels.
     """
     assert exposure.scene is not None
     x, y = int(shift_px[0]), int(shift_px[1]) if len(shift_px) > 1 else 0

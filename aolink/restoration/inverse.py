@@ -34,11 +34,8 @@ def largest_zero(values: FloatArray) -> float:
 def stable_direction(values: FloatArray, wanted: Direction | None = None) -> Direction:
     """The direction in which lines can be inverted exactly, or the requested one; backwards the PSF is reversed.
 
-    Raises
-    ------
-    RestorationError
-        The inverse is unstable in the requested direction; or in both: the PSF has zeros on both sides of the unit
-        circle.
+    Raises `RestorationError` where the inverse is unstable in the requested direction; or in both: the PSF has zeros on
+    both sides of the unit circle.
     """
     zeros: dict[Direction, float] = {"forward": largest_zero(values), "backward": largest_zero(values[..., ::-1])}
     best: Direction = "forward" if zeros["forward"] <= zeros["backward"] else "backward"
@@ -60,21 +57,11 @@ def stable_direction(values: FloatArray, wanted: Direction | None = None) -> Dir
 
 
 def invert_lines(lines: FloatArray, values: FloatArray, known: FloatArray | None) -> FloatArray:
-    """The scenes whose blur is exactly these lines, scanned forwards.
+    """The scenes whose blur is exactly these lines (lines, columns), scanned forwards: (lines, columns + m), the m
+    pixels of the initial state first. The PSF is (taps,) or (columns, taps), c_0 above zero.
 
-    Parameters
-    ----------
-    lines:
-        (lines, columns)
-    values:
-        (taps,) or (columns, taps), c_0 above zero.
-    known:
-        The scene's m pixels before the first that c_0 meets, in their order on the line, (lines or 1, m). None
-        estimates them: of all scenes that give these lines, the one with the smallest differences.
-
-    Returns
-    -------
-    (lines, columns + m), the m pixels of the initial state first.
+    ``known`` are the scene's m pixels before the first that c_0 meets, in their order on the line, (lines or 1, m).
+    None estimates them: of all scenes that give these lines, the one with the smallest differences.
     """
     columns, m = lines.shape[1], values.shape[-1] - 1
     C = line_matrix(values, columns)

@@ -34,19 +34,11 @@ class LineModel:
 
 
 def line_model(values: FloatArray, columns: int, scanner: Scanner, known: FloatArray | None = None) -> LineModel:
-    """The model of lines blurred by a PSF.
+    """The model of lines of so many pixels of a scanner's scene, blurred by a PSF c_0 .. c_m, (taps,), or that of each
+    pixel, (columns, taps).
 
-    Parameters
-    ----------
-    values:
-        The PSF c_0 .. c_m, (taps,), or that of each pixel, (columns, taps).
-    columns:
-        Number of pixels of a line.
-    scanner:
-        Model of the scene.
-    known:
-        The m pixels of the scene before the first, about its mean, the nearest first, (lines or 1, m); None where they
-        are not known and have the scanner's stationary covariance.
+    ``known`` are the m pixels of the scene before the first, about its mean, the nearest first, (lines or 1, m); None
+    where they are not known and have the scanner's stationary covariance.
     """
     taps = np.broadcast_to(values, (columns, values.shape[-1]))
     m, q = taps.shape[1] - 1, len(scanner.gamma)
@@ -101,17 +93,9 @@ class Filtered:
 def kalman(
     model: LineModel, lines: FloatArray, noise_variance: float, seen: BoolArray | None = None, keep: bool = False
 ) -> Filtered:
-    """Filter lines (lines, columns).
+    """Filter lines (lines, columns); ``seen`` is False where a pixel was not measured, and ``keep`` says whether to
+    keep the covariances, which the smoother needs.
 
-    Parameters
-    ----------
-    seen:
-        False where a pixel was not measured, (lines, columns).
-    keep:
-        Whether to keep the covariances, which the smoother needs.
-
-    References
-    ----------
     Shahin (13), with the barred B in B K B', in the usual two steps; F(k) there is A times the gain here.
     """
     n_lines, columns = lines.shape

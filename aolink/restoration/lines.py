@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy import ndimage
 
 from aolink.errors import RestorationError
 from aolink.numerics.arrays import BoolArray, FloatArray
@@ -17,7 +19,6 @@ from aolink.restoration.inverse import Direction, invert_lines, stable_direction
 from aolink.restoration.kalman import kalman, line_model, scene_from_states, smooth
 from aolink.restoration.method import Blurred, Restored
 from aolink.restoration.psf import STRAIGHT_PX
-from aolink.restoration.rotation import to_lines
 from aolink.restoration.scanner import Scanner, first_order
 from aolink.restoration.uncertainty import line_variance
 
@@ -57,7 +58,7 @@ def kalman_estimate(
     way = _checked_direction(direction) or "forward"
     back = None
     if not picture.psf.on_line:
-        planes, seen, back = to_lines(picture.whole, picture.seen, picture.line.angle_rad)
+        planes, seen, back = _to_lines(picture.whole, picture.seen, picture.line.angle_rad)
         picture = replace(picture, planes=planes, psf=picture.line.psf, seen=seen)
     psf, noise = picture.psf, picture.noise_variance
     if scanner is None:
@@ -102,9 +103,7 @@ class _Lines:
     direction: Direction
 
     @classmethod
-    def of(
-        cls, picture: Blurred, values: FloatArray, origin: int, boundary: _Boundary, direction: Direction
-    ) -> _Lines:  # fmt: skip
+    def of(cls, picture: Blurred, values: FloatArray, origin: int, boundary: _Boundary, direction: Direction) -> _Lines:
         """The rows of a picture with the taps that blurred it."""
         batch, height, columns = picture.planes.shape
         known = _known(boundary, height, values.shape[-1] - 1)
@@ -188,3 +187,33 @@ def _estimated(scanned: _Lines, which: str, scanner: Scanner, variance: float) -
             states = result.predicted if which == "predictor" else result.filtered
         out[some] = scene_from_states(model, states, pixels, lag=m if which == "lag" else 0, first=first)
     return np.asarray(out + mean)
+
+
+def _to_lines(
+    planes: FloatArray, good: BoolArray | None, angle_rad: float
+) -> tuple[FloatArray, BoolArray, Callable[[FloatArray], FloatArray]]:
+    """Turn pictures so that rows run along an angle from growing columns towards growing rows, by cubic splines.
+
+    ``planes``, (batch, rows, columns), have a likely value in each pixel that was not measured; ``good``, (rows,
+    columns), is True where one was. Returns the turned pictures, in a frame that holds all of them; the mask of the
+    measured pixels; and a function that turns back.
+    """
+    rows, columns = planes.shape[1:]
+    c, s = math.cos(angle_rad), math.sin(angle_rad)
+    # (row, column) in the picture from (row, column) in the turned one, about the centres.
+    turn = np.array([[c, s], [-s, c]])
+    size = np.ceil(np.abs(turn) @ (rows - 1, columns - 1)).astype(int) + 1
+    shape = (int(size[0]), int(size[1]))
+    here, there = (np.array([rows, columns]) - 1) / 2, (np.array(shape) - 1) / 2
+    offset = here - turn @ there
+    turned = np.stack([ndimage.affine_transform(p, turn, offset, shape, order=3, mode="nearest") for p in planes])
+    weight = np.ones((rows, columns)) if good is None else good.astype(np.float64)
+    seen = ndimage.affine_transform(weight, turn, offset, shape, order=1, mode="constant") > 0.999
+
+    def back(scene: FloatArray) -> FloatArray:
+        return np.stack([
+            ndimage.affine_transform(p, turn.T, there - turn.T @ here, (rows, columns), order=3, mode="nearest")
+            for p in scene
+        ])  # fmt: skip
+
+    return turned, seen, back

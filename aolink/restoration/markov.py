@@ -41,22 +41,18 @@ class Solver(Protocol):
     @property
     def frame(self) -> tuple[slice, slice]:
         """The place of the frame in the scene."""
-        ...
 
     def project(self, images: FloatingArray) -> FloatingArray:
         """H'W applied to images, the size of the scene."""
-        ...
 
     def solve(
         self, right: FloatingArray, start: FloatingArray | None = None, tolerance: float = _TOLERANCE
     ) -> FloatingArray:
         """The scene x with (H'WH + kappa L) x = right; ``tolerance`` is relative to the root of kappa x'L x."""
-        ...
 
     def guess(self, images: FloatingArray) -> FloatingArray | None:
         """A scene to start from, or None if the solver needs none; ``images`` hold likely values where nothing was
         measured."""
-        ...
 
 
 def difference_spectrum(n: int) -> NDArray[np.float64]:
@@ -318,12 +314,9 @@ def _roughness_spectrum(shape: tuple[int, int]) -> FloatingArray:
 
 
 def inverse_spectrum(
-    transfer: NDArray[np.complexfloating[Any]],
-    rough: FloatingArray,
-    kappa: float,
-    share: float = 1.0,
+    transfer: NDArray[np.complexfloating[Any]], rough: FloatingArray, kappa: float, share: float = 1.0,
     white: bool = False,
-) -> FloatingArray:
+) -> FloatingArray:  # fmt: skip
     """One over the spectrum of (H'H + kappa L), or with I instead of L; a given share of the plane's pixels is
     measured."""
     # A floor for the mean, which the differences do not determine.

@@ -31,27 +31,14 @@ _TOLERANCE = 3e-3
 
 
 def plug_and_play(
-    make_solver: Callable[[float], IterativeSolver],
-    images: FloatArray,
-    noise_variance: float,
-    start: NDArray[np.floating[Any]],
-    denoise: Denoiser,
-) -> FloatArray:
+    make_solver: Callable[[float], IterativeSolver], images: FloatArray, noise_variance: float,
+    start: NDArray[np.floating[Any]], denoise: Denoiser,
+) -> FloatArray:  # fmt: skip
     """Half-quadratic splitting: in turn, the scene x that minimises |image - H x|^2 / s^2 + rho |x - z|^2, and the
     denoised z of x.
 
-    Parameters
-    ----------
-    make_solver:
-        A function that gives the solver of (H'WH + kappa I) for a kappa.
-    images:
-        (batch, rows, columns)
-    start:
-        A first restoration, beyond the frame as well, (batch, rows, columns).
-
-    Returns
-    -------
-    (batch, rows, columns)
+    ``make_solver`` gives the solver of (H'WH + kappa I) for a kappa. Images, ``start``, a first restoration beyond the
+    frame as well, and the result are (batch, rows, columns).
     """
     noise_sd, span = math.sqrt(noise_variance), float(np.ptp(images))
     last = max(noise_sd, _LAST_SD * span)

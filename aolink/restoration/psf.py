@@ -113,12 +113,9 @@ def as_psf(psf: Psf | ArrayLike) -> Psf:
 
 
 def motion_psf(
-    path: ArrayLike,
-    path_covariance: ArrayLike | None,
-    kernel: Kernel,
-    pixel_scale: float,
+    path: ArrayLike, path_covariance: ArrayLike | None, kernel: Kernel, pixel_scale: float,
     shares: ArrayLike | None = None,
-) -> Psf:
+) -> Psf:  # fmt: skip
     """The PSF that a path gives: its histogram convolved with the image kernel, integrated over pixels.
 
     Parameters
@@ -201,12 +198,8 @@ def _checked_shares(shares: ArrayLike | None, n: int) -> FloatArray:
 
 
 def _correlated_part(spread: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Covariances (n_steps, axes, axes) as the sum of c c' and a remainder in which x and y are independent.
-
-    Returns
-    -------
-    c, (axes, n_steps), and points and weights by which a mean over a normal distribution along c is taken.
-    """
+    """Covariances (n_steps, axes, axes) as the sum of c c' and a remainder in which x and y are independent: c, (axes,
+    n_steps), and points and weights by which a mean over a normal distribution along c is taken."""
     n, axes, _ = spread.shape
     xx, xy, yy = spread[:, 0, 0], spread[:, 0, -1], spread[:, -1, -1]
     largest = float((abs(xy) / np.sqrt(xx * yy)).max()) if axes == 2 else 0.0
@@ -263,11 +256,7 @@ def line_matrix(values: FloatArray, columns: int) -> FloatArray:
     """The matrix that blurs a line, (columns, columns + taps - 1), Shahin (4): image = C scene.
 
     The scene goes beyond the frame by as much as the PSF reaches; pixel 0 of the frame is element taps - 1 - origin.
-
-    Parameters
-    ----------
-    values:
-        (taps,), or (columns, taps).
+    Values are (taps,), or (columns, taps).
     """
     m = values.shape[-1] - 1
     taps = np.broadcast_to(values, (columns, m + 1))

@@ -19,14 +19,9 @@ _COLOURS = (3, 4)
 
 
 def restore(
-    image: ArrayLike,
-    psf: Psf | ArrayLike,
-    *,
-    method: str = DEFAULT_METHOD,
-    noise_sd: float | None = None,
-    mask: ArrayLike | None = None,
-    **parameters: Any,
-) -> Restored:
+    image: ArrayLike, psf: Psf | ArrayLike, *, method: str = DEFAULT_METHOD, noise_sd: float | None = None,
+    mask: ArrayLike | None = None, **parameters: Any,
+) -> Restored:  # fmt: skip
     """Take the blur out of a picture.
 
     Parameters
@@ -89,9 +84,7 @@ def restore(
         if psf.values.shape[0] > 1:
             turned = None if mask is None else np.asarray(mask).T
             upright = Psf(values=psf.values.T, origin=psf.origin[::-1], modes=psf.modes.swapaxes(1, 2))
-            done = restore(
-                picture.swapaxes(0, 1), upright, method=method, noise_sd=noise_sd, mask=turned, **parameters
-            )  # fmt: skip
+            done = restore(picture.swapaxes(0, 1), upright, method=method, noise_sd=noise_sd, mask=turned, **parameters)
             return replace(done, image=done.image.swapaxes(0, 1))
         psf = Psf(values=psf.values[0], origin=psf.origin[1:], modes=psf.modes[:, 0])
     _check_fit(planes, psf)

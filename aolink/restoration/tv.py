@@ -34,26 +34,14 @@ _TOLERANCE = 3e-3
 
 
 def total_variation(
-    make_solver: Callable[[float], Solver],
-    images: FloatingArray,
-    noise_variance: float,
-    difference_weight: float,
+    make_solver: Callable[[float], Solver], images: FloatingArray, noise_variance: float, difference_weight: float,
     iterations: int = ITERATIONS,
-) -> tuple[FloatingArray, Solver]:
-    """Minimise |image - H scene|^2 / (2 s^2) + w sum |gradient of scene|, w = 1.2 sqrt(lambda).
+) -> tuple[FloatingArray, Solver]:  # fmt: skip
+    """Minimise |image - H scene|^2 / (2 s^2) + w sum |gradient of scene|, w = 1.2 sqrt(lambda), lambda one over the
+    variance of the scene's differences (``difference_weight``).
 
-    Parameters
-    ----------
-    make_solver:
-        A function that gives the solver for a kappa.
-    images:
-        (batch, rows, columns)
-    noise_variance, difference_weight:
-        s^2, and lambda, one over the variance of the scene's differences.
-
-    Returns
-    -------
-    The scenes, beyond the frame as well, (batch, rows, columns), and their solver, which knows where the frame lies.
+    ``make_solver`` gives the solver for a kappa; images are (batch, rows, columns). The result is the scenes, beyond
+    the frame as well, (batch, rows, columns), and their solver, which knows where the frame lies.
     """
     penalty = PENALTY * difference_weight
     kappa = penalty * noise_variance
@@ -131,13 +119,9 @@ def plane_weight(noise_variance: float, difference_weight: float) -> float:
 
 
 def plane_total_variation(
-    plane: PeriodicPlane,
-    images: NDArray[np.float64],
-    noise_variance: float,
-    difference_weight: float,
-    seen: BoolArray | None = None,
-    iterations: int = PLANE_ITERATIONS,
-) -> FloatingArray:
+    plane: PeriodicPlane, images: NDArray[np.float64], noise_variance: float, difference_weight: float,
+    seen: BoolArray | None = None, iterations: int = PLANE_ITERATIONS,
+) -> FloatingArray:  # fmt: skip
     """Minimise |W (image - H scene)|^2 / (2 s^2) + w sum |gradient of scene|, with w of `plane_weight`.
 
     The splits are u = H scene, on a periodic plane, in which the data weight the measured pixels of the frame, and the

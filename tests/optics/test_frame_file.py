@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from aolink.errors import FrameError
-from aolink.optics.frame_file import parse_fits, parse_fits_array, read_frame
+from aolink.optics.frame_file import fits_arrays, parse_fits, read_frame
 
 
 @pytest.mark.parametrize("dtype", ["uint8", "int16", "uint16", "int32", "int64", "float32", "float64"])
@@ -93,13 +93,13 @@ def test_a_picture_in_an_extension_is_read_past_tables():
     primary = fits.PrimaryHDU()
     primary.header["EXPTIME"] = 0.25
     data = fits_bytes(primary, table, fits.ImageHDU(picture))
-    values, found, scale, zero = parse_fits_array(data)
+    values, found, scale, zero = next(fits_arrays(data))
     np.testing.assert_array_equal(found, picture)
     assert (scale, zero, values["EXPTIME"]) == (1.0, 0.0, "0.25")
 
 
 def test_a_file_without_a_picture_says_what_it_has():
     with pytest.raises(FrameError, match="compressed in tiles"):
-        parse_fits_array(fits_bytes(fits.PrimaryHDU(), fits.CompImageHDU(np.ones((40, 40), np.int16))))
+        next(fits_arrays(fits_bytes(fits.PrimaryHDU(), fits.CompImageHDU(np.ones((40, 40), np.int16)))))
     with pytest.raises(FrameError, match="no array of pixels"):
-        parse_fits_array(fits_bytes(fits.PrimaryHDU()))
+        next(fits_arrays(fits_bytes(fits.PrimaryHDU())))

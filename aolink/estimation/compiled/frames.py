@@ -21,14 +21,8 @@ _ABREAST = 64
 def window_sums(frames: NDArray[np.uint16], side: int, sums: FloatArray, ends: IntArray) -> None:
     """Sums of each window over its rows and over its columns, and the ends of each frame's scale that were met.
 
-    Parameters
-    ----------
-    frames:
-        (frames, rows * side, columns * side)
-    sums:
-        Filled, (side, frames, rows, columns, 2): over rows first.
-    ends:
-        Filled with the least and the largest count of each frame, (frames, 2).
+    Frames are (frames, rows * side, columns * side). ``sums``, (side, frames, rows, columns, 2), is filled, over rows
+    first; ``ends`` with the least and the largest count of each frame, (frames, 2).
     """
     width = frames.shape[2]
     columns = width // side
@@ -58,15 +52,8 @@ def window_sums(frames: NDArray[np.uint16], side: int, sums: FloatArray, ends: I
 
 @compiled
 def brightest_stretches(density: FloatArray, found: FloatArray) -> None:
-    """The largest sum over each of some lengths of pixels, over the root of the length.
-
-    Parameters
-    ----------
-    density:
-        A profile in each column, (pixels, n).
-    found:
-        Filled, (n,).
-    """
+    """The largest sum over each of some lengths of pixels, over the root of the length, of a profile in each column,
+    (pixels, n): ``found``, (n,)."""
     pixels, n = density.shape
     light, best = np.zeros((pixels + 1, _ABREAST)), np.empty(_ABREAST)
     for first in range(0, n, _ABREAST):

@@ -31,12 +31,8 @@ def informed(information: FloatArray, patterns: FloatArray, course_of: Indices, 
 def spread_of(left: FloatArray, patterns: FloatArray, starts: Indices, course: int, out: FloatArray) -> None:
     """Covariance of the courses' shares, (spots, 2, m, 2, m), between one course and those up to it.
 
-    Parameters
-    ----------
-    left:
-        The course's patterns times the covariance of the coefficients, (outputs, .).
-    starts:
-        Where each course's coefficients begin, and where the last one's end.
+    ``left`` holds the course's patterns times the covariance of the coefficients, (outputs, .), ``starts`` where each
+    course's coefficients begin, and where the last one's end.
     """
     for s in range(len(out)):
         for d in range(2):

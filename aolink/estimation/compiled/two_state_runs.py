@@ -75,9 +75,7 @@ def update_and_predict(
             z1 = values[k, axis, 0] - (f0 * x + f1 * v + means[k, axis])
             z2 = values[k, axis, 1] - (x * (half0 + b0) + v * (half1 + b1) + squares[k, axis])
             noise = (noises[k, axis, 0], noises[k, axis, 1], noises[k, axis, 2])
-            after = _update(
-                (x, v), (p, q, r), (z1, z2), ((f0, f1), (2 * half0, 2 * half1)), noise, noise[1] != 0.0
-            )  # fmt: skip
+            after = _update((x, v), (p, q, r), (z1, z2), ((f0, f1), (2 * half0, 2 * half1)), noise, noise[1] != 0.0)
             total = z1 + z2
             for j in range(9):
                 total += after[j]

@@ -156,9 +156,7 @@ def slopes_of(basis: FloatArray, g: FloatArray, slope: FloatArray) -> None:
 
 
 @compiled
-def remainder_of(
-    shared: FloatArray, left: FloatArray, right: FloatArray, g: FloatArray, remainder: FloatArray
-) -> None:  # fmt: skip
+def remainder_of(shared: FloatArray, left: FloatArray, right: FloatArray, g: FloatArray, remainder: FloatArray) -> None:
     """Omega, (sums, sums), by Mehler's series: as `PlainMoments.regression` of the twin.
 
     The path's covariance is ``shared`` + left' right.
@@ -195,9 +193,7 @@ def remainder_of(
 
 
 @compiled_sums
-def _four_sums(
-    c: FloatArray, g: FloatArray, a: int, end: int, second: FloatArray, third: FloatArray
-) -> None:  # fmt: skip
+def _four_sums(c: FloatArray, g: FloatArray, a: int, end: int, second: FloatArray, third: FloatArray) -> None:
     """Sums of c^2 g[1] and of c^3 g[2] over the nodes for four of the moments: c is loaded once for all of them."""
     s0 = s1 = s2 = s3 = t0 = t1 = t2 = t3 = 0.0
     for j in range(end):

@@ -14,10 +14,8 @@ from aolink.rig import Rig
 def centroid_covariance(rig: Rig) -> FloatArray:
     """Covariance of the centroids by read-out and shot noise, for spots where the plant's prior expects them.
 
-    Returns
-    -------
-    Blocks along the diagonal for each copy of the plant, one block a spot, (axes, blocks, size, size), slope units
-    squared; for one copy, (1, blocks, size, size), where all have the same light.
+    The result is blocks along the diagonal for each copy of the plant, one block a spot, (axes, blocks, size, size),
+    slope units squared; for one copy, (1, blocks, size, size), where all have the same light.
     """
     sensor, plant = rig.sensor, rig.plant
     own = _of_whole_spot(sensor, plant.n_outputs)

@@ -58,18 +58,10 @@ def noise_integrals(sensor: Sensor, highest: int) -> FloatArray:
 def measured_flux_covariance(
     sums: FloatArray, orders: Sequence[int] | Indices, ratios: FloatArray, total: FloatArray
 ) -> FloatArray:
-    """Cov(y_p, y_q) of y_p = M_p/M_0 to first order.
+    """Cov(y_p, y_q) of y_p = M_p/M_0 to first order: [C(p+q) - y_p C(q) - y_q C(p) + y_p y_q C(0)] / M_0^2.
 
-    [C(p+q) - y_p C(q) - y_q C(p) + y_p y_q C(0)] / M_0^2
-
-    Parameters
-    ----------
-    sums:
-        C(p+q) = Cov(M_p, M_q), from p + q = 0, (n,), or of each axis, (axes, n).
-    ratios:
-        y_p, kernel included, (axes, orders).
-    total:
-        M_0, (axes,).
+    ``sums`` are C(p+q) = Cov(M_p, M_q), from p + q = 0, (n,), or of each axis, (axes, n); ``ratios`` y_p, kernel
+    included, (axes, orders); ``total`` M_0, (axes,).
     """
     p = np.asarray(orders)
     y, first = ratios, sums[..., p]

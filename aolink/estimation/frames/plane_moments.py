@@ -21,16 +21,9 @@ Order = tuple[int, int]
 
 
 def measure_moments_2d(
-    density: FloatArray,
-    x_edges: FloatArray,
-    y_edges: FloatArray,
-    kernel: FloatArray,
-    noise_density: float,
-    orders: Sequence[Order],
-    flux: Flux = "known",
-    light: FloatArray | None = None,
-    photoelectrons: float = 0.0,
-) -> Measurement | str:
+    density: FloatArray, x_edges: FloatArray, y_edges: FloatArray, kernel: FloatArray, noise_density: float,
+    orders: Sequence[Order], flux: Flux = "known", light: FloatArray | None = None, photoelectrons: float = 0.0,
+) -> Measurement | str:  # fmt: skip
     """Moments of frames without the kernel.
 
     Parameters

@@ -68,10 +68,7 @@ def moments_of_frames(
 ) -> tuple[Indices, Measurement | None]:
     """Which of some frames show all spots without a flaw, and the moments of these, a row for each output of each.
 
-    Parameters
-    ----------
-    frames:
-        (frames, rows, columns), of which all pixels arrived.
+    Frames are (frames, rows, columns); all of their pixels arrived.
     """
     from aolink.estimation.compiled.frames import brightest_stretches, window_sums  # not before it is needed
 
@@ -101,14 +98,8 @@ def measure_spots(
 ) -> tuple[FrameData | None, str]:  # fmt: skip
     """What is measured of each axis in a frame, or None; and a remark on how many axes are not measured, and why.
 
-    Parameters
-    ----------
-    pixels, arrived:
-        The frame and which of its pixels arrived, (rows, columns).
-    needs:
-        What is to be measured.
-    least_significance:
-        By how many standard deviations of noise a spot must stand out, (n_outputs,) or one for all.
+    ``pixels`` is the frame, ``arrived`` which of them did, (rows, columns). ``least_significance`` says by how many
+    standard deviations of noise a spot must stand out, (n_outputs,) or one for all.
     """
     saturated = is_saturated(sensor, pixels) & arrived
     light = None if sensor.spot_light is None else np.repeat(sensor.spot_light, 2)

@@ -6,7 +6,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy import special
@@ -64,13 +64,12 @@ class Posterior:
         return Gaussian(self.coefficients.mean[:, :n], self.coefficients.covariance[:, :n, :n])
 
 
-@dataclass(frozen=True, eq=False)
-class Run:
-    """Posteriors of consecutive exposures, as in `Posterior`; arrays are (exposures, axes, ...)."""
+class Run(NamedTuple):
+    """Posteriors of consecutive exposures, as in `Estimate`; arrays are (exposures, axes, ...)."""
 
-    coefficients: FloatArray
-    covariance: FloatArray
-    end: FloatArray
+    start_state: FloatArray
+    start_covariance: FloatArray
+    end_state: FloatArray
     end_covariance: FloatArray
     innovation: FloatArray
     innovation_covariance: FloatArray
@@ -122,10 +121,9 @@ class BlurFilter(Filter):
     ) -> None:  # fmt: skip
         self.plant, self.observation = plant, observation
         self._process_noise, self._predict = process_noise, predictor or predict
-        prior = Gaussian(
+        prior = self.prior = Gaussian(
             batched.tile(plant.initial_mean, plant.axes), batched.tile(plant.initial_covariance, plant.axes)
         )
-        self.prior = prior
         """The state after the last exposure or bridge: the next exposure starts there."""
         # The prediction without any measurement; its covariance is that of every axis, (1, n_states, n_states).
         self._unseen = Gaussian(prior.mean, prior.covariance[:1])
@@ -167,13 +165,9 @@ class BlurFilter(Filter):
             self.prior = self._predict(coefficients, model.transition, noise, response.end)
         self._predict_unseen(model.transition, model.process_noise, response.end)
         return Posterior(
-            coefficients=coefficients,
-            end=self.prior,
-            status=status,
-            innovation=_numbers(done.innovation),
-            innovation_covariance=_numbers(_kept(done.innovation_covariance)),
-            nis=_numbers(done.nis),
-        )
+            coefficients=coefficients, end=self.prior, status=status, innovation=_numbers(done.innovation),
+            innovation_covariance=_numbers(_kept(done.innovation_covariance)), nis=_numbers(done.nis),
+        )  # fmt: skip
 
     def _predict_unseen(self, transition: FloatArray, noise: FloatArray, kick: FloatArray) -> None:
         """Predict `_unseen`; a covariance that has settled is not computed again."""
@@ -209,14 +203,8 @@ class BlurFilter(Filter):
 def gate_status(used: BoolArray, lost: BoolArray, missed: IntArray) -> tuple[IntArray, IntArray]:
     """The `Status` of measured axes, and how many of their measurements in a row were gated, all (axes,).
 
-    Parameters
-    ----------
-    used:
-        Whether the measurement passed the gate.
-    lost:
-        Whether enough measurements before it were gated for the filter to start again.
-    missed:
-        Number of measurements in a row before it that were gated.
+    ``used`` says whether the measurement passed the gate, ``lost`` whether enough of those before it were gated for the
+    filter to start again; ``missed`` counts the measurements in a row before it that were gated.
     """
     now = np.where(used, 0, np.where(lost, 1, missed + 1))
     passed = np.where(lost, Status.REINITIALISED, Status.OK)
@@ -236,20 +224,14 @@ class TwoStateFilter(BlurFilter):
     def warm_up(self, model: ExposureModel) -> None:
         """Load what `run` needs, or compile it, before the session."""
         nothing = Measurement(value=np.zeros((0, 2)), covariance=np.zeros((0, 2, 2)))
-        self.run(
-            model,
-            model.response(np.zeros((model.n_steps, self.plant.axes * self.plant.n_inputs))).of(slice(0)),
-            nothing,
-        )
+        response = model.response(np.zeros((model.n_steps, self.plant.axes * self.plant.n_inputs)))
+        self.run(model, response.of(slice(0)), nothing)
 
     def run(self, model: ExposureModel, responses: InputResponse, measured: Measurement) -> Run | None:
         """`step` for exposures without a gap between them, all at once and to the same bits, up to the first of which
         an axis is gated or not finite; None if that is the first of all.
 
-        Parameters
-        ----------
-        responses, measured:
-            A row for each axis of the first exposure, then of the second.
+        ``responses`` and ``measured`` have a row for each axis of the first exposure, then of the second.
         """
         if self._missed.any():
             return None
@@ -281,7 +263,7 @@ class TwoStateFilter(BlurFilter):
             self._predict_unseen(model.transition, model.process_noise, np.zeros_like(unseen))
         self._unseen = Gaussian(unseen, self._unseen.covariance)
         return Run(
-            coefficients=table[..., :2], covariance=table[..., _SQUARE + 2], end=table[..., 9:11],
+            start_state=table[..., :2], start_covariance=table[..., _SQUARE + 2], end_state=table[..., 9:11],
             end_covariance=table[..., _SQUARE + 11], innovation=table[..., 14:],
             innovation_covariance=table[..., _SQUARE + 5], nis=table[..., 8],
         )  # fmt: skip

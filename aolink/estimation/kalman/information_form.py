@@ -39,16 +39,10 @@ def information_update(
 def _updated(
     mean: FloatArray, P: FloatArray, y: FloatArray, H: FloatArray, R: FloatArray, gain: FloatArray | None
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """One axis, y its innovation, with the optimal gain or another one.
+    """One axis, y its innovation, with the optimal gain or another one; R are blocks along the diagonal, (blocks, size,
+    size).
 
-    Parameters
-    ----------
-    R:
-        Blocks along the diagonal, (blocks, size, size).
-
-    Returns
-    -------
-    Mean and covariance after it, the diagonal of the innovation covariance, and the NIS.
+    Returns mean and covariance after it, the diagonal of the innovation covariance, and the NIS.
     """
     blocks, size, _ = R.shape
     m, n = H.shape
@@ -74,12 +68,7 @@ def stepped_gain(A: FloatArray, H: FloatArray, Q: FloatArray, R: FloatArray) -> 
     """The gain that a Kalman filter settles at, (n_states, m); None where it does not settle.
 
     The Riccati equation stepped from exposure to exposure: a second for 288 states of a plant that forgets its state
-    within a few exposures.
-
-    Parameters
-    ----------
-    R:
-        Blocks along the diagonal, (blocks, size, size).
+    within a few exposures. R are blocks along the diagonal, (blocks, size, size).
     """
     blocks, size, _ = R.shape
     weighted = np.asarray(np.linalg.solve(R, H.reshape(blocks, size, -1)), dtype=np.float64).reshape(len(H), -1)

@@ -37,16 +37,8 @@ class Observation(Protocol[Data]):
 class PathMoments:
     """Moments of the path, as the paper's filters take them: no process noise inside the exposure.
 
-    Parameters
-    ----------
-    plant:
-        Its number of outputs is that of each moment's measurements.
-    orders:
-        Moments, of 1 and 2.
-    gain:
-        A constant gain (n_states, n_measurements) instead of the optimal one.
-    flux:
-        As in `Needs`.
+    The plant's number of outputs is that of the measurements of each moment, of the orders 1 and 2. ``gain`` is a
+    constant one, (n_states, n_measurements), instead of the optimal one; ``flux`` is as in `Needs`.
     """
 
     models_noise = False
@@ -99,21 +91,12 @@ class SecondOrderMoments(PathMoments):
 def predicted_moments(
     model: ExposureModel, response: InputResponse, state: FloatArray, orders: Sequence[int]
 ) -> tuple[FloatArray, FloatArray]:
-    """Moments of the path without process noise, and their Jacobian by the start state.
+    """Moments of the path without process noise, h (axes, m), and their Jacobian by the start state, H (axes, m,
+    n_states); an output's orders are together.
 
-    h_1 = C-bar x + mean(c), h_2 = x'Mx + 2 b'x + s for each output; H_1 = C-bar, H_2 = 2 (Mx + b)'.
-    Mishra & Wen (12), (13) and (15), with the inputs inside the exposure that they leave out.
-
-    Parameters
-    ----------
-    state:
-        (axes, n_states)
-    orders:
-        A subset of 1 and 2, in order.
-
-    Returns
-    -------
-    h (axes, m) and H (axes, m, n_states); an output's orders are together.
+    h_1 = C-bar x + mean(c), h_2 = x'Mx + 2 b'x + s for each output; H_1 = C-bar, H_2 = 2 (Mx + b)'. Mishra & Wen (12),
+    (13) and (15), with the inputs inside the exposure that they leave out. States are (axes, n_states); orders a subset
+    of 1 and 2, in order.
     """
     h, H = _moment_entries(model, response, state, orders)
     return entrywise.pack_vector(h, len(state)), entrywise.pack(H, len(state))

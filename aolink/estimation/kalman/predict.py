@@ -27,12 +27,8 @@ def added_noise(model: ExposureModel, kind: Noise) -> FloatArray:
 def predict(state: Gaussian, transition: FloatArray, noise: FloatArray, kick: FloatArray) -> Gaussian:
     """x -> A x + d, P -> A P A' + Q: Mishra & Wen (16) and (17), with the inputs.
 
-    Parameters
-    ----------
-    transition, noise:
-        A and Q, both (n_states, n_states).
-    kick:
-        d, the state's response to the inputs, (axes, n_states).
+    A (``transition``) and Q (``noise``) are (n_states, n_states); d (``kick``), the state's response to the inputs, is
+    (axes, n_states).
     """
     mean = predicted_mean(state.mean, transition, kick)
     if max(transition.shape) > MANY_STATES:

@@ -17,13 +17,9 @@ _ROUNDING = 1e-6
 def steady_gain(model: ExposureModel, Q: FloatArray, R: FloatArray) -> FloatArray | None:
     """Steady-state gain of the centroid filter on the lifted plant (A^N, C-bar), (n_states, n_outputs).
 
-    It corrects the state at the start of the exposure with that exposure's centroid. None where the
-    Riccati equation has no stabilising solution: the centroid does not observe an eigenmode that does not decay.
-
-    Parameters
-    ----------
-    R:
-        Covariance of the centroids as blocks along its diagonal, (blocks, size, size), or whole.
+    It corrects the state at the start of the exposure with that exposure's centroid. None where the Riccati equation
+    has no stabilising solution: the centroid does not observe an eigenmode that does not decay. R is the covariance of
+    the centroids as blocks along its diagonal, (blocks, size, size), or whole.
     """
     H = model.mean_row
     if R.ndim == 3 and H.shape[1] > MANY_STATES:

@@ -18,18 +18,11 @@ from aolink.numerics.entrywise import Entry
 def joseph_update(
     prior: Gaussian, innovation: FloatArray, H: FloatArray, R: FloatArray, gain: FloatArray | None = None
 ) -> Update:
-    """The update of a Kalman filter in Joseph form: Mishra & Wen (18) to (20), with the innovation y - h(x).
+    """The update of a Kalman filter in Joseph form: Mishra & Wen (18) to (20), with the innovation y - h(x), (axes, m).
 
-    Parameters
-    ----------
-    innovation:
-        (axes, n_measurements)
-    H:
-        Jacobian of h, (axes or 1, n_measurements, n); also (n_measurements, n), the same for all axes.
-    R:
-        Covariance of the measurement, (axes or 1, n_measurements, n_measurements).
-    gain:
-        A gain to use instead of the optimal one, (n, n_measurements): the covariance is the true one with this gain.
+    H, the Jacobian of h, is (axes or 1, m, n), also (m, n), the same for all axes; R, the covariance of the
+    measurement, (axes or 1, m, m). ``gain``, (n, m), is one to use instead of the optimal one: the covariance is the
+    true one with it.
     """
     R = batched.batch_last(R)
     PH = batched.matmul(prior.covariance, batched.transpose(H))
@@ -48,13 +41,9 @@ def blocked_update(
 ) -> Update:
     """`joseph_update` for few states and many measurements, whose noise is shared within blocks only.
 
-    With G = H' R^-1 H and M = (I + P G)^-1 P, the optimal gain is M H' R^-1 and S^-1 y = R^-1 (y - H K y): nothing
-    has more rows than there are states, and P may be singular. Where S is large, only its diagonal is computed.
-
-    Parameters
-    ----------
-    R:
-        (axes, blocks, size, size)
+    With G = H' R^-1 H and M = (I + P G)^-1 P, the optimal gain is M H' R^-1 and S^-1 y = R^-1 (y - H K y): nothing has
+    more rows than there are states, and P may be singular. Where S is large, only its diagonal is computed. R is
+    (axes, blocks, size, size).
     """
     axes, blocks, size, _ = R.shape
     n = prior.mean.shape[1]

@@ -140,9 +140,7 @@ class DenseModel(ExposureModel):
             return path
 
         end, mean, slope, square = found
-        return InputResponse(
-            end=end.T, mean=mean.T, slope=np.moveaxis(slope, -1, 0), square=square.T, whole=path
-        )  # fmt: skip
+        return InputResponse(end=end.T, mean=mean.T, slope=np.moveaxis(slope, -1, 0), square=square.T, whole=path)
 
     def _multiplied(self, inputs: FloatArray) -> InputResponse:
         """`responses` by products of matrices, of many steps at once."""

@@ -29,19 +29,12 @@ def _made_once(plant: Plant, n_steps: int, offset: float) -> ExposureModel:
 def path_from_coefficients(
     model: ExposureModel, coefficients: FloatArray, covariance: FloatArray, inputs: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Path and its standard deviation, both (axes * n_outputs, n_steps).
+    """Path and its standard deviation, both (axes * n_outputs, n_steps), from coefficients of ``model.basis``, (axes,
+    n_states) or more of its columns, their covariance, (axes, n, n), and the exposure's inputs, (n_steps, axes *
+    n_inputs).
 
-    Estimators and the reader of recordings both come here, so that a recorded estimate unfolds to the
-    bits that the estimator gave.
-
-    Parameters
-    ----------
-    coefficients:
-        Coefficients of ``model.basis``, (axes, n_states) or more of its columns.
-    covariance:
-        Covariance of the coefficients, (axes, n, n).
-    inputs:
-        The exposure's, (n_steps, axes * n_inputs); an exposure of another length has a model of its own.
+    An exposure of another length has a model of its own. Estimators and the reader of recordings both come here, so
+    that a recorded estimate unfolds to the bits that the estimator gave.
     """
     plant = model.plant
     if len(inputs) != model.n_steps:

@@ -37,12 +37,8 @@ _DRAWS = 4
 class JointPaths:
     """Paths of all spots at quadrature nodes, from the first ``size`` coefficients.
 
-    Parameters
-    ----------
-    sensor:
-        Its kernel, pixels and noise set the number of nodes and of coefficients.
-    left_out:
-        Rms of the noise path that may be left out, in standard deviations of the kernel.
+    The sensor's kernel, pixels and noise set the number of nodes and of coefficients. ``left_out`` is the rms of the
+    noise path that may be left out, in standard deviations of the kernel.
     """
 
     def __init__(self, model: FactoredModel, sensor: SpotSensor, left_out: float = LEFT_OUT) -> None:
@@ -102,10 +98,7 @@ class JointPaths:
     def foreseen(self, mean: FloatArray, response: InputResponse, axis: int) -> JointPaths:
         """The same with the response to an exposure's inputs, and as many nodes as a path about this mean needs.
 
-        Parameters
-        ----------
-        mean:
-            Mean of the coefficients before the exposure, (size,).
+        ``mean`` is that of the coefficients before the exposure, (size,).
         """
         paths, path = copy(self), response.path[axis]
         expected = self.shares(mean) @ self._functions.T + path

@@ -133,14 +133,8 @@ class Resolution:
 def resolution(paths: FloatArray, variance: float, sensor: Sensor) -> Resolution:
     """The coarsest resolution whose error in a spot's light stays below a share of the pixels' noise.
 
-    Parameters
-    ----------
-    paths:
-        Typical paths of the plant at rest, of one spot each, (paths, n_steps).
-    variance:
-        Variance of the kernel, slope units squared.
-    sensor:
-        Pixels and their noise.
+    ``paths``, (paths, n_steps), are typical ones of the plant at rest, of one spot each; ``variance`` is that of the
+    kernel, slope units squared.
     """
     n_steps = paths.shape[1]
     paths = paths - paths.mean(axis=1, keepdims=True)

@@ -64,21 +64,12 @@ class JointObservation(ABC):
         self, paths: JointPaths, prior: Gaussian, windows: SpotWindows
     ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
         """The update of one copy; the prior has the mean of all coefficients and the covariance of the state alone.
-
-        Returns
-        -------
-        Mean and covariance of the coefficients, innovation, its variance, and the NIS.
-        """
+        Gives mean and covariance of the coefficients, innovation, its variance, and the NIS."""
 
 
 class JointMoments(JointObservation):
-    """The estimator `moments` of a plant with hundreds of states: iterated statistical linearisation.
-
-    Parameters
-    ----------
-    orders, basis, flux:
-        As in `WindowedSpots`.
-    """
+    """The estimator `moments` of a plant with hundreds of states: iterated statistical linearisation. Orders, basis and
+    flux are as in `WindowedSpots`."""
 
     most_memory = Windowed.most_memory
     """As in `Windowed`."""
@@ -138,7 +129,6 @@ def by_spot(measured: SpotWindows, axis: int) -> SpotWindows:
 def _information_and_score(
     paths: JointPaths, fit: Regression, R: FloatArray, new: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Information and score of the coefficients from the sums of all spots."""
     weighted = np.linalg.solve(R, np.concatenate([fit.slope, new[..., None]], axis=2))
     products = batched.transpose(fit.slope) @ weighted
     shape = (len(products), 2, paths.functions.shape[1])

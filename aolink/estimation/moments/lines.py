@@ -37,20 +37,15 @@ _AXES_OF_A_THREAD = 16
 class WindowedMoments:
     """Windowed moments of line-sensor profiles, one output for each axis.
 
-    Parameters
-    ----------
-    orders:
-        Orders of the basis functions; 0 is the light in the window.
-    basis, flux:
-        As in `Windowed`.
+    ``orders`` are those of the basis functions; 0 is the light in the window. ``basis`` and ``flux`` are as in
+    `Windowed`.
     """
 
     models_noise = True
 
     def __init__(
-        self, sensor: Sensor, orders: Sequence[int] = (0, 1, 2, 3), *, basis: Basis = "monomial",
-        flux: Flux = "known",
-    ) -> None:  # fmt: skip
+        self, sensor: Sensor, orders: Sequence[int] = (0, 1, 2, 3), *, basis: Basis = "monomial", flux: Flux = "known"
+    ) -> None:
         self.sensor, self.basis, self.flux = sensor, basis, flux
         # A ratio to the light in the window needs the light first.
         self.orders = tuple(orders) if flux == "known" else (0, *(p for p in orders if p))
@@ -92,10 +87,7 @@ def updated(
 ) -> Gaussian:
     """Priors of a path's coefficients, of any covariance, updated with the moments of orders 0 to 3.
 
-    Parameters
-    ----------
-    memory:
-        Factor of the covariance of what the linearisation leaves out, (axes,), the same in all passes.
+    ``memory`` is the factor of the covariance of what the linearisation leaves out, (axes,), the same in all passes.
     """
     orders, n = (0, 1, 2, 3), prior.mean.shape[1]
     lines = _lines(sensor, orders, "monomial", "known", nodes, measured, n, np.empty((0, n)))

@@ -35,17 +35,11 @@ _LEAST_OF_A_ROW = 0.5
 
 
 class WindowedSpots(Windowed[SpotWindows]):
-    """Windowed moments of all spots that one copy of the plant moves.
+    """Windowed moments of all spots that one copy of the plant moves; its outputs are spot 0's x and y, spot 1's x and
+    y, ...
 
-    Parameters
-    ----------
-    spots:
-        Number of spots of one copy; its outputs are spot 0's x and y, spot 1's x and y, ...
-    orders:
-        Which functions of the basis, along x and along y; 0 is the light in the window. The product of both directions'
-        first functions belongs to the sums as well, y_11.
-    basis, flux:
-        As in `Windowed`.
+    ``orders`` says which functions of the basis, along x and along y; 0 is the light in the window. The product of both
+    directions' first functions belongs to the sums as well, y_11. Basis and flux are as in `Windowed`.
     """
 
     most_nodes = _MOST_NODES
@@ -81,27 +75,14 @@ class WindowedSpots(Windowed[SpotWindows]):
     def window_functions(
         self, mean: FloatArray, variance: FloatArray, mask: BoolArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Functions of the columns and of the rows, both (axes, spots, m, pixels).
-
-        Parameters
-        ----------
-        mean, variance:
-            Mean and variance of the path, (axes, spots, nodes, 2).
-        mask:
-            (axes, spots, rows, columns)
-        """
+        """Functions of the columns and of the rows, both (axes, spots, m, pixels), from mean and variance of the path,
+        (axes, spots, nodes, 2), and a mask (axes, spots, rows, columns)."""
         good_rows = mask.mean(axis=3) > _LEAST_OF_A_ROW
         good_columns = (mask | ~good_rows[..., None]).all(axis=2)
         line, kernel, out = self.sensor.profile, self.sensor.kernel.covariance, []
         for direction, good in enumerate((good_columns, good_rows)):
-            flat = (-1, mean.shape[2])
-            u, inside = self.window(
-                line,
-                kernel[direction, direction],
-                mean[..., direction].reshape(flat),
-                variance[..., direction].reshape(flat),
-                good.reshape(-1, good.shape[-1]),
-            )
+            place, width = (each[..., direction].reshape(-1, mean.shape[2]) for each in (mean, variance))
+            u, inside = self.window(line, kernel[direction, direction], place, width, good.reshape(-1, good.shape[-1]))
             functions = [self.function(order[direction], u) * inside for order in self.orders]
             out.append(np.stack(functions, axis=1).reshape(*mean.shape[:2], len(self.orders), -1))
         return out[0], out[1]
@@ -109,19 +90,11 @@ class WindowedSpots(Windowed[SpotWindows]):
     def expectations(
         self, along: FloatArray, across: FloatArray, mean: FloatArray, own: FloatArray
     ) -> list[FloatArray]:
-        """Expectations of the sums and of their derivatives by the spot's position, under the prior.
+        """Expectations of the sums and of their derivatives by the spot's position, under the prior: for order n, n
+        from 0 to 3, the derivatives by x (n - i) times and by y i times, i from 0 to n, (axes, spots, nodes, n + 1, m).
 
-        Parameters
-        ----------
-        along, across:
-            (axes, spots, m, pixels)
-        mean, own:
-            Mean and covariance of a spot at a node, (axes, spots, nodes, 2) and (axes, spots, nodes, 2, 2).
-
-        Returns
-        -------
-        For order n, n from 0 to 3, the derivatives by x (n - i) times and by y i times, i from 0 to n:
-        (axes, spots, nodes, n + 1, m).
+        ``along`` and ``across`` are (axes, spots, m, pixels); ``mean`` and ``own``, mean and covariance of a spot at a
+        node, (axes, spots, nodes, 2) and (axes, spots, nodes, 2, 2).
         """
         kernel, edges = self.sensor.kernel.covariance, self.sensor.profile.edges
         variance = np.maximum(np.einsum("askdd->askd", own), 0.0)
@@ -196,13 +169,8 @@ class WindowedSpots(Windowed[SpotWindows]):
 def _meetings(C: FloatArray, order: int) -> FloatArray:
     """Terms of Mehler's series between two spots at every two nodes: weights of products of their n-th derivatives.
 
-    Cov(f, f') has, for each n, the sum over all ways to pair n derivatives by x or y of f with n of f', of the
-    product of the pairs' covariances, over n!.
-
-    Parameters
-    ----------
-    C:
-        Covariance of the two spots' positions, (axes, nodes, 2, nodes, 2).
+    Cov(f, f') has, for each n, the sum over all ways to pair n derivatives by x or y of f with n of f', of the product
+    of the pairs' covariances, over n!. C is the covariance of the two spots' positions, (axes, nodes, 2, nodes, 2).
 
     Returns
     -------

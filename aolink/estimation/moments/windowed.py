@@ -145,14 +145,8 @@ class Windowed(ABC, Generic[Data]):
     ) -> tuple[FloatArray, BoolArray]:
         """u in [-1, 1] across the window about a path, and the pixels that are in it, both (axes, pixels).
 
-        Parameters
-        ----------
-        kernel:
-            Variance of the kernel in this direction, slope units squared.
-        mean, variance:
-            Mean and variance of the path at its nodes, (axes, nodes).
-        mask:
-            True where a pixel can be used, (axes, pixels).
+        ``kernel`` is the variance of the kernel in this direction, slope units squared; mean and variance are those of
+        the path at its nodes, (axes, nodes); ``mask``, (axes, pixels), is True where a pixel can be used.
         """
         sd = np.sqrt(np.maximum(variance, 0.0))
         margin = KERNEL_REACH * math.sqrt(kernel + sensor.pixel_width**2 / 12)
@@ -198,20 +192,11 @@ class Windowed(ABC, Generic[Data]):
 def weighted_sums(
     sensor: BaseSensor, W: FloatArray, density: FloatArray, light: FloatArray | None = None
 ) -> tuple[FloatArray, FloatArray]:
-    """Weighted sums of pixels and the covariance of the pixels' noise in them.
+    """Weighted sums of pixels, (..., m), and the covariance of the pixels' noise in them, (..., m, m).
 
-    Parameters
-    ----------
-    W:
-        (..., m, pixels)
-    density:
-        (..., pixels), zero where a pixel cannot be used; its weights are zero as well.
-    light:
-        Light of the spot, as a share of a whole one's, that the density was divided by, (...); one where None.
-
-    Returns
-    -------
-    (..., m) and (..., m, m)
+    W is (..., m, pixels). ``density``, (..., pixels), is zero where a pixel cannot be used; its weights are zero as
+    well. ``light`` is that of the spot, as a share of a whole one's, that the density was divided by, (...); one where
+    None.
     """
     D = sensor.pixel_size
     y = batched.matvec(W, density * D)
@@ -232,15 +217,8 @@ def weighted_sums(
 def expected_response(
     kernel_variance: float, edges: FloatArray, W: FloatArray, mean: FloatArray, variance: FloatArray, highest: int = 3
 ) -> list[FloatArray]:
-    """Expectations of g and its derivatives up to ``highest`` for theta ~ N(mean, variance), each (..., nodes, m).
-
-    Parameters
-    ----------
-    W:
-        Weights of the pixels, (..., m, pixels).
-    mean, variance:
-        (..., nodes)
-    """
+    """Expectations of g and its derivatives up to ``highest`` for theta ~ N(mean, variance), (..., nodes), each (...,
+    nodes, m); W are weights of the pixels, (..., m, pixels)."""
     # The sum over pixels of W_i times a difference of edges, summed by edges instead.
     padded = np.zeros((*W.shape[:-1], W.shape[-1] + 2))
     padded[..., 1:-1] = W

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
-from typing import Any, Protocol
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,8 +37,7 @@ _AT_ONCE = 32
 _AT_ONCE_COMPILED = 450
 
 
-@dataclass(frozen=True, eq=False)
-class Innovation:
+class Innovation(NamedTuple):
     """Innovation of the pixels, in the directions in which the prior lets them vary most."""
 
     value: FloatArray
@@ -87,22 +86,14 @@ class MixtureUpdater(Protocol):
 
 
 class MixtureFilter(Filter):
-    """A mixture for each axis, carried from exposure to exposure.
-
-    Parameters
-    ----------
-    updater:
-        Updates it with a frame.
-    gate:
-        Whether frames that are too far from their prediction are left out.
-    """
+    """A mixture for each axis, carried from exposure to exposure: ``updater`` updates it with a frame. ``gate`` says
+    whether frames that are too far from their prediction are left out."""
 
     def __init__(self, plant: Plant, sensor: BaseSensor, updater: MixtureUpdater, *, gate: bool = True) -> None:
         self.plant, self.sensor, self._updater, self._gate = plant, sensor, updater, gate
         axes = plant.axes
-        self.prior = single(
-            Gaussian(np.tile(plant.initial_mean, (axes, 1)), np.tile(plant.initial_covariance, (axes, 1, 1)))
-        )
+        start = Gaussian(np.tile(plant.initial_mean, (axes, 1)), np.tile(plant.initial_covariance, (axes, 1, 1)))
+        self.prior = single(start)
         # The prediction without any measurement.
         self._unseen = self.prior.gaussian
         self._missed = np.zeros(axes, dtype=np.int64)
@@ -116,12 +107,9 @@ class MixtureFilter(Filter):
         twice.mapped(np.eye(n), np.zeros((n, n))).reduced(1).log_density(twice.mean)
         drop_repeats(twice.mean, twice.covariance, 1.0, *(np.zeros((1, 2)) for _ in range(3)))
         model, outputs, pixels = exposure_model(self.plant, 2), self.plant.n_outputs, self.sensor.profile.pixels
-        dark: Profile | SpotWindows
-        if outputs == 1:
-            dark = Profile(density=np.zeros((1, pixels)), mask=np.ones((1, pixels), dtype=bool))
-        else:
-            window = (1, outputs // 2, pixels, pixels)
-            dark = SpotWindows(density=np.zeros(window), mask=np.ones(window, dtype=bool))
+        kind = Profile if outputs == 1 else SpotWindows
+        shape = (1, pixels) if outputs == 1 else (1, outputs // 2, pixels, pixels)
+        dark = kind(density=np.zeros(shape), mask=np.ones(shape, dtype=bool))
         response = model.response(np.zeros((2, self.plant.n_inputs * self.plant.axes)))
         view = PixelView(self.sensor, model, response, dark, updater.reduction(model, self.sensor))
         updater.update(view.part(one), self.prior.part(one), self._unseen.part(one), 0)
@@ -179,7 +167,7 @@ class MixtureFilter(Filter):
                 return replace(u, coefficients=reduced.coefficients(u.coefficients))
 
             done = in_threads(updated, parts)
-            components = [(p, *each.posterior.arrays) for p, each in zip(parts, done, strict=True)]
+            components = [(p, *each.posterior) for p, each in zip(parts, done, strict=True)]
             new = _spread([each.innovation for each in done], seen, axes)
             log_evidence[seen] = np.concatenate([log_evidence[:0], *(each.log_evidence for each in done)])
             # The pixels' own noise is left out of their likelihoods, being the same at all points of one camera.
@@ -214,9 +202,7 @@ class MixtureFilter(Filter):
             coefficients=coefficients, end=end.gaussian, status=status, innovation=new.value,
             innovation_covariance=new.covariance, nis=new.nis, several=several, remark=self._remark(poor, reduced),
             log_evidence=log_evidence,
-            components=Components(
-                components, reduced.expand, reduced.left_out, (unseen.mean, unseen.covariance)
-            ),
+            components=Components(components, reduced.expand, reduced.left_out, (unseen.mean, unseen.covariance)),
         )  # fmt: skip
 
     def _remark(self, poor: BoolArray, reduced: Reduction) -> str:
@@ -234,8 +220,8 @@ def _spread(parts: Sequence[Innovation], seen: Indices, axes: int) -> Innovation
     """Innovations of these axes in their places; zero, with a covariance of zero, for the others."""
     k = parts[0].value.shape[1] if parts else 0
     out = Innovation(np.zeros((axes, k)), np.zeros((axes, k, k)), np.zeros(axes), np.zeros(axes, dtype=bool))
-    for field in fields(Innovation) if parts else ():
-        getattr(out, field.name)[seen] = np.concatenate([getattr(each, field.name) for each in parts])
+    for room, *each in zip(out, *parts, strict=True) if parts else ():
+        room[seen] = np.concatenate(each)
     return out
 
 

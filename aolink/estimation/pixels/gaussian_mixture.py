@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -15,8 +15,7 @@ from aolink.numerics.arrays import FloatArray, Indices
 from aolink.numerics.covariance import cholesky, lower_inverse
 
 
-@dataclass(frozen=True, eq=False)
-class GaussianMixture:
+class GaussianMixture(NamedTuple):
     """A mixture of Gaussians for each axis."""
 
     log_weight: FloatArray
@@ -26,22 +25,17 @@ class GaussianMixture:
     covariance: FloatArray
     """(axes, components, n, n)"""
 
-    @property
-    def arrays(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Log-weights, means and covariances."""
-        return self.log_weight, self.mean, self.covariance
-
     def part(self, axes: slice | Indices) -> GaussianMixture:
         """The part of these axes."""
-        return GaussianMixture(self.log_weight[axes], self.mean[axes], self.covariance[axes])
+        return GaussianMixture(*(each[axes] for each in self))
 
     def copy(self) -> GaussianMixture:
         """A copy, each of whose arrays is contiguous in memory."""
-        return GaussianMixture(*(np.array(each, order="C") for each in self.arrays))
+        return GaussianMixture(*(np.array(each, order="C") for each in self))
 
     def weighted(self, share: float) -> GaussianMixture:
         """The mixture with its weights multiplied by a share."""
-        return replace(self, log_weight=self.log_weight + math.log(share))
+        return self._replace(log_weight=self.log_weight + math.log(share))
 
     @property
     def gaussian(self) -> Gaussian:
@@ -79,7 +73,7 @@ class GaussianMixture:
     @property
     def contiguous(self) -> list[FloatArray]:
         """Log-weights, means and covariances, each contiguous in memory, as compiled code takes them."""
-        return [np.ascontiguousarray(each) for each in self.arrays]
+        return [np.ascontiguousarray(each) for each in self]
 
     def reduced(self, most: int, free: float = 0.0) -> GaussianMixture:
         """The mixture reduced to ``most`` components, or fewer if mergers cost less than ``free``.
@@ -107,9 +101,9 @@ class GaussianMixture:
     def replaced(self, axes: Indices, by: GaussianMixture) -> GaussianMixture:
         """The mixtures with those of these axes replaced."""
         count = max(self.mean.shape[1], by.mean.shape[1])
-        old, new = self.with_components(count), by.with_components(count)
-        out = old.copy()
-        out.log_weight[axes], out.mean[axes], out.covariance[axes] = new.log_weight, new.mean, new.covariance
+        out, new = self.with_components(count).copy(), by.with_components(count)
+        for room, each in zip(out, new, strict=True):
+            room[axes] = each
         return out
 
     def ordered(self, most: int | None = None) -> GaussianMixture:
@@ -129,14 +123,13 @@ def single(gaussian: Gaussian) -> GaussianMixture:
 
 def joined(*mixtures: GaussianMixture) -> GaussianMixture:
     """All components of several mixtures, their weights normalised together."""
-    arrays = zip(*(each.arrays for each in mixtures), strict=True)
-    log_weight, mean, covariance = (np.concatenate(each, axis=1) for each in arrays)
+    log_weight, mean, covariance = (np.concatenate(each, axis=1) for each in zip(*mixtures, strict=True))
     return GaussianMixture(log_weight - log_sum(log_weight, axis=1)[:, None], mean, covariance)
 
 
 def stacked_axes(mixtures: Sequence[GaussianMixture]) -> GaussianMixture:
     """Mixtures of different axes, one after the other."""
-    return GaussianMixture(*map(np.concatenate, zip(*(each.arrays for each in mixtures), strict=True)))
+    return GaussianMixture(*map(np.concatenate, zip(*mixtures, strict=True)))
 
 
 def with_noise(prior: GaussianMixture, t: FloatArray) -> FloatArray:

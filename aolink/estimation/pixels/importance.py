@@ -22,13 +22,7 @@ import numpy as np
 from scipy import special
 
 from aolink.estimation.compiled import mixtures as compiled_mixtures
-from aolink.estimation.pixels.gaussian_mixture import (
-    GaussianMixture,
-    joined,
-    log_sum,
-    stacked_axes,
-    with_noise,
-)
+from aolink.estimation.pixels.gaussian_mixture import GaussianMixture, joined, log_sum, stacked_axes, with_noise
 from aolink.estimation.pixels.likelihood import PixelView
 from aolink.estimation.pixels.tempering import fitted, tempered_points
 from aolink.numerics.arrays import BoolArray, FloatArray

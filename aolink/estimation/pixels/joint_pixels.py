@@ -47,10 +47,7 @@ _NO_LIGHT = 1e-9
 class JointPixels:
     """The pixels of one frame as a function of the coefficients of all spots together.
 
-    Parameters
-    ----------
-    windows:
-        Spots of one copy of the plant, as `by_spot` gives them.
+    ``windows`` are the spots of one copy of the plant, as `by_spot` gives them.
     """
 
     def __init__(self, sensor: SpotSensor, paths: JointPaths, windows: SpotWindows) -> None:
@@ -84,13 +81,10 @@ class JointPixels:
         )  # fmt: skip
         score, information = score.reshape(spots, 2, m), information.reshape(spots, 2, m, 2, m)
         return Linearised(
-            log_likelihood=float(log_likelihood.sum()),
-            score=score[..., :-1],
+            log_likelihood=float(log_likelihood.sum()), score=score[..., :-1], displacement_score=score[..., -1],
             information=np.ascontiguousarray(information[:, :, :-1, :, :-1]),
-            displaced=information[:, :, :-1, :, -1],
-            of_displacement=information[:, :, -1, :, -1],
-            displacement_score=score[..., -1],
-        )
+            displaced=information[:, :, :-1, :, -1], of_displacement=information[:, :, -1, :, -1],
+        )  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -173,12 +167,8 @@ class JointProfile(JointObservation):
 def displacements(
     paths: JointPaths, mean: FloatArray, state_covariance: FloatArray, t: FloatArray, at: Linearised
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Displacement of each spot from its prediction, as the pixels linearised at a point give it.
-
-    Returns
-    -------
-    (n_outputs,), its variance (n_outputs,), and its NIS.
-    """
+    """Displacement of each spot from its prediction, as the pixels linearised at a point give it, (n_outputs,), its
+    variance (n_outputs,), and its NIS."""
     spots, n = paths.spots, len(state_covariance)
     information = at.of_displacement
     most = np.einsum("sdd->s", information).max()

@@ -101,10 +101,7 @@ class Reduction:
 def reduction(model: ExposureModel, sensor: BaseSensor, *, left_out: float = _LEFT_OUT) -> Reduction:
     """The reduction for a sensor, made once.
 
-    Parameters
-    ----------
-    left_out:
-        Rms of the path that may be left out, in standard deviations of the kernel.
+    ``left_out`` is the rms of the path that may be left out, in standard deviations of the kernel.
     """
     n = model.plant.n_states
     variance = float(np.linalg.eigvalsh(sensor.kernel.covariance)[0])

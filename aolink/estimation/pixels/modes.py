@@ -12,7 +12,7 @@ the kernel is wide a mode is not Gaussian, so mean and covariance are those of p
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy import special
@@ -26,13 +26,7 @@ from aolink.estimation.kalman.update import joseph_update
 from aolink.estimation.moments.lines import updated
 from aolink.estimation.pixels.filter import Innovation
 from aolink.estimation.pixels.gaussian_mixture import log_sum
-from aolink.estimation.pixels.levenberg_marquardt import (
-    FIRST_DAMPING,
-    FREE_DAMPING,
-    LARGEST_DAMPING,
-    Points,
-    minimise,
-)
+from aolink.estimation.pixels.levenberg_marquardt import FIRST_DAMPING, FREE_DAMPING, LARGEST_DAMPING, Points, minimise
 from aolink.estimation.pixels.likelihood import PixelView
 from aolink.numerics import batched
 from aolink.numerics.arrays import FloatArray, Indices
@@ -58,8 +52,7 @@ _NEW_DIRECTIONS = 4
 _NO_INFORMATION = 1e-13
 
 
-@dataclass(frozen=True, eq=False)
-class Modes:
+class Modes(NamedTuple):
     """Modes of the posterior, (axes, starts, ...)."""
 
     mean: FloatArray
@@ -78,11 +71,6 @@ class Modes:
         return cls(np.zeros((axes, count, n)), np.zeros((axes, count, n, n)), -never, nothing, never)
 
     @property
-    def arrays(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
-        """The five, in this order."""
-        return self.mean, self.covariance, self.log_evidence, self.distance, self.objective
-
-    @property
     def total_evidence(self) -> FloatArray:
         """Log-evidence of all modes together, (axes,)."""
         return log_sum(self.log_evidence, axis=1)
@@ -94,15 +82,7 @@ class Modes:
 
 
 def find_modes(view: PixelView, prior: Gaussian, starts: FloatArray) -> Modes:
-    """The mode that each start leads to.
-
-    Parameters
-    ----------
-    prior:
-        Prior of each axis.
-    starts:
-        In whitened coordinates, (axes, starts, n).
-    """
+    """The mode that each start, in whitened coordinates, (axes, starts, n), leads to, with this prior of each axis."""
     axes, count, n = starts.shape
     if (line := view.line) is not None:
         return found_compiled(line, prior, starts, np.full(axes, count), 0, 0.0)
@@ -134,7 +114,7 @@ def found_compiled(
     compiled_modes.find_modes_of_lines(
         line, np.ascontiguousarray(prior.mean), np.ascontiguousarray(prior.covariance), np.ascontiguousarray(starts),
         of_axis, whole, reversed_precision, _PASSES, FIRST_DAMPING, LARGEST_DAMPING, FREE_DAMPING, _CONVERGED,
-        *found.arrays,
+        *found,
     )  # fmt: skip
     return found
 
@@ -169,7 +149,7 @@ def _at(rows: PixelView, m: FloatArray, L: FloatArray, s: FloatArray) -> Points:
 
 def without_repeats(modes: Modes) -> Modes:
     """The modes without those that an earlier start has led to; the remaining ones come first."""
-    mean, covariance, *rest = kept = [each.copy() for each in modes.arrays]
+    mean, covariance, *rest = kept = [each.copy() for each in modes]
     most = compiled_modes.drop_repeats(mean, covariance, _APART, *rest)
     return Modes(*(each[:, : max(most, 1)] for each in kept))
 
@@ -196,11 +176,9 @@ def broad(view: PixelView, prior: Gaussian, memory: FloatArray | None = None) ->
 def spread_starts(view: PixelView, prior: Gaussian, wide: Gaussian) -> tuple[FloatArray, FloatArray]:
     """The mean of a wide Gaussian and points on both sides of it along the path's most uncertain directions.
 
-    Returns
-    -------
-    The points, (axes, 1 + 2 directions, n), in coordinates in which the prior is N(0, I): the mean, and a pair for each
-    direction. And the mean square of the path along each direction at one standard deviation, the largest first,
-    (axes, n).
+    They are (axes, 1 + 2 directions, n), in coordinates in which the prior is N(0, I): the mean, and a pair for each
+    direction. The second result is the mean square of the path along each direction at one standard deviation, the
+    largest first, (axes, n).
     """
     axes, n = wide.mean.shape
     if view.on_line:
@@ -250,9 +228,9 @@ def reversed_starts(view: PixelView, prior: Gaussian, points: FloatArray) -> Flo
 def with_more(modes: Modes, axes: slice | Indices, more: Modes) -> Modes:
     """The same modes, and after them those that more starts of some axes led to."""
     spread = Modes.none(len(modes.mean), *more.mean.shape[1:])
-    for room, new in zip(spread.arrays, more.arrays, strict=True):
+    for room, new in zip(spread, more, strict=True):
         room[axes] = new
-    return Modes(*(np.concatenate(each, axis=1) for each in zip(modes.arrays, spread.arrays, strict=True)))
+    return Modes(*(np.concatenate(each, axis=1) for each in zip(modes, spread, strict=True)))
 
 
 def whitened(prior: Gaussian, points: FloatArray) -> FloatArray:

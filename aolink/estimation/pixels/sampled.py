@@ -40,11 +40,9 @@ class TemperedUpdater:
         return ""
 
     def reduction(self, model: ExposureModel, sensor: BaseSensor) -> Reduction:
-        """The coefficients that it works with."""
         return reduction(model, sensor, left_out=_LEFT_OUT)
 
     def update(self, view: PixelView, prior: GaussianMixture, unseen: Gaussian, number: int) -> MixtureUpdate:
-        """The posterior of axes with a prior of their start states."""
         t = self.sample(view, prior, number)
         reduced, before = view.reduced, view.reduced.prior(prior.gaussian)
         mean = t.mean(axis=1)
@@ -60,14 +58,8 @@ class TemperedUpdater:
         )
 
     def sample(self, view: PixelView, prior: GaussianMixture, number: int) -> FloatArray:
-        """Equally likely particles of the posterior, (axes, particles, n).
-
-        Parameters
-        ----------
-        prior:
-            Prior of the start state; the noise coefficients have N(0, I).
-        number:
-            Number of the exposure: with the estimator's seed and the axis it seeds the random numbers.
-        """
+        """Equally likely particles of the posterior, (axes, particles, n), from the prior of the start state; the noise
+        coefficients have N(0, I). With the estimator's seed and the axis, the exposure's ``number`` seeds the random
+        numbers."""
         keys = [(self.seed, number, axis) for axis in view.axes.tolist()]
         return tempered_points(view, prior, self.particles, keys)

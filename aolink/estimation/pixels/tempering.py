@@ -30,17 +30,11 @@ _LEAST_SPREAD = 1e-3
 _WHOLE = 4
 
 
-def tempered_points(
-    view: PixelView, prior: GaussianMixture, count: int, keys: Sequence[tuple[int, ...]]
-) -> FloatArray:  # fmt: skip
-    """Equally likely points of the posterior, (axes, count, n).
+def tempered_points(view: PixelView, prior: GaussianMixture, count: int, keys: Sequence[tuple[int, ...]]) -> FloatArray:
+    """Equally likely points of the posterior, (axes, count, n); the same key, the seed of an axis, gives the same
+    points.
 
-    Parameters
-    ----------
-    prior:
-        Prior of the start state; the noise coefficients have N(0, I).
-    keys:
-        Seed of each axis: the same key gives the same points.
+    ``prior`` is that of the start state; the noise coefficients have N(0, I).
     """
     each = (np.array([axis]) for axis in range(len(keys)))
     return np.stack([_of_axis(view.part(a), prior.part(a), count, key) for a, key in zip(each, keys, strict=True)])
@@ -80,18 +74,10 @@ def _of_axis(view: PixelView, prior: GaussianMixture, count: int, key: tuple[int
 
 
 def fitted(points: FloatArray, rows: FloatArray, components: int, seed: int) -> GaussianMixture:
-    """A mixture of Gaussians for equally likely points of one axis, by expectation and maximisation.
+    """A mixture of Gaussians for equally likely points (points, n) of one axis, by expectation and maximisation.
 
-    Parameters
-    ----------
-    points:
-        (points, n)
-    rows:
-        Their projections rows @ point are what the mixture is fitted to, (k, n): few dimensions, so points suffice.
-
-    Returns
-    -------
-    The mixture of the points themselves, one axis; its mean is theirs, and its covariance to a thousandth.
+    It is fitted to their projections rows @ point, with rows (k, n): few dimensions, so points suffice. The result is
+    the mixture of the points themselves; its mean is theirs, and its covariance to a thousandth.
     """
     rng, seen = np.random.default_rng(seed), points @ rows.T
     k = seen.shape[1]

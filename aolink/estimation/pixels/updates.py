@@ -95,11 +95,9 @@ class ImportanceUpdater:
         return reduced.size**2 / self.points if self.points else 1.0
 
     def reduction(self, model: ExposureModel, sensor: BaseSensor) -> Reduction:
-        """The coefficients that it works with."""
         return reduction(model, sensor)
 
     def update(self, view: PixelView, prior: GaussianMixture, unseen: Gaussian, number: int) -> MixtureUpdate:
-        """The posterior of axes with a prior of their start states."""
         reduced = view.reduced
         modes, proposal = explored(view, prior)
         own = reduced.prior(prior.gaussian)
@@ -112,7 +110,7 @@ class ImportanceUpdater:
             _, more = explored(view.part(doubted), anew)
             proposal = proposal.replaced(doubted, joined(proposal.part(doubted), more))
             wide = wide.replaced(doubted, joined(wide.part(doubted), _wide_part(more, anew)))
-        rest = replace(prior, log_weight=prior.log_weight + math.log1p(-_DOUBT))
+        rest = prior._replace(log_weight=prior.log_weight + math.log1p(-_DOUBT))
         before = joined(rest, single(unseen).weighted(_DOUBT))
         usual = np.flatnonzero(~lost | (self.points == 0))
         after, poor = proposal, lost.copy()
@@ -162,9 +160,9 @@ def explored(view: PixelView, prior: GaussianMixture) -> tuple[Modes, GaussianMi
     rows, own = view.part(there[0]), Gaussian(before.mean[there], before.covariance[there])
     wide = broad(rows, own)
     found = modes_of(rows, own, wide)
-    found = replace(found, log_evidence=found.log_evidence + prior.log_weight[there][:, None])
+    found = found._replace(log_evidence=found.log_evidence + prior.log_weight[there][:, None])
     modes = Modes.none(axes, count * found.mean.shape[1], found.mean.shape[2])
-    for room, each in zip(modes.arrays, found.arrays, strict=True):
+    for room, each in zip(modes, found, strict=True):
         room.reshape(axes, count, *each.shape[1:])[there] = each
     modes = without_repeats(modes)
     flat = GaussianMixture(prior.log_weight, np.zeros_like(before.mean), np.zeros_like(before.covariance))
@@ -204,7 +202,7 @@ def _by_share_of(points: GaussianMixture, wide: GaussianMixture) -> GaussianMixt
     """
     there = np.isfinite(wide.log_weight)
     covariance = np.where(there[..., None, None], wide.covariance, np.eye(wide.mean.shape[2]))
-    logs = replace(wide, covariance=covariance).component_log_densities(points.mean)
+    logs = wide._replace(covariance=covariance).component_log_densities(points.mean)
     share = np.exp(logs - log_sum(logs, axis=1)[:, None]) * np.exp(points.log_weight)[:, None]
     with np.errstate(divide="ignore"):
-        return replace(wide, log_weight=np.log(share.sum(axis=2)))
+        return wide._replace(log_weight=np.log(share.sum(axis=2)))

@@ -158,7 +158,7 @@ def test_reversals_of_the_best_are_those_of_the_twin(pair):
     found = Modes.none(AXES, 6, starts.shape[2])
     find_modes_of_lines(
         view.line, prior.mean, prior.covariance, starts, np.full(AXES, 3), view.whole_nodes,
-        modes.precision_of_reversal(view), 0, FIRST_DAMPING, LARGEST_DAMPING, FREE_DAMPING, 0.0, *found.arrays,
+        modes.precision_of_reversal(view), 0, FIRST_DAMPING, LARGEST_DAMPING, FREE_DAMPING, 0.0, *found,
     )  # fmt: skip
     ends = prior.mean[:, None] + batched.matmul(starts, batched.transpose(cholesky(prior.covariance)))
     best = ends[np.arange(AXES), np.argmin(found.objective[:, :3], axis=1)]

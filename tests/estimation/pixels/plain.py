@@ -1,7 +1,6 @@
 """The plain twins, in NumPy, of what compiled code does for pixels: of a line sensor, and of spots on a plane."""
 
 import math
-from dataclasses import replace
 
 import numpy as np
 
@@ -105,7 +104,7 @@ def importance_corrected(view, prior, proposal, share, enough):
         effective = np.where(going_on, np.exp(-log_sum(2 * log_weight, axis=1)), effective)
         tempered = _tempered(log_weight, importance.LEAST_EFFECTIVE)
         scale = importance.LOOSENED if k else importance.TIGHTENED
-        scaled = replace(proposal, covariance=proposal.covariance * scale)
+        scaled = proposal._replace(covariance=proposal.covariance * scale)
         last = _refitted(proposal, t, tempered, scaled, n * importance.LAST_PRIOR_POINTS)
         some = np.flatnonzero(going_on)
         fit = fit.replaced(some, last.part(some))
