@@ -132,10 +132,7 @@ def compare(
 
 @app.command(epilog="Example: aolink recover broken.mcap -o whole.mcap")
 def recover(
-    file: FileArgument,
-    output: OutputOption,
-    overwrite: OverwriteOption = False,
-    as_json: JsonOption = False,
+    file: FileArgument, output: OutputOption, overwrite: OverwriteOption = False, as_json: JsonOption = False
 ) -> None:
     """Save the undamaged part of a damaged or unfinished recording. Exit code 1 if something was lost."""
     from aolink.recording.editing import recover as recover_recording

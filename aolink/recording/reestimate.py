@@ -28,11 +28,7 @@ _BYTES_AT_ONCE = 4 << 20
 
 
 def reestimate(
-    recording: Recording,
-    names: Sequence[str],
-    progress: Progress = no_progress,
-    *,
-    as_recorded: bool = False,
+    recording: Recording, names: Sequence[str], progress: Progress = no_progress, *, as_recorded: bool = False
 ) -> dict[str, list[Estimate]]:
     """Run estimators over a recording; gives the estimates by name, one for each exposure.
 

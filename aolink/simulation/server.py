@@ -22,14 +22,7 @@ from aolink.simulation.devices import LineName, Outgoing, SimulatedDevices
 from aolink.simulation.faults import Way
 from aolink.simulation.streams import VERSIONS, Stream, refusal_event
 from aolink.wire import messages_pb2 as pb
-from aolink.wire.packet import (
-    DELIMITER,
-    MessageDecoder,
-    Packet,
-    PacketDecoder,
-    PacketType,
-    encode_packets,
-)
+from aolink.wire.packet import DELIMITER, MessageDecoder, Packet, PacketDecoder, PacketType, encode_packets
 from aolink.wire.signing import refusal
 
 VIRTUAL_EPOCH_NS = 1_767_225_600_000_000_000

@@ -27,11 +27,7 @@ def filterpy_loop(model: Any, R: Any, values: Any) -> Callable[[], None]:
 
     def loop() -> None:
         for ekf, z in filters:
-            ekf.update(
-                z,
-                lambda x: np.vstack([row, 2 * (M @ x).T]),
-                lambda x: np.vstack([row @ x, x.T @ M @ x]),
-            )
+            ekf.update(z, lambda x: np.vstack([row, 2 * (M @ x).T]), lambda x: np.vstack([row @ x, x.T @ M @ x]))
             ekf.predict()
 
     return loop

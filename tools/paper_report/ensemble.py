@@ -58,9 +58,7 @@ def variant(
     if process_noise is not None:
         factor = process_noise / plant.process_noise[0, 0]
         plant = dataclasses.replace(
-            plant,
-            process_noise=plant.process_noise * factor,
-            initial_covariance=plant.initial_covariance * factor,
+            plant, process_noise=plant.process_noise * factor, initial_covariance=plant.initial_covariance * factor
         )
     if noise_density is not None:
         sensor = dataclasses.replace(sensor, noise_density=noise_density)
@@ -78,9 +76,7 @@ def side_by_side(rig: Rig, runs: int) -> Rig:
     """A rig whose axes are ``runs`` independent copies of one that has a single axis."""
     values = {f.name: getattr(rig.sensor, f.name) for f in dataclasses.fields(Sensor)}
     return dataclasses.replace(
-        rig,
-        plant=dataclasses.replace(rig.plant, axes=runs),
-        sensor=SensorRows(**values, rows=runs),
+        rig, plant=dataclasses.replace(rig.plant, axes=runs), sensor=SensorRows(**values, rows=runs)
     )
 
 

@@ -15,10 +15,7 @@ from aolink.errors import DeviceError
 from aolink.extensions import needs_extra
 from aolink.rig import Rig
 
-_CLOCKS = (
-    ("TimestampLatch", "TimestampLatchValue"),
-    ("GevTimestampControlLatch", "GevTimestampValue"),
-)
+_CLOCKS = (("TimestampLatch", "TimestampLatchValue"), ("GevTimestampControlLatch", "GevTimestampValue"))
 """Pairs of features that latch the camera's clock and give its value: those of newer cameras, then those of GigE
 cameras."""
 _RATES = ("ResultingFrameRate", "BslResultingAcquisitionFrameRate", "ResultingFrameRateAbs")
@@ -147,10 +144,7 @@ class BaslerCamera:
         frequency = self._first(("GevTimestampTickFrequency",))
         self._tick_ns = 1e9 / float(self._value(frequency)) if frequency else 1.0
         self._tells_time = self.time_ns() is not None
-        self.lacks = (
-            *(() if self._tells_time else (Lacks.TIME,)),
-            *(() if triggered else (Lacks.TRIGGER,)),
-        )
+        self.lacks = (*(() if self._tells_time else (Lacks.TIME,)), *(() if triggered else (Lacks.TRIGGER,)))
         self._camera.MaxNumBuffer.Value = _BUFFERS
         self._listener = _listener(self._pylon, self._arrived, self._frame)
         self._camera.RegisterImageEventHandler(
