@@ -6,6 +6,14 @@ from __future__ import annotations
 import numpy as np
 from scipy import stats
 
+from aolink.devices.clock import (
+    QUERY_PERIOD_S,
+    SUSPICION_PERIOD_S,
+    WARM_UP_QUERIES,
+    ClockExchange,
+    ClockRegression,
+    StepClock,
+)
 from bench_rows.row import Effort, Row
 
 _SEEDS = 100
@@ -29,15 +37,6 @@ def _session(seed: int, duration_s: float, *, stamps_show_it: bool) -> tuple[np.
     Where no stamp shows the step (a device that counts its fast steps from its clock), those frames are flagged that
     began after the last query which agreed with the old clock, once the step is found.
     """
-    from aolink.devices.clock import (
-        QUERY_PERIOD_S,
-        SUSPICION_PERIOD_S,
-        WARM_UP_QUERIES,
-        ClockExchange,
-        ClockRegression,
-        StepClock,
-    )
-
     rng = np.random.default_rng(seed)
     there_ns = _ROUND_TRIP_NS * rng.uniform()
     step_at_s = duration_s * rng.uniform(0.3, 0.7)

@@ -33,7 +33,7 @@ from aolink.identification import (
 from aolink.jobs.closed_loop import closed_loop
 from aolink.numerics.arrays import FloatArray
 from aolink.rig import Rig, load_rig, parse_rig
-from bench_rows.disturbances import STEP_S, DisturbanceRun, likeliest, together, turbulence, vibration
+from bench_rows.disturbances import STEP_S, DisturbanceRun, likeliest, played, together, turbulence, vibration
 from bench_rows.rivals import PREDICTORS, predicted, with_true_state
 from bench_rows.row import Effort, Row
 
@@ -242,14 +242,14 @@ def _of_seed(cell: Cell, seed: int, size: Size) -> tuple[dict[str, float], Proce
             series = [seen.exposure for seen in closed_loop(rig, controller, estimator, size.exposures, seed=seed)]
             rms[name] = residual_rms(series[size.settled :])
 
-        def played(model: ProcessSum) -> Rig:
-            return _played(cell.rig(model), ahead.slopes, Path(folder) / "ahead.toml")
+        def disturbed(model: ProcessSum) -> Rig:
+            return played(cell.rig(model), ahead.slopes[:, None], Path(folder) / "ahead.toml")
 
-        rig = played(whole.model)
+        rig = disturbed(whole.model)
         run("open", rig, "")
         for gain in size.gains:
             run(f"integrator {gain:g}", replace(rig, control=replace(rig.control, gain=gain)), "integrator")
-        before = _played(cell.rig(whole.model), whole.slopes[:past], Path(folder) / "before.toml")
+        before = played(cell.rig(whole.model), whole.slopes[:past, None], Path(folder) / "before.toml")
         earlier = [seen.exposure for seen in closed_loop(before, "", "", size.past, seed=seed + 10_000)]
         for name in PREDICTORS:
             run(name, rig, predicted(name, np.array([centroids(rig, exposure) for exposure in earlier])))
@@ -257,20 +257,12 @@ def _of_seed(cell: Cell, seed: int, size: Size) -> tuple[dict[str, float], Proce
             run(estimator, rig, "lqg", estimator)
         if cell.identified:
             identified = _identified(cell, before, earlier)
-            own = played(identified)
+            own = disturbed(identified)
             for estimator in cell.identified:
                 run(f"identified {estimator}", own, "lqg", estimator)
-            run(FROM_PATH, played(_from_path(cell, whole, past)), "lqg", "o1")
+            run(FROM_PATH, disturbed(_from_path(cell, whole, past)), "lqg", "o1")
         run("true state", rig, with_true_state(ahead))
     return rms, identified
-
-
-def _played(believes: Rig, slopes: FloatArray, path: Path) -> Rig:
-    """A rig that these slopes disturb, whatever its model is."""
-    np.save(path.with_suffix(".npy"), slopes[:, None])
-    table = f'[disturbance]\nplant_noise = false\nrecorded = "{path.stem}.npy"\n\n[simulation]'
-    path.write_text(believes.toml.replace("[simulation]", table, 1))
-    return load_rig(path)
 
 
 def _identified(cell: Cell, rig: Rig, exposures: list[Exposure]) -> ProcessSum:

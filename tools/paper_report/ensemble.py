@@ -80,16 +80,12 @@ def side_by_side(rig: Rig, runs: int) -> Rig:
     )
 
 
-def drive_inputs(rig: Rig, n_steps: int, runs: int = 1) -> FloatArray:
-    """The rig's slow input, the same for all runs, (n_steps, runs)."""
-    return np.tile(rig.drive.inputs(0, n_steps, rig.timing.fast_step_s), (1, runs))
-
-
 def clean_exposures(rig: Rig, exposures: int, seed: int) -> list[Exposure]:
-    """Exposures of a rig from `side_by_side` with process noise and without pixel noise."""
+    """Exposures of a rig from `side_by_side` with process noise and without pixel noise; its slow input is the same for
+    all runs."""
     silent = dataclasses.replace(rig, sensor=dataclasses.replace(rig.sensor, noise_density=0.0))
-    inputs = drive_inputs(rig, exposures * rig.timing.exposure_steps, rig.plant.axes)
-    return simulate(silent, exposures, seed, inputs=inputs)
+    inputs = rig.drive.inputs(0, exposures * rig.timing.exposure_steps, rig.timing.fast_step_s)
+    return simulate(silent, exposures, seed, inputs=np.tile(inputs, (1, rig.plant.axes)))
 
 
 def with_pixel_noise(rig: Rig, clean: Sequence[Exposure], seed: int) -> list[Exposure]:
@@ -132,6 +128,11 @@ def errors(exposures: Sequence[Exposure], estimates: Sequence[Estimate], skip: i
     return Errors(path=np.array(path).T, start=np.array(start).T, end=np.array(end).T)
 
 
+def normalised(estimate: Estimate, error: FloatArray) -> FloatArray:
+    """Normalised square of an error of the end state (axes, n_states), (axes,)."""
+    return np.asarray(np.einsum("ai,ai->a", error, np.linalg.solve(estimate.end_covariance, error[..., None])[..., 0]))
+
+
 def measure_errors(rig: Rig, exposures: Sequence[Exposure], names: Sequence[str], skip: int) -> dict[str, Errors]:
     """Errors of several estimators on the same exposures, by their names."""
     return {name: errors(exposures, each, skip) for name, each in run(rig, exposures, names).items()}
@@ -167,7 +168,8 @@ def _resampled(count: int) -> NDArray[np.intp]:
     return np.random.default_rng(count).integers(0, count, size=(_RESAMPLES, count))
 
 
-def _measured(value: float, samples: FloatArray) -> IntervalEstimate:
+def measured(value: float, samples: FloatArray) -> IntervalEstimate:
+    """A number with the error and the interval of its bootstrap samples."""
     low, high = np.quantile(samples, [0.025, 0.975])
     return IntervalEstimate(float(value), float(samples.std()), float(low), float(high))
 
@@ -175,13 +177,13 @@ def _measured(value: float, samples: FloatArray) -> IntervalEstimate:
 def rms(squares: FloatArray) -> IntervalEstimate:
     """Root of the mean of squared errors, (runs, exposures); NaN where one does not count."""
     each = np.nanmean(squares, axis=1)
-    return _measured(np.sqrt(each.mean()), np.sqrt(each[_resampled(len(each))].mean(axis=1)))
+    return measured(np.sqrt(each.mean()), np.sqrt(each[_resampled(len(each))].mean(axis=1)))
 
 
 def mean(values: FloatArray) -> IntervalEstimate:
     """Mean of (runs, exposures)."""
     each = values.mean(axis=1)
-    return _measured(each.mean(), each[_resampled(len(each))].mean(axis=1))
+    return measured(each.mean(), each[_resampled(len(each))].mean(axis=1))
 
 
 def ratio(squares: FloatArray, reference: FloatArray) -> IntervalEstimate:
@@ -189,7 +191,7 @@ def ratio(squares: FloatArray, reference: FloatArray) -> IntervalEstimate:
     above, below = np.nanmean(squares, axis=1), np.nanmean(reference, axis=1)
     chosen = _resampled(len(above))
     samples = np.sqrt(above[chosen].mean(axis=1) / below[chosen].mean(axis=1))
-    return _measured(np.sqrt(above.mean() / below.mean()), samples)
+    return measured(np.sqrt(above.mean() / below.mean()), samples)
 
 
 @dataclass(frozen=True, kw_only=True)
