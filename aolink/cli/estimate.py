@@ -8,19 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from aolink.cli.common import (
-    EstimatorOption,
-    JsonOption,
-    OverwriteOption,
-    app,
-    check_measured,
-    get_ready,
-    open_recording,
-    progress,
-    stderr,
-    stdout,
-    warn,
-)
+from aolink.cli import common
+from aolink.cli.common import EstimatorOption, JsonOption, OverwriteOption, app, progress, stderr, stdout, warn
 from aolink.errors import AolinkError, EstimatorError
 from aolink.files import check_target, writing
 from aolink.signals import StopRequest
@@ -253,12 +242,12 @@ def _estimate_one(
         write_reestimated,
     )
 
-    recording = model.applied_to(open_recording(file))
+    recording = model.applied_to(common.open_recording(file))
     check_has_exposures(recording)
     names = list(dict.fromkeys(estimator or recording.estimators or [DEFAULT_ESTIMATOR]))
     total, known = recording.n_frames, recording.damage
     try:
-        get_ready(recording.rig, names)
+        common.get_ready(recording.rig, names)
         with progress("estimate", total) as tell:
             if output is not None:
                 write_reestimated(
@@ -292,4 +281,4 @@ def _estimate_one(
             if recording.estimators and not recording.rig_is_recorded:
                 beside = "; the recording's own estimates were made with another rig file and are left out"
             stdout.print(f"written: {output}{beside}", markup=False)
-    check_measured(recording.path, scores)
+    common.check_measured(recording.path, scores)

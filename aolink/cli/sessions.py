@@ -10,25 +10,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from aolink.cli.common import (
-    EstimatorOption,
-    FileArgument,
-    JsonOption,
-    KeyOption,
-    OutputOption,
-    OverwriteOption,
-    app,
-    check_measured,
-    get_ready,
-    load_checked,
-    open_recording,
-    program,
-    progress,
-    stderr,
-    stdout,
-    warn,
-    with_key,
-)
+from aolink.cli import common
+from aolink.cli.common import EstimatorOption, JsonOption, KeyOption, app, get_ready, program, progress, stdout, warn
 from aolink.cli.terminal import progress_bar
 from aolink.errors import EstimatorError
 from aolink.signals import Interrupted, StopRequest
@@ -62,7 +45,7 @@ def record(
     rig: Annotated[
         str, typer.Option(metavar="RIG.toml", help="A rig file, or the name of a rig that comes with aolink.")
     ],
-    output: OutputOption,
+    output: common.OutputOption,
     camera: Annotated[
         str | None,
         typer.Option(
@@ -124,7 +107,7 @@ def record(
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Check everything, with the devices, but send the mirror no input.")
     ] = False,
-    overwrite: OverwriteOption = False,
+    overwrite: common.OverwriteOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """Record a session: play the rig's drive, or close the loop; record everything, estimate online.
@@ -139,7 +122,7 @@ def record(
         compression=compression, chunk_bytes=chunk_kib << 10, flush_s=flush_s, fsync_s=fsync_s,
         split_bytes=round(split_mib * 2**20), split_s=split_s,
     )  # fmt: skip
-    loaded = load_checked(rig)
+    loaded = common.load_checked(rig)
     if force and not control:
         raise typer.BadParameter("--force is for --control")
     if exposures is not None and duration is not None:
@@ -149,7 +132,7 @@ def record(
         if not 0 < periods <= MOST_EXPOSURES:
             raise typer.BadParameter(f"--duration {duration:g} is not a number of seconds above zero")
         exposures = math.ceil(periods)
-    loaded, camera, mirror = with_key(loaded, camera, mirror, key)
+    loaded, camera, mirror = common.with_key(loaded, camera, mirror, key)
     played = None
     if inputs:
         from aolink.session.excitation import excitation
@@ -236,7 +219,7 @@ def _live_view(
     "  |  aolink replay session.mcap --to-rig --camera /dev/pts/3 --mirror /dev/pts/4 -o again.mcap"
 )
 def replay(
-    file: FileArgument,
+    file: common.FileArgument,
     estimator: EstimatorOption = None,
     rate: Annotated[
         float, typer.Option(min=0, metavar="X", help="Pace relative to the recording's; 0 for as fast as possible.")
@@ -261,7 +244,7 @@ def replay(
     output: Annotated[
         Path | None, typer.Option("--output", "-o", metavar="FILE", help="The new recording, with --to-rig.")
     ] = None,
-    overwrite: OverwriteOption = False,
+    overwrite: common.OverwriteOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """Replay a recording through the estimators as if it were live, or send its commands to a rig.
@@ -270,7 +253,7 @@ def replay(
     """
     from aolink.estimation.registry import DEFAULT_ESTIMATOR
 
-    recording = open_recording(file)
+    recording = common.open_recording(file)
     names = list(dict.fromkeys(estimator or recording.estimators or [DEFAULT_ESTIMATOR]))
     get_ready(recording.rig, names)
     if to_rig:
@@ -280,7 +263,7 @@ def replay(
             raise typer.BadParameter(
                 "--to-rig needs -o FILE, --camera PORT and --mirror PORT, or [devices] in its rig file"
             )
-        to = with_key(recording.rig, camera, mirror, key)
+        to = common.with_key(recording.rig, camera, mirror, key)
         _replay_to_rig(recording, names, *to, output, overwrite=overwrite, as_json=as_json)
         return
     if camera or mirror or key or output:
@@ -314,7 +297,7 @@ def replay(
         else:
             stdout.print(tables.scores(scores))
     stop.raise_if_asked()
-    check_measured(file, scores)
+    common.check_measured(file, scores)
 
 
 def _replay_control(recording: "Recording", controller: str, estimator: str, *, as_json: bool) -> None:
@@ -392,12 +375,12 @@ def demo(
     from aolink.recording.reader import Recording
     from aolink.recording.reestimate import scored
 
-    loaded = load_checked(rig)
+    loaded = common.load_checked(rig)
     folder = new_folder(out)
     get_ready(loaded, possible_estimators(loaded))
     stop = StopRequest()
     try:
-        with progress_bar(stderr, exposures) as tell:
+        with progress_bar(common.stderr, exposures) as tell:
             result = run_demo(
                 loaded, rig, folder, exposures=exposures, seed=seed, real_time=real_time,
                 control=control or "", stoppable=stop.installed, progress=tell,
