@@ -21,11 +21,8 @@ if TYPE_CHECKING:
     from aolink.jobs.unit import Model
 
 
-class Engine(StrEnum):
-    """The implementation of o1 to o3."""
-
-    AOLINK = "aolink"
-    FILTERPY = "filterpy"
+Engine = StrEnum("Engine", ["AOLINK", "FILTERPY"])
+"""The implementation of o1 to o3."""
 
 
 @app.command(
@@ -111,6 +108,8 @@ def estimate(
 
     if side:
         if table is not None:
+            if table.suffix.lower() == ".parquet":  # any other name is refused, and needs no folder
+                _make_folder(table.parent)
             check_target(table, overwrite=True, suffix=".parquet")
             load_parquet()
         sources = batch.shard(files, shard) if shard else files
@@ -165,10 +164,7 @@ def _estimate_many(
     for each in () if overwrite else places:
         check_table(each)
 
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise AolinkError(f"cannot make the folder {folder}: {(error.strerror or str(error)).lower()}") from None
+    _make_folder(folder)
     # The table's file is locked from the start, so that the same part, if begun twice, is refused.
     with writing(table, overwrite=True) as partial:
         with StopRequest().installed() as stop, progress("estimate", len(todo)) as tell:
@@ -198,6 +194,13 @@ def _estimate_many(
         raise typer.Exit(1)
     if any(each.nothing_measured for each in done):
         raise typer.Exit(EstimatorError.exit_code)
+
+
+def _make_folder(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise AolinkError(f"cannot make the folder {folder}: {(error.strerror or str(error)).lower()}") from None
 
 
 _MOST_ROWS_SHOWN = 40
@@ -233,14 +236,9 @@ def _estimate_one(
 ) -> None:  # fmt: skip
     from aolink.cli.tables import scores as tables
     from aolink.estimation.registry import DEFAULT_ESTIMATOR
+    from aolink.recording import reestimate
     from aolink.recording.reader import Recording
-    from aolink.recording.reestimate import (
-        check_has_exposures,
-        kept_estimators,
-        reestimated,
-        scored_and_compared,
-        write_reestimated,
-    )
+    from aolink.recording.reestimate import check_has_exposures, kept_estimators, reestimated, scored_and_compared
 
     recording = model.applied_to(common.open_recording(file))
     check_has_exposures(recording)
@@ -250,7 +248,7 @@ def _estimate_one(
         common.get_ready(recording.rig, names)
         with progress("estimate", total) as tell:
             if output is not None:
-                write_reestimated(
+                reestimate.write_reestimated(
                     recording, names, output,
                     only=only, overwrite=overwrite, progress=tell, engine=engine.value,
                 )  # fmt: skip

@@ -15,18 +15,8 @@ if TYPE_CHECKING:
     from aolink.recording.reader import Recording
 
 
-class What(StrEnum):
-    """The figures that `aolink plot` draws: those of `aolink.plotting.FIGURES`."""
-
-    BLUR = "blur"
-    EXPOSURE = "exposure"
-    NIS = "nis"
-    ERRORS = "errors"
-    LOSSES = "losses"
-    LATENCY = "latency"
-    PUPIL = "pupil"
-    SCENE = "scene"
-
+What = StrEnum("What", ["BLUR", "EXPOSURE", "NIS", "ERRORS", "LOSSES", "LATENCY", "PUPIL", "SCENE"])
+"""The figures that `aolink plot` draws: those of `aolink.plotting.FIGURES`."""
 
 StepsOption = Annotated[bool, typer.Option("--steps", help="Count fast steps on time axes, not seconds.")]
 

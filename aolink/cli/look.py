@@ -139,7 +139,6 @@ def _numbers(recording: "Recording", exposure: int | None, start: float | None, 
 
 
 def _first_steps(recording: "Recording") -> list[int]:
-    """The fast steps at which the exposures begin, from the messages that have them."""
     from aolink.recording import topics
     from aolink.recording.schemas_pb2 import ExposureInfo
 

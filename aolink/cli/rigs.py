@@ -143,7 +143,6 @@ _OF_FILMS = frozenset(("rate", "frames", "track", "at", "invert", "gamma", "topi
 
 
 def _check_goes_with(context: typer.Context, film: Path | None) -> None:
-    """Refuse options that would have no effect."""
     for each in context.command.params:
         name = each.name or ""
         source = context.get_parameter_source(name)

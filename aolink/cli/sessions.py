@@ -29,12 +29,8 @@ if TYPE_CHECKING:
 MOST_EXPOSURES = 2**32 - 1
 
 
-class CalibrationLight(StrEnum):
-    """The light in a recording for a calibration."""
-
-    DARK = "dark"
-    FLAT = "flat"
-    STILL = "still"
+CalibrationLight = StrEnum("CalibrationLight", ["DARK", "FLAT", "STILL"])
+"""The light in a recording for a calibration."""
 
 
 @app.command(
@@ -183,9 +179,7 @@ def _print_dry_run(found: "DryRun", as_json: bool) -> None:
         return
     for name, text in found.facts.items():
         stdout.print(f"{name:<12}{text}", markup=False)
-    stdout.print(
-        "dry run: all of this is good; no input was sent to the mirror, and nothing was recorded", markup=False
-    )
+    stdout.print("dry run: all of this is good; no input was sent to the mirror, and nothing was recorded")
 
 
 def _print_session(report: "Report", output: Path, as_json: bool) -> None:
@@ -206,7 +200,6 @@ def _print_session(report: "Report", output: Path, as_json: bool) -> None:
 def _live_view(
     rig: "Rig", estimators: Sequence[str], true_scene: "NDArray[np.uint16] | None" = None, *, shown: bool
 ) -> "AbstractContextManager[LiveView | None]":
-    """The function that shows exposures in the viewer, or None."""
     if not shown:
         return nullcontext()
     from aolink import viewing
@@ -259,7 +252,8 @@ def replay(
     if to_rig:
         if control:
             raise typer.BadParameter("--to-rig sends the recorded commands: `aolink record --control` closes a loop")
-        if not (output and _are_driven(recording.rig, camera, mirror)):
+        driven = recording.rig.devices
+        if not (output and (camera or "camera" in driven) and (mirror or "mirror" in driven)):
             raise typer.BadParameter(
                 "--to-rig needs -o FILE, --camera PORT and --mirror PORT, or [devices] in its rig file"
             )
@@ -313,22 +307,10 @@ def _replay_control(recording: "Recording", controller: str, estimator: str, *, 
         stdout.print(tables.replayed(result))
 
 
-def _are_driven(rig: "Rig", camera: str | None, mirror: str | None) -> bool:
-    """Whether a port or the rig file names the driver of each device."""
-    return all(port or kind in rig.devices for kind, port in (("camera", camera), ("mirror", mirror)))
-
-
 def _replay_to_rig(
-    recording: "Recording",
-    names: list[str],
-    rig: "Rig",
-    camera: str | None,
-    mirror: str | None,
-    output: Path,
-    *,
-    overwrite: bool,
-    as_json: bool,
-) -> None:
+    recording: "Recording", names: list[str], rig: "Rig", camera: str | None, mirror: str | None, output: Path, *,
+    overwrite: bool, as_json: bool,
+) -> None:  # fmt: skip
     from aolink import session
     from aolink.cli.tables import recordings as tables
     from aolink.cli.tables import sessions

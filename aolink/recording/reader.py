@@ -379,9 +379,8 @@ def _parsed_rig(text: str) -> Rig:
 
 
 def _restored(info: schemas_pb2.Restoration, pictures: dict[str, RawImage]) -> RestoredPictures:
-    return convert.restored_from_messages(
-        info, pictures.get(topics.RESTORED_SCENE), pictures.get(topics.RESTORED_SPOTS)
-    )
+    scene, spots = pictures.get(topics.RESTORED_SCENE), pictures.get(topics.RESTORED_SPOTS)
+    return convert.restored_from_messages(info, scene, spots)
 
 
 def _check_replaces(rig: Rig | None, recorded: Rig, path: Path | Url) -> None:

@@ -21,23 +21,11 @@ from typing import IO
 
 import lz4.frame
 import zstandard
+from mcap import records as kinds
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import (
-    Attachment,
-    AttachmentIndex,
-    Channel,
-    Chunk,
-    ChunkIndex,
-    Footer,
-    Header,
-    McapRecord,
-    Metadata,
-    MetadataIndex,
-    Schema,
-    Statistics,
-)
+from mcap.records import AttachmentIndex, Channel, Chunk, ChunkIndex, McapRecord, MetadataIndex, Schema, Statistics
 from mcap.records import Message as McapMessage
 
 from aolink.errors import RecordingError
@@ -53,17 +41,17 @@ _FOOTER_BYTES = HEAD.size + 20 + len(MAGIC)
 
 _CHUNK_INDEX_HEAD = struct.Struct("<QQQQI")
 _PARSERS: dict[int, Callable[[ReadDataStream], McapRecord]] = {
-    Opcode.HEADER: Header.read,
+    Opcode.HEADER: kinds.Header.read,
     Opcode.SCHEMA: Schema.read,
     Opcode.CHANNEL: Channel.read,
     Opcode.CHUNK: Chunk.read,
     Opcode.CHUNK_INDEX: ChunkIndex.read,
-    Opcode.ATTACHMENT: Attachment.read,
+    Opcode.ATTACHMENT: kinds.Attachment.read,
     Opcode.ATTACHMENT_INDEX: AttachmentIndex.read,
     Opcode.STATISTICS: Statistics.read,
-    Opcode.METADATA: Metadata.read,
+    Opcode.METADATA: kinds.Metadata.read,
     Opcode.METADATA_INDEX: MetadataIndex.read,
-    Opcode.FOOTER: Footer.read,
+    Opcode.FOOTER: kinds.Footer.read,
 }
 """The kinds of records that are parsed; message indexes and others are skipped."""
 

@@ -12,22 +12,10 @@ import scipy
 from aolink.errors import RigError
 from aolink.numerics.arrays import FloatArray
 from aolink.numerics.block_diagonal import stationary_covariance
+from aolink.rig import parts
 from aolink.rig.disturbance import DisturbanceModel
 from aolink.rig.optical_plant import Optics, read_membrane, read_tip_tilt, read_voltage
-from aolink.rig.parts import (
-    FAULT_NAMES,
-    Control,
-    Drive,
-    Faults,
-    Light,
-    MirrorDriver,
-    Plant,
-    Simulation,
-    Timing,
-    UnmodelledSlopes,
-    Wandering,
-    Wanders,
-)
+from aolink.rig.parts import FAULT_NAMES, Control, Drive, Faults, Light, MirrorDriver, Plant, Timing, UnmodelledSlopes
 from aolink.rig.sensor_tables import read_grid
 from aolink.rig.toml_table import Table, shape_text
 
@@ -38,7 +26,7 @@ _MOST_INPUTS = 10_000
 _MOST_UNMODELLED = 512
 _MOST_FAULT_S = 60.0
 # Largest relative changes that estimators follow: a plant that differs more from its matrices should be identified.
-_WANDERING: dict[Wanders, float] = {
+_WANDERING: dict[parts.Wanders, float] = {
     "frequency": 0.2, "gain": 0.5, "process_noise": 3.0, "kernel_width": 0.5, "sensor_noise": 3.0,
 }  # fmt: skip
 
@@ -85,14 +73,14 @@ def _unmodelled(table: Table, fast_step_s: float) -> UnmodelledSlopes:
     return UnmodelledSlopes(sd=table.number("sd", above=0.0), correlation_steps=correlation_s / fast_step_s)
 
 
-def _wandering(table: Table) -> Wandering:
+def _wandering(table: Table) -> parts.Wandering:
     given = [name for name in _WANDERING if table.has(name)]
     if len(given) != 1:
         raise RigError(
             f"plant.wandering has {' and '.join(given) or 'nothing that drifts'}: give one of {', '.join(_WANDERING)}"
         )
     (name,) = given
-    return Wandering(
+    return parts.Wandering(
         parameter=name,
         largest=table.number(name, above=0.0, high=_WANDERING[name]),
         rate_per_minute=table.number("rate_per_minute", above=0.0, high=_WANDERING[name]),
@@ -260,9 +248,9 @@ def read_control(table: Table, timing: Timing) -> Control:
     return control
 
 
-def read_simulation(table: Table) -> Simulation:
+def read_simulation(table: Table) -> parts.Simulation:
     """Read the table ``[simulation]``. Raises `RigError`."""
-    return Simulation(
+    return parts.Simulation(
         seed=table.integer("seed", 1, low=0),
         light=parse_light(table.text("light", "moving"), table.key("light")),
         clock_offset_s=table.number("clock_offset_s", 0.0),

@@ -15,21 +15,11 @@ from tempfile import TemporaryDirectory
 import numpy as np
 from scipy import stats
 
+from aolink import identification
 from aolink.control import ControllerRow
 from aolink.control.loop import centroids
 from aolink.exposure import Exposure, residual_rms
-from aolink.identification import (
-    Process,
-    ProcessSum,
-    by_pixels,
-    candidates,
-    identified_text,
-    maxima,
-    readings,
-    refined,
-    scanned,
-    space_of,
-)
+from aolink.identification import Process, ProcessSum, by_pixels, candidates, identified_text, maxima, readings
 from aolink.jobs.closed_loop import closed_loop
 from aolink.numerics.arrays import FloatArray
 from aolink.rig import Rig, load_rig, parse_rig
@@ -268,15 +258,15 @@ def _of_seed(cell: Cell, seed: int, size: Size) -> tuple[dict[str, float], Proce
 def _identified(cell: Cell, rig: Rig, exposures: list[Exposure]) -> ProcessSum:
     """The model that `aolink identify --model` finds from blurred frames alone, without its intervals."""
     seen = [readings(rig, exposures)]
-    space = space_of(cell.kinds, seen, rig.sensor.kernel.variance, with_noise=False, with_kernel=False)
+    space = identification.space_of(cell.kinds, seen, rig.sensor.kernel.variance, with_noise=False, with_kernel=False)
 
     def rig_of(x: FloatArray) -> Rig:
         return cell.rig(space.model(x))
 
     tops = maxima(space, seen)
-    found = [*candidates(space, tops, seen), *scanned(space, tops[0], seen, rig_of, exposures)]
+    found = [*candidates(space, tops, seen), *identification.scanned(space, tops[0], seen, rig_of, exposures)]
     left = by_pixels(found, rig_of, exposures)
-    return space.model(refined(space, left[0].x, rig_of, exposures))
+    return space.model(identification.refined(space, left[0].x, rig_of, exposures))
 
 
 def _from_path(cell: Cell, whole: DisturbanceRun, past: int) -> ProcessSum:

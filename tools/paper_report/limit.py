@@ -18,16 +18,9 @@ from aolink.numerics.arrays import FloatArray
 from aolink.optics.sensor import SpotSensor
 from aolink.rig import Rig, load_rig
 from aolink.simulation.model import simulate
+from paper_report import ensemble as runs_of
 from paper_report.blocks import Block, Heading, PageFigure, Table, Text
-from paper_report.ensemble import (
-    IntervalEstimate,
-    measure_errors,
-    normalised,
-    ratio,
-    side_by_side,
-    variant,
-    with_pixel_noise,
-)
+from paper_report.ensemble import IntervalEstimate, measure_errors, normalised, ratio, side_by_side, variant
 from paper_report.numbers import Effort
 from paper_report.shake import shaken
 
@@ -93,7 +86,7 @@ def _side_by_side(rig: Rig, runs: int, count: int, u: FloatArray, seed: int) -> 
     many = side_by_side(rig, runs)
     silent = dataclasses.replace(many, sensor=dataclasses.replace(many.sensor, noise_density=0.0))
     inputs = np.tile(u[:, None], (1, runs))
-    return many, with_pixel_noise(many, simulate(silent, count, seed, inputs=inputs), seed + 1)
+    return many, runs_of.with_pixel_noise(many, simulate(silent, count, seed, inputs=inputs), seed + 1)
 
 
 def limit_table(effort: Effort) -> list[Scene]:
