@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from aolink.jobs.unit import Model
 
 
-Engine = StrEnum("Engine", ["AOLINK", "FILTERPY"])
+Engine = StrEnum("Engine", {"AOLINK": "aolink", "FILTERPY": "filterpy"})
 """The implementation of o1 to o3."""
 
 

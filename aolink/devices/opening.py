@@ -156,7 +156,7 @@ def signed(rig: Rig, camera_port: str | None, mirror_port: str | None, key: str 
     for kind, table in tables.items():
         if table.driver == NATIVE:
             tables[kind] = replace(table, options={**table.options, "key": Path(key).absolute()})
-    return replace(rig, devices=dict[str, DeviceTable](tables))
+    return replace(rig, devices={str(kind): table for kind, table in tables.items()})
 
 
 def _port_and_key(kind: DeviceKind, table: DeviceTable, rig: Rig) -> tuple[str, bytes | None]:
