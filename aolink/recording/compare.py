@@ -79,15 +79,9 @@ class TopicComparison:
 
 
 def compare(
-    first: Recording,
-    second: Recording,
-    *,
-    relative: float = RELATIVE,
-    absolute: float = ABSOLUTE,
-    only: Sequence[str] = (),
-    relative_to_start: bool = False,
-    progress: Progress = no_progress,
-) -> dict[str, TopicComparison]:
+    first: Recording, second: Recording, *, relative: float = RELATIVE, absolute: float = ABSOLUTE, only: Sequence[str]
+    = (), relative_to_start: bool = False, progress: Progress = no_progress,
+) -> dict[str, TopicComparison]:  # fmt: skip
     """Compare two recordings by topic.
 
     Messages are matched by the exposure or command block that they belong to, or else by their number in the topic, not

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import asdict, replace
+from typing import Any
 
 import numpy as np
 import scipy
@@ -17,7 +18,7 @@ from aolink.rig.disturbance import DisturbanceModel
 from aolink.rig.optical_plant import Optics, read_membrane, read_tip_tilt, read_voltage
 from aolink.rig.parts import FAULT_NAMES, Control, Drive, Faults, Light, MirrorDriver, Plant, Timing, UnmodelledSlopes
 from aolink.rig.sensor_tables import read_grid
-from aolink.rig.toml_table import Table, shape_text
+from aolink.rig.toml_table import Table
 
 # One row of inputs, and their limits, must fit into a message of the protocol.
 _MOST_INPUTS = 10_000
@@ -44,28 +45,23 @@ def read_plant(table: Table, root: Table, optics: Optics | None, timing: Timing)
     else:
         return _plant_by_matrices(table, timing)
     # A number is the variance of each noise.
-    W = np.diag(table.vector("process_noise", model.B_w.shape[1], "noises"))
-    if (W < 0).any():
-        raise RigError("plant.process_noise has a variance below zero")
-    unmodelled = _read_unmodelled(table, len(model.C), timing)
-    wandering = table.read_any("wandering", _wandering)
+    W = table.variances("process_noise", model.B_w.shape[1], "noises")
     initial = stationary_covariance(model.A, model.B_w @ W @ model.B_w.T)
     return Plant(
         A=model.A, B=model.B, B_w=model.B_w, C=model.C, process_noise=W, initial_mean=np.zeros(len(model.A)),
-        initial_covariance=initial, axes=1, unmodelled=unmodelled, wandering=wandering,
+        initial_covariance=initial, axes=1, **_beside_the_model(table, len(model.C), timing),
     )  # fmt: skip
 
 
-def _read_unmodelled(table: Table, n_outputs: int, timing: Timing) -> UnmodelledSlopes | None:
-    """Read the table ``[plant.unmodelled]``; None where the file has none."""
-    if not table.has("unmodelled"):
-        return None
-    if n_outputs > _MOST_UNMODELLED:
+def _beside_the_model(table: Table, n_outputs: int, timing: Timing) -> dict[str, Any]:
+    """Read the tables ``[plant.unmodelled]`` and ``[plant.wandering]``."""
+    if table.has("unmodelled") and n_outputs > _MOST_UNMODELLED:
         raise RigError(
             f"{table.key('unmodelled')} is for at most {_MOST_UNMODELLED} slopes of one plant, this one has"
             f" {n_outputs}: leave it out"
         )
-    return table.read("unmodelled", _unmodelled, timing.fast_step_s)
+    unmodelled = table.read_any("unmodelled", _unmodelled, timing.fast_step_s)
+    return {"unmodelled": unmodelled, "wandering": table.read_any("wandering", _wandering)}
 
 
 def _unmodelled(table: Table, fast_step_s: float) -> UnmodelledSlopes:
@@ -88,10 +84,8 @@ def _wandering(table: Table) -> parts.Wandering:
 
 
 def _plant_by_matrices(table: Table, timing: Timing) -> Plant:
-    A = table.matrix("A", (None, None), "states x states")
-    n = A.shape[0]
-    if A.shape != (n, n):
-        raise RigError(f"plant.A has shape {shape_text(A)}, expected a square matrix (states x states)")
+    A = table.square("A", "states x states")
+    n = len(A)
     radius = float(np.abs(np.linalg.eigvals(A)).max())
     if radius > 1 + 1e-9:
         raise RigError(f"plant.A is unstable: its largest eigenvalue has modulus {radius:.6g}, it must be at most 1")
@@ -113,11 +107,9 @@ def _plant_by_matrices(table: Table, timing: Timing) -> Plant:
     else:
         covariance = _covariance(table, "initial_covariance", n, "states x states")
     axes = table.integer("axes", 1, low=1, high=10_000)
-    unmodelled = _read_unmodelled(table, len(C), timing)
-    wandering = table.read_any("wandering", _wandering)
     return Plant(
         A=A, B=B, B_w=B_w, C=C, process_noise=W, initial_mean=mean, initial_covariance=covariance, axes=axes,
-        unmodelled=unmodelled, wandering=wandering,
+        **_beside_the_model(table, len(C), timing),
     )  # fmt: skip
 
 

@@ -25,16 +25,10 @@ _NAP_S = 0.1
 
 
 def replay(
-    recording: Recording,
-    names: Sequence[str],
-    *,
-    rate: float = 0.0,
-    start_s: float = 0.0,
-    end_s: float = float("inf"),
-    stop: Callable[[], bool] = lambda: False,
-    now_s: Callable[[], float] = time.monotonic,
-    sleep: Callable[[float], None] = time.sleep,
-) -> Iterator[tuple[Exposure, list[Estimate]]]:
+    recording: Recording, names: Sequence[str], *, rate: float = 0.0, start_s: float = 0.0, end_s: float = float("inf"),
+    stop: Callable[[], bool] = lambda: False, now_s: Callable[[], float] = time.monotonic, sleep: Callable[[float],
+    None] = time.sleep,
+) -> Iterator[tuple[Exposure, list[Estimate]]]:  # fmt: skip
     """Run estimators over a recording, exposure by exposure; each skips the exposures that it skipped in the session.
 
     Parameters

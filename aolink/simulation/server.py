@@ -177,14 +177,9 @@ class RigServer:
     """Runs the simulated devices behind two serial lines until it is stopped."""
 
     def __init__(
-        self,
-        rig: Rig,
-        streams: dict[LineName, Stream],
-        *,
-        seed: int | None = None,
-        real_time: bool = False,
-        clock_ns: Callable[[], int] = time.monotonic_ns,
-    ) -> None:
+        self, rig: Rig, streams: dict[LineName, Stream], *, seed: int | None = None, real_time: bool = False, clock_ns:
+        Callable[[], int] = time.monotonic_ns,
+    ) -> None:  # fmt: skip
         simulation = rig.simulation
         if simulation.faults.vanish_rate and not real_time:
             raise RigError("simulation.faults.vanish_rate: ports vanish in real time only: add --real-time")

@@ -34,13 +34,9 @@ class SensorRows(Sensor):
 
 
 def variant(
-    rig: Rig,
-    *,
-    process_noise: float | None = None,
-    noise_density: float | None = None,
-    offset: float | None = None,
+    rig: Rig, *, process_noise: float | None = None, noise_density: float | None = None, offset: float | None = None,
     output: Sequence[float] | None = None,
-) -> Rig:
+) -> Rig:  # fmt: skip
     """A rig with other noise, another output, or held off centre from the start instead of driven.
 
     Parameters
@@ -212,15 +208,9 @@ class Cell:
 
 
 def map_cells(
-    rig: Rig,
-    offsets: Sequence[float],
-    densities: Sequence[float],
-    process_noises: Sequence[float],
-    *,
-    runs: int,
-    exposures: int,
-    skip: int,
-) -> list[Cell]:
+    rig: Rig, offsets: Sequence[float], densities: Sequence[float], process_noises: Sequence[float], *, runs: int,
+    exposures: int, skip: int,
+) -> list[Cell]:  # fmt: skip
     """The map o3/o1 over (offset, V, W_f): paired runs, and the same random numbers at every point."""
     cells = []
     for noise in process_noises:
