@@ -117,16 +117,12 @@ def with_disturbance(plant: Plant, model: DisturbanceModel) -> Plant:
     """A plant with the states of a disturbance's model behind its own, and the sum of both as its outputs."""
     n = len(model.A)
     return replace(
-        plant,
-        A=_beside(plant.A, model.A),
-        B=np.vstack([plant.B, np.zeros((n, plant.n_inputs))]),
-        B_w=_beside(plant.B_w, model.B_w),
-        C=np.hstack([plant.C, model.C]),
+        plant, A=_beside(plant.A, model.A), B=np.vstack([plant.B, np.zeros((n, plant.n_inputs))]),
+        B_w=_beside(plant.B_w, model.B_w), C=np.hstack([plant.C, model.C]),
         process_noise=_beside(plant.process_noise, model.process_noise),
         initial_mean=np.append(plant.initial_mean, np.zeros(n)),
-        initial_covariance=_beside(plant.initial_covariance, model.initial_covariance),
-        disturbance_states=n,
-    )
+        initial_covariance=_beside(plant.initial_covariance, model.initial_covariance), disturbance_states=n,
+    )  # fmt: skip
 
 
 def _beside(first: FloatArray, second: FloatArray) -> FloatArray:
@@ -190,16 +186,10 @@ def read_mirror(table: Table, n_inputs: int) -> MirrorDriver:
     if queue < 2 * block:
         raise RigError(f"mirror.queue_steps = {queue} must hold at least two blocks of mirror.block_steps = {block}")
     return MirrorDriver(
-        input_min=low,
-        input_max=high,
-        park=park,
-        dac_bits=table.integer("dac_bits", 16, low=0, high=32),
-        block_steps=block,
-        queue_steps=queue,
-        watchdog_s=table.number("watchdog_s", 1.0, above=0.0),
-        slew_max_per_s=table.number("slew_max_per_s", 0.0, low=0.0),
-        voltage=law,
-    )
+        input_min=low, input_max=high, park=park, dac_bits=table.integer("dac_bits", 16, low=0, high=32),
+        block_steps=block, queue_steps=queue, watchdog_s=table.number("watchdog_s", 1.0, above=0.0),
+        slew_max_per_s=table.number("slew_max_per_s", 0.0, low=0.0), voltage=law,
+    )  # fmt: skip
 
 
 def read_drive(table: Table, n_inputs: int, mirror: MirrorDriver) -> Drive:

@@ -77,23 +77,13 @@ FIGURES = {
 def build(results: Results) -> list[Block]:
     """The whole page."""
     return [
-        *_introduction(results),
-        *_printed_numbers(results),
-        *_figures(),
-        *_steady_levels(results),
-        *_errors(results),
-        *_misprints(results),
-        *_remarks(results),
-        *_map(results),
-        *shake_section(results.shake, results.effort),
+        *_introduction(results), *_printed_numbers(results), *_figures(), *_steady_levels(results), *_errors(results),
+        *_misprints(results), *_remarks(results), *_map(results), *shake_section(results.shake, results.effort),
         *limit_section(results.limit, results.effort, _picture("limit.png")),
-        *against_o1_section(results.over_o1, results.effort),
-        *family_section(results.family, _picture("family.png")),
-        *film_section(results.film),
-        *made_section(results.made, results.effort),
-        *fitted_section(results.fitted, results.effort),
-        *loop_section(results.loops),
-    ]
+        *against_o1_section(results.over_o1, results.effort), *family_section(results.family, _picture("family.png")),
+        *film_section(results.film), *made_section(results.made, results.effort),
+        *fitted_section(results.fitted, results.effort), *loop_section(results.loops),
+    ]  # fmt: skip
 
 
 def _picture(file: str) -> PageFigure:

@@ -155,17 +155,11 @@ def _film_of(frames: int, effort: Effort) -> Film:
 
     everywhere = np.ones_like(counts)
     return Film(
-        frames,
-        {name: rms(of(each, counts)) for name, each in path.items()},
-        over(path, held, counts),
-        {name: rms(of(each, counts)) for name, each in smoothed.items()},
-        over(smoothed, interpolated, counts),
-        coverage,
-        int((~counts).sum()) // 2,
-        counts.size // 2,
-        over(path, held, everywhere),
+        frames, {name: rms(of(each, counts)) for name, each in path.items()}, over(path, held, counts),
+        {name: rms(of(each, counts)) for name, each in smoothed.items()}, over(smoothed, interpolated, counts),
+        coverage, int((~counts).sum()) // 2, counts.size // 2, over(path, held, everywhere),
         over(smoothed, interpolated, everywhere),
-    )
+    )  # fmt: skip
 
 
 def film_section(found: Sequence[Film]) -> list[Block]:
