@@ -12,8 +12,8 @@ import scipy
 from aolink.errors import RigError
 from aolink.numerics.arrays import FloatArray
 from aolink.numerics.block_diagonal import stationary_covariance
+from aolink.optics.mirror import second_order
 from aolink.optics.turbulence import Layer
-from aolink.rig.optical_plant import read_resonance
 from aolink.rig.toml_table import Table
 
 
@@ -104,7 +104,8 @@ def _model(table: Table, n_outputs: int, fast_step_s: float) -> DisturbanceModel
         return _model_by_matrices(table, n_outputs)
     modes = table.matrix("modes", (n_outputs, None), "outputs x modes") if table.has("modes") else np.eye(n_outputs)
     if kind == "resonance":
-        A, B_w = read_resonance(table, "frequency_hz", table.number("frequency_hz", above=0.0), fast_step_s)
+        frequency = table.frequency("frequency_hz", fast_step_s)
+        A, B_w = second_order(frequency, table.number("damping", above=0.0), fast_step_s)
     elif kind == "ornstein-uhlenbeck":
         A, B_w = np.array([[math.exp(-fast_step_s / table.number("correlation_s", above=0.0))]]), np.eye(1)
     elif kind == "random-walk":

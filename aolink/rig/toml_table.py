@@ -151,6 +151,14 @@ class Table:
             raise RigError(f"{self.key(name)} = {value:g} must be {bound}")
         return float(value)
 
+    def frequency(self, name: str, fast_step_s: float) -> float:
+        value, most = self.number(name, above=0.0), 0.5 / fast_step_s
+        if value >= most:
+            raise RigError(
+                f"{self.key(name)} = {value:g} is beyond what steps of {fast_step_s:g} s can follow, {most:g} Hz"
+            )
+        return value
+
     def optional_number(self, name: str, *, low: float) -> float | None:
         return self.number(name, low=low) if self.has(name) else None
 
