@@ -158,8 +158,7 @@ class NativeCamera(_NativeDevice):
 
     def start(self, first_step: int, exposures: int) -> bool:
         message = pb.CameraControl(run=True, first_step=first_step, exposures=exposures)
-        ack = self._request(message, "start", _START_ANSWER_S, _START_TRIES, (pb.OK, pb.TOO_LATE))
-        return ack.code == pb.OK
+        return self._request(message, "start", _START_ANSWER_S, _START_TRIES, (pb.OK, pb.TOO_LATE)).code == pb.OK
 
     def stop(self) -> None:
         self._request(pb.CameraControl(run=False), "stop")

@@ -98,8 +98,7 @@ def _sum(parts: Sequence[DisturbanceModel]) -> DisturbanceModel | None:
 def _model(table: Table, n_outputs: int, fast_step_s: float) -> DisturbanceModel:
     """One part of ``disturbance.model``: a system given by its kind, for each of its mode shapes, or by its
     matrices."""
-    kinds = ("resonance", "ornstein-uhlenbeck", "random-walk", "ar", "matrices")
-    kind = table.choice("kind", kinds)
+    kind = table.choice("kind", ("resonance", "ornstein-uhlenbeck", "random-walk", "ar", "matrices"))
     if kind == "matrices":
         return _model_by_matrices(table, n_outputs)
     modes = table.matrix("modes", (n_outputs, None), "outputs x modes") if table.has("modes") else np.eye(n_outputs)

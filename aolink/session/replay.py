@@ -153,8 +153,7 @@ class RecordedCommands:
         """Inputs of fast steps counted from the session's first, (n_steps, n_inputs); must be asked for in order."""
         while self._known < first_step + n_steps and self._read():
             pass
-        rows = [self._rows.pop(k, self._park) for k in range(first_step, first_step + n_steps)]
-        return np.array(rows)
+        return np.array([self._rows.pop(k, self._park) for k in range(first_step, first_step + n_steps)])
 
     def _read(self) -> bool:
         block = next(self._blocks, None)

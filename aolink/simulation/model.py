@@ -126,8 +126,7 @@ class RigPhysics:
         if sensor.photoelectrons:
             density_of_one = shot_gain(sensor)
             density = np.asarray(self._electrons.poisson(np.maximum(density, 0) / density_of_one) * density_of_one)
-        noise = self._pixel_noise.standard_normal(sensor.shape)
-        density = density + pixel_noise_sd(sensor) * noise
+        density = density + pixel_noise_sd(sensor) * self._pixel_noise.standard_normal(sensor.shape)
         pixels = to_counts(sensor, density)
         if faults.saturation_rate:
             pixels[self._faulty.random(pixels.shape) < faults.saturation_rate] = (1 << sensor.bit_depth) - 1

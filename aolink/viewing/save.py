@@ -121,8 +121,7 @@ class Sender:
     def __init__(self, stream: rr.RecordingStream, recording: Recording, look: Look, root: str = "") -> None:
         check_stands_alone(recording)
         self._recording, self._look, self._rig = recording, look, recording.rig
-        whole = range(len(recording))
-        self._numbers = look.exposures if look.exposures is not None else whole
+        self._numbers = range(len(recording)) if look.exposures is None else look.exposures
         few = len(self._numbers) <= 2 * PATH_WINDOW + 1
         chosen = Chosen.of(recording.rig, look.spot)
         self._drawing = Drawing(stream=stream, chosen=chosen, root=root, points=None if few else POINTS)
