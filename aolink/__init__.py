@@ -164,8 +164,7 @@ def estimate(exposures: Exposures | Series | str | Path, estimator: str) -> list
     from aolink.estimation import Driver
 
     rig, series = _opened(exposures)
-    driver = Driver(rig, [estimator])
-    return [result for _, (result,) in driver.steps(series)]
+    return [result for _, (result,) in Driver(rig, [estimator]).steps(series)]
 
 
 def smooth(

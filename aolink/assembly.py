@@ -110,20 +110,14 @@ class FrameReassembly:
         lost_before = 0 if self._last_id is None else first.frame_id - self._last_id - 1
         self._last_id = first.frame_id
         return Frame(
-            frame_id=first.frame_id,
-            first_step=first.first_step,
-            last_step=first.last_step,
+            frame_id=first.frame_id, first_step=first.first_step, last_step=first.last_step,
             pixels=data.view("<u2").astype(np.uint16, copy=False).reshape(self._shape),
             mask=(arrived[::2] & arrived[1::2]).reshape(self._shape),
             chunks_lost=-(-(first.total - int(np.count_nonzero(arrived))) // self._largest),
-            frames_lost_before=lost_before,
-            device_start_ns=first.exposure_start_ns,
-            device_end_ns=first.exposure_end_ns,
-            host_first_byte_ns=self._first_byte_ns,
-            host_receive_ns=self._last_byte_ns,
-            exposure_offset_ns=first.exposure_offset_ns,
-            plane=first.plane,
-        )
+            frames_lost_before=lost_before, device_start_ns=first.exposure_start_ns,
+            device_end_ns=first.exposure_end_ns, host_first_byte_ns=self._first_byte_ns,
+            host_receive_ns=self._last_byte_ns, exposure_offset_ns=first.exposure_offset_ns, plane=first.plane,
+        )  # fmt: skip
 
 
 class PlanesReassembly:
@@ -345,21 +339,10 @@ class Assembler:
         inputs, assumed = self._history.take(frame.first_step, frame.last_step + 1)
         self._end = frame.last_step + 1
         return Exposure(
-            n_steps=frame.last_step + 1 - frame.first_step,
-            inputs=inputs,
-            lead_inputs=lead,
-            start_offset=frame.exposure_offset_ns / self._fast_step_ns,
-            inputs_assumed=assumed + lead_assumed,
-            frame_id=frame.frame_id,
-            first_step=frame.first_step,
-            pixels=frame.pixels,
-            mask=frame.mask,
-            chunks_lost=frame.chunks_lost,
-            device_start_ns=frame.device_start_ns,
-            device_end_ns=frame.device_end_ns,
-            host_start_ns=frame.host_start_ns,
-            host_receive_ns=frame.host_receive_ns,
-            clock_sigma_ns=frame.clock_sigma_ns,
-            alignment_sigma_ns=frame.alignment_sigma_ns,
-            slopes=frame.slopes,
-        )
+            n_steps=frame.last_step + 1 - frame.first_step, inputs=inputs, lead_inputs=lead,
+            start_offset=frame.exposure_offset_ns / self._fast_step_ns, inputs_assumed=assumed + lead_assumed,
+            frame_id=frame.frame_id, first_step=frame.first_step, pixels=frame.pixels, mask=frame.mask,
+            chunks_lost=frame.chunks_lost, device_start_ns=frame.device_start_ns, device_end_ns=frame.device_end_ns,
+            host_start_ns=frame.host_start_ns, host_receive_ns=frame.host_receive_ns,
+            clock_sigma_ns=frame.clock_sigma_ns, alignment_sigma_ns=frame.alignment_sigma_ns, slopes=frame.slopes,
+        )  # fmt: skip

@@ -49,13 +49,9 @@ _KINDS = {
 
 
 def check_target(
-    target: Path,
-    *,
-    overwrite: bool = False,
-    sources: Iterable[Path] = (),
-    suffix: str = "",
-    error: type[AolinkError] = AolinkError,
-) -> None:
+    target: Path, *, overwrite: bool = False, sources: Iterable[Path] = (), suffix: str = "", error: type[AolinkError] =
+    AolinkError,
+) -> None:  # fmt: skip
     """Refuse a target that must not be written or cannot be, before any work is done for it.
 
     Parameters
@@ -91,13 +87,9 @@ def check_target(
 
 @contextmanager
 def writing(
-    target: Path,
-    *,
-    overwrite: bool = False,
-    sources: Iterable[Path] = (),
-    suffix: str = "",
-    error: type[AolinkError] = AolinkError,
-) -> Iterator[Path]:
+    target: Path, *, overwrite: bool = False, sources: Iterable[Path] = (), suffix: str = "", error: type[AolinkError] =
+    AolinkError,
+) -> Iterator[Path]:  # fmt: skip
     """A new, empty file beside ``target``, to be written in the block; parameters as for `check_target`.
 
     When the block ends well the file is brought to the disk and put in the place of ``target``, with the permissions

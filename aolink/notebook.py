@@ -56,11 +56,7 @@ class NotebookSeries(Series):
         return to_xarray(self, estimators)
 
     def plot(
-        self,
-        estimators: Sequence[str] | None = None,
-        *,
-        output: int = 0,
-        axes: tuple[Axes, Axes] | None = None,
+        self, estimators: Sequence[str] | None = None, *, output: int = 0, axes: tuple[Axes, Axes] | None = None
     ) -> tuple[Axes, Axes]:
         """Draw with matplotlib the camera's blur of one output with the paths over it, and the NIS of the estimates.
 

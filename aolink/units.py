@@ -23,6 +23,4 @@ def duration(seconds: float) -> str:
     if seconds < 60:
         return with_unit(seconds, "s")
     minutes, rest = divmod(round(seconds), 60)
-    if minutes < 60:
-        return f"{minutes} min {rest} s"
-    return f"{minutes // 60} h {minutes % 60} min"
+    return f"{minutes} min {rest} s" if minutes < 60 else f"{minutes // 60} h {minutes % 60} min"

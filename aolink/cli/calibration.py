@@ -81,10 +81,8 @@ def calibrate(
     if files and key:
         raise typer.BadParameter("--key is for the devices' packets: leave it out with recordings")
     to_record, camera, mirror = with_key(loaded, camera, mirror, key)
-    if interaction:
-        check_target(output, overwrite=overwrite, sources=files or [], suffix=".npz", error=CalibrationError)
-    else:
-        check_target(output, overwrite=overwrite, sources=files or [])
+    suffix, kind = (".npz", CalibrationError) if interaction else ("", AolinkError)
+    check_target(output, overwrite=overwrite, sources=files or [], suffix=suffix, error=kind)
     folder = keep or Path(mkdtemp(prefix="aolink-"))
     try:
         if files:
@@ -153,23 +151,20 @@ def _write_interaction(
             sd=measured.sd, residual_rms=measured.residual_rms, exposures=measured.exposures,
             plant_matrix=found.modelled.matrix,
         )  # fmt: skip
-    facts = {
-        "outputs": len(measured.matrix),
-        "inputs": measured.matrix.shape[1],
-        "exposures": measured.exposures,
-        "singular_values": measured.singular_values.tolist(),
-        "condition": measured.condition,
-        "residual_rms": measured.residual_rms,
-        "difference_from_plant": found.difference,
-        "noise": None if np.isnan(found.noise) else found.noise,
-    }
+    outputs, inputs = measured.matrix.shape
     if as_json:
+        facts = {
+            "outputs": outputs, "inputs": inputs, "exposures": measured.exposures,
+            "singular_values": measured.singular_values.tolist(), "condition": measured.condition,
+            "residual_rms": measured.residual_rms, "difference_from_plant": found.difference,
+            "noise": None if np.isnan(found.noise) else found.noise,
+        }  # fmt: skip
         print(json.dumps(facts))
         return
     largest, smallest = measured.singular_values[0], measured.singular_values[-1]
     off = ": a sign, the order of the inputs or a scale is wrong" if found.difference > 0.3 + 3 * found.noise else ""
     stdout.print(
-        f"{facts['outputs']} slopes for {facts['inputs']} inputs from {measured.exposures} exposures; singular values"
+        f"{outputs} slopes for {inputs} inputs from {measured.exposures} exposures; singular values"
         f" {largest:.4g} to {smallest:.4g}, condition {measured.condition:.3g}; residual {measured.residual_rms:.3g}"
         f" slope units (rms)\nthe rig file's plant is off by {100 * found.difference:.3g} % of the matrix, noise"
         f" explains {100 * found.noise:.3g} %{off}"

@@ -8,19 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from aolink.cli.common import (
-    EstimatorOption,
-    JsonOption,
-    OverwriteOption,
-    app,
-    check_measured,
-    get_ready,
-    open_recording,
-    progress,
-    stderr,
-    stdout,
-    warn,
-)
+from aolink.cli import common
+from aolink.cli.common import EstimatorOption, JsonOption, OverwriteOption, app, progress, stderr, stdout, warn
 from aolink.errors import AolinkError, EstimatorError
 from aolink.files import check_target, writing
 from aolink.signals import StopRequest
@@ -32,11 +21,8 @@ if TYPE_CHECKING:
     from aolink.jobs.unit import Model
 
 
-class Engine(StrEnum):
-    """The implementation of o1 to o3."""
-
-    AOLINK = "aolink"
-    FILTERPY = "filterpy"
+Engine = StrEnum("Engine", {"AOLINK": "aolink", "FILTERPY": "filterpy"})
+"""The implementation of o1 to o3."""
 
 
 @app.command(
@@ -122,6 +108,8 @@ def estimate(
 
     if side:
         if table is not None:
+            if table.suffix.lower() == ".parquet":  # any other name is refused, and needs no folder
+                _make_folder(table.parent)
             check_target(table, overwrite=True, suffix=".parquet")
             load_parquet()
         sources = batch.shard(files, shard) if shard else files
@@ -176,10 +164,7 @@ def _estimate_many(
     for each in () if overwrite else places:
         check_table(each)
 
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise AolinkError(f"cannot make the folder {folder}: {(error.strerror or str(error)).lower()}") from None
+    _make_folder(folder)
     # The table's file is locked from the start, so that the same part, if begun twice, is refused.
     with writing(table, overwrite=True) as partial:
         with StopRequest().installed() as stop, progress("estimate", len(todo)) as tell:
@@ -209,6 +194,13 @@ def _estimate_many(
         raise typer.Exit(1)
     if any(each.nothing_measured for each in done):
         raise typer.Exit(EstimatorError.exit_code)
+
+
+def _make_folder(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise AolinkError(f"cannot make the folder {folder}: {(error.strerror or str(error)).lower()}") from None
 
 
 _MOST_ROWS_SHOWN = 40
@@ -244,24 +236,19 @@ def _estimate_one(
 ) -> None:  # fmt: skip
     from aolink.cli.tables import scores as tables
     from aolink.estimation.registry import DEFAULT_ESTIMATOR
+    from aolink.recording import reestimate
     from aolink.recording.reader import Recording
-    from aolink.recording.reestimate import (
-        check_has_exposures,
-        kept_estimators,
-        reestimated,
-        scored_and_compared,
-        write_reestimated,
-    )
+    from aolink.recording.reestimate import check_has_exposures, kept_estimators, reestimated, scored_and_compared
 
-    recording = model.applied_to(open_recording(file))
+    recording = model.applied_to(common.open_recording(file))
     check_has_exposures(recording)
     names = list(dict.fromkeys(estimator or recording.estimators or [DEFAULT_ESTIMATOR]))
     total, known = recording.n_frames, recording.damage
     try:
-        get_ready(recording.rig, names)
+        common.get_ready(recording.rig, names)
         with progress("estimate", total) as tell:
             if output is not None:
-                write_reestimated(
+                reestimate.write_reestimated(
                     recording, names, output,
                     only=only, overwrite=overwrite, progress=tell, engine=engine.value,
                 )  # fmt: skip
@@ -292,4 +279,4 @@ def _estimate_one(
             if recording.estimators and not recording.rig_is_recorded:
                 beside = "; the recording's own estimates were made with another rig file and are left out"
             stdout.print(f"written: {output}{beside}", markup=False)
-    check_measured(recording.path, scores)
+    common.check_measured(recording.path, scores)

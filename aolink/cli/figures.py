@@ -6,16 +6,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from aolink.cli.common import (
-    EstimatorOption,
-    LensletOption,
-    OverwriteOption,
-    app,
-    open_recording,
-    progress,
-    spot_of,
-    stdout,
-)  # fmt: skip
+from aolink.cli import common
+from aolink.cli.common import EstimatorOption, LensletOption, OverwriteOption, app, open_recording, progress, stdout
 from aolink.errors import ExportError, RecordingError
 from aolink.files import check_target
 
@@ -23,18 +15,8 @@ if TYPE_CHECKING:
     from aolink.recording.reader import Recording
 
 
-class What(StrEnum):
-    """The figures that `aolink plot` draws: those of `aolink.plotting.FIGURES`."""
-
-    BLUR = "blur"
-    EXPOSURE = "exposure"
-    NIS = "nis"
-    ERRORS = "errors"
-    LOSSES = "losses"
-    LATENCY = "latency"
-    PUPIL = "pupil"
-    SCENE = "scene"
-
+What = StrEnum("What", ["BLUR", "EXPOSURE", "NIS", "ERRORS", "LOSSES", "LATENCY", "PUPIL", "SCENE"])
+"""The figures that `aolink plot` draws: those of `aolink.plotting.FIGURES`."""
 
 StepsOption = Annotated[bool, typer.Option("--steps", help="Count fast steps on time axes, not seconds.")]
 
@@ -73,7 +55,7 @@ def plot(
         raise ExportError(f"cannot write {output}: a figure is a {', '.join(FORMATS)} file; give such a name")
     recording = open_recording(file, side=[location(each) for each in side or ()])
     check_target(output, overwrite=overwrite, sources=recording.files, error=ExportError)
-    spot = spot_of(recording.rig.sensor, lenslet) if lenslet else 0
+    spot = common.spot_of(recording.rig.sensor, lenslet) if lenslet else 0
     with progress("read", recording.n_frames) as tell:
         save_figure(
             recording, what.value, output, estimators=estimator, exposure=exposure,

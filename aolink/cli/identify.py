@@ -126,7 +126,6 @@ def identify(
 def _follow(
     place: "Path | Url", output: Path, rig: "Rig | None", wanted: "Wanted", sources: list[Path], *, as_json: bool
 ) -> None:
-    """Follow a recording up to its end, and write the models that are offered."""
     from aolink.control.drift import WINDOW
     from aolink.jobs.follow import Following, Offer, offer_path
     from aolink.recording.growing import GrowingRecording
@@ -182,20 +181,12 @@ def _say(each: "News | Offer", *, as_json: bool) -> None:
 
 
 def _as_json(found: "IdentifiedModel") -> dict[str, Any]:
+    parameters = {}
+    for each in found.parameters:
+        ends = [[None if p.open_low else p.low, None if p.open_high else p.high] for p in each.pieces]
+        parameters[each.name] = {"value": each.best, "set": ends}
     return {
-        "output": found.output,
-        "model": found.model.name,
-        "exposures": found.exposures,
-        "log_likelihood": found.log_likelihood,
-        "tried": {each.name: each.score for each in found.tried},
-        "parameters": {
-            each.name: {
-                "value": each.best,
-                "set": [
-                    [None if piece.open_low else piece.low, None if piece.open_high else piece.high]
-                    for piece in each.pieces
-                ],
-            }
-            for each in found.parameters
-        },
-    }
+        "output": found.output, "model": found.model.name, "exposures": found.exposures,
+        "log_likelihood": found.log_likelihood, "tried": {each.name: each.score for each in found.tried},
+        "parameters": parameters,
+    }  # fmt: skip

@@ -9,16 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from aolink.cli.common import (
-    JsonOption,
-    LensletOption,
-    OverwriteOption,
-    app,
-    open_recording,
-    progress,
-    spot_of,
-    stdout,
-)  # fmt: skip
+from aolink.cli import common
+from aolink.cli.common import JsonOption, LensletOption, OverwriteOption, app, open_recording, progress, stdout
 from aolink.errors import FrameError, ViewerError
 from aolink.files import check_target
 
@@ -92,7 +84,7 @@ def view(
         return
     exposures = _numbers(recording, exposure, start, end)
     look = viewing.Look(
-        exposures=exposures, spot=spot_of(recording.rig.sensor, lenslet) if lenslet else 0,
+        exposures=exposures, spot=common.spot_of(recording.rig.sensor, lenslet) if lenslet else 0,
         compared=open_recording(compare) if compare else None,
     )  # fmt: skip
     total = len(exposures) if exposures is not None else recording.n_frames
@@ -147,7 +139,6 @@ def _numbers(recording: "Recording", exposure: int | None, start: float | None, 
 
 
 def _first_steps(recording: "Recording") -> list[int]:
-    """The fast steps at which the exposures begin, from the messages that have them."""
     from aolink.recording import topics
     from aolink.recording.schemas_pb2 import ExposureInfo
 

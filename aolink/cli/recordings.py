@@ -9,17 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from aolink.cli.common import (
-    FileArgument,
-    JsonOption,
-    OutputOption,
-    OverwriteOption,
-    app,
-    open_recording,
-    progress,
-    stdout,
-    warn,
-)
+from aolink.cli import common
+from aolink.cli.common import JsonOption, OutputOption, OverwriteOption, app, open_recording, progress, stdout, warn
 from aolink.errors import RecordingError
 from aolink.files import writing
 
@@ -132,10 +123,7 @@ def compare(
 
 @app.command(epilog="Example: aolink recover broken.mcap -o whole.mcap")
 def recover(
-    file: FileArgument,
-    output: OutputOption,
-    overwrite: OverwriteOption = False,
-    as_json: JsonOption = False,
+    file: common.FileArgument, output: OutputOption, overwrite: OverwriteOption = False, as_json: JsonOption = False
 ) -> None:
     """Save the undamaged part of a damaged or unfinished recording. Exit code 1 if something was lost."""
     from aolink.recording.editing import recover as recover_recording
@@ -149,7 +137,7 @@ def recover(
 
 @app.command(epilog="Example: aolink cut session.mcap --start 10 --end 20 -o part.mcap")
 def cut(
-    file: FileArgument,
+    file: common.FileArgument,
     output: OutputOption,
     start: CutTime = None,
     end: CutTime = None,

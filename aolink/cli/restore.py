@@ -9,16 +9,8 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperCommand, TyperOption
 
-from aolink.cli.common import (
-    JsonOption,
-    OverwriteOption,
-    app,
-    check_measured,
-    local_file,
-    open_recording,
-    progress,
-    stdout,
-)
+from aolink.cli import common
+from aolink.cli.common import JsonOption, OverwriteOption, app, check_measured, local_file, open_recording, stdout
 from aolink.errors import RestorationError
 from aolink.files import check_target
 
@@ -104,7 +96,7 @@ def _deblur_recording(
     from aolink.recording.deblur import write_deblurred
 
     recording = open_recording(file)
-    with progress("deblur", recording.n_frames) as tell:
+    with common.progress("deblur", recording.n_frames) as tell:
         summary = write_deblurred(
             recording, out, estimator=estimator, method=method, overwrite=overwrite,
             workers=os.cpu_count() or 1, progress=tell,

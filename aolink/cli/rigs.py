@@ -11,30 +11,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.markup import escape
 
-from aolink.cli.common import (
-    JsonOption,
-    KeyOption,
-    OverwriteOption,
-    RigArgument,
-    app,
-    load_checked,
-    local_file,
-    program,
-    progress,
-    stderr,
-    stdout,
-    warn,
-)
-from aolink.cli.films import (
-    AtOption,
-    GammaOption,
-    InvertOption,
-    RateOption,
-    SumOption,
-    TopicOption,
-    TrackOption,
-    film_settings,
-)
+from aolink.cli import common, films
+from aolink.cli.common import JsonOption, KeyOption, OverwriteOption, RigArgument, app, load_checked, program, stdout
+from aolink.cli.films import AtOption, GammaOption, InvertOption, RateOption, SumOption, TopicOption, TrackOption
 from aolink.cli.terminal import input_ended
 from aolink.errors import AolinkError, RigError
 from aolink.files import check_target, writing
@@ -86,7 +65,7 @@ def rig(
         typer.Option(
             "--from",
             metavar="FILM",
-            parser=local_file,
+            parser=common.local_file,
             help="Write a first rig file for the objects of a film, RIG or FILM's name with .toml, and end.",
         ),
     ] = None,
@@ -106,7 +85,7 @@ def rig(
     _check_goes_with(context, film)
     if film is not None:
         path = Path(rig or f"{film.stem}.toml")
-        _write_first_rig(path, film, topic, film_settings(rate, frames, track, at, invert, gamma), overwrite)
+        _write_first_rig(path, film, topic, films.film_settings(rate, frames, track, at, invert, gamma), overwrite)
         return
     if not rig:
         raise typer.BadParameter("name a rig file, or a rig that comes with aolink")
@@ -136,7 +115,7 @@ def rig(
             listen, key=read_key(key) if key else None, allow_remote=allow_remote, unsigned=unsigned, links=links
         )
         if allow_remote:
-            warn(
+            common.warn(
                 "other machines can reach this rig: it obeys those that have the key, and what it sends can be read by"
                 " all" if key else "other machines can reach this rig, and everybody there can move the mirror"
             )  # fmt: skip
@@ -164,7 +143,6 @@ _OF_FILMS = frozenset(("rate", "frames", "track", "at", "invert", "gamma", "topi
 
 
 def _check_goes_with(context: typer.Context, film: Path | None) -> None:
-    """Refuse options that would have no effect."""
     for each in context.command.params:
         name = each.name or ""
         source = context.get_parameter_source(name)
@@ -181,7 +159,7 @@ def _write_first_rig(path: Path, source: Path, topic: str | None, settings: "Fil
 
     check_target(path, overwrite=overwrite, suffix=".toml", error=RigError)
     film = open_film(source, topic)
-    with progress("follow", film.count) as tell:
+    with common.progress("follow", film.count) as tell:
         made = first_rig(film, settings, path.stem, tell)
     with writing(path, overwrite=overwrite, error=RigError) as partial:
         partial.write_text(made.text, encoding="utf-8")
@@ -257,7 +235,7 @@ def devices(
             found.append(identify_port(port, key))
         except AolinkError as error:
             failed = error
-            stderr.print(f"{port}: {escape(str(error))}")
+            common.stderr.print(f"{port}: {escape(str(error))}")
             continue
         if not as_json:
             stdout.print(f"{port}: {escape(found[-1].text())}")

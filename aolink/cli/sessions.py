@@ -10,25 +10,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from aolink.cli.common import (
-    EstimatorOption,
-    FileArgument,
-    JsonOption,
-    KeyOption,
-    OutputOption,
-    OverwriteOption,
-    app,
-    check_measured,
-    get_ready,
-    load_checked,
-    open_recording,
-    program,
-    progress,
-    stderr,
-    stdout,
-    warn,
-    with_key,
-)
+from aolink.cli import common
+from aolink.cli.common import EstimatorOption, JsonOption, KeyOption, app, get_ready, program, progress, stdout, warn
 from aolink.cli.terminal import progress_bar
 from aolink.errors import EstimatorError
 from aolink.signals import Interrupted, StopRequest
@@ -46,12 +29,8 @@ if TYPE_CHECKING:
 MOST_EXPOSURES = 2**32 - 1
 
 
-class CalibrationLight(StrEnum):
-    """The light in a recording for a calibration."""
-
-    DARK = "dark"
-    FLAT = "flat"
-    STILL = "still"
+CalibrationLight = StrEnum("CalibrationLight", ["DARK", "FLAT", "STILL"])
+"""The light in a recording for a calibration."""
 
 
 @app.command(
@@ -62,7 +41,7 @@ def record(
     rig: Annotated[
         str, typer.Option(metavar="RIG.toml", help="A rig file, or the name of a rig that comes with aolink.")
     ],
-    output: OutputOption,
+    output: common.OutputOption,
     camera: Annotated[
         str | None,
         typer.Option(
@@ -124,7 +103,7 @@ def record(
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Check everything, with the devices, but send the mirror no input.")
     ] = False,
-    overwrite: OverwriteOption = False,
+    overwrite: common.OverwriteOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """Record a session: play the rig's drive, or close the loop; record everything, estimate online.
@@ -139,7 +118,7 @@ def record(
         compression=compression, chunk_bytes=chunk_kib << 10, flush_s=flush_s, fsync_s=fsync_s,
         split_bytes=round(split_mib * 2**20), split_s=split_s,
     )  # fmt: skip
-    loaded = load_checked(rig)
+    loaded = common.load_checked(rig)
     if force and not control:
         raise typer.BadParameter("--force is for --control")
     if exposures is not None and duration is not None:
@@ -149,7 +128,7 @@ def record(
         if not 0 < periods <= MOST_EXPOSURES:
             raise typer.BadParameter(f"--duration {duration:g} is not a number of seconds above zero")
         exposures = math.ceil(periods)
-    loaded, camera, mirror = with_key(loaded, camera, mirror, key)
+    loaded, camera, mirror = common.with_key(loaded, camera, mirror, key)
     played = None
     if inputs:
         from aolink.session.excitation import excitation
@@ -200,9 +179,7 @@ def _print_dry_run(found: "DryRun", as_json: bool) -> None:
         return
     for name, text in found.facts.items():
         stdout.print(f"{name:<12}{text}", markup=False)
-    stdout.print(
-        "dry run: all of this is good; no input was sent to the mirror, and nothing was recorded", markup=False
-    )
+    stdout.print("dry run: all of this is good; no input was sent to the mirror, and nothing was recorded")
 
 
 def _print_session(report: "Report", output: Path, as_json: bool) -> None:
@@ -223,7 +200,6 @@ def _print_session(report: "Report", output: Path, as_json: bool) -> None:
 def _live_view(
     rig: "Rig", estimators: Sequence[str], true_scene: "NDArray[np.uint16] | None" = None, *, shown: bool
 ) -> "AbstractContextManager[LiveView | None]":
-    """The function that shows exposures in the viewer, or None."""
     if not shown:
         return nullcontext()
     from aolink import viewing
@@ -236,7 +212,7 @@ def _live_view(
     "  |  aolink replay session.mcap --to-rig --camera /dev/pts/3 --mirror /dev/pts/4 -o again.mcap"
 )
 def replay(
-    file: FileArgument,
+    file: common.FileArgument,
     estimator: EstimatorOption = None,
     rate: Annotated[
         float, typer.Option(min=0, metavar="X", help="Pace relative to the recording's; 0 for as fast as possible.")
@@ -261,7 +237,7 @@ def replay(
     output: Annotated[
         Path | None, typer.Option("--output", "-o", metavar="FILE", help="The new recording, with --to-rig.")
     ] = None,
-    overwrite: OverwriteOption = False,
+    overwrite: common.OverwriteOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """Replay a recording through the estimators as if it were live, or send its commands to a rig.
@@ -270,17 +246,18 @@ def replay(
     """
     from aolink.estimation.registry import DEFAULT_ESTIMATOR
 
-    recording = open_recording(file)
+    recording = common.open_recording(file)
     names = list(dict.fromkeys(estimator or recording.estimators or [DEFAULT_ESTIMATOR]))
     get_ready(recording.rig, names)
     if to_rig:
         if control:
             raise typer.BadParameter("--to-rig sends the recorded commands: `aolink record --control` closes a loop")
-        if not (output and _are_driven(recording.rig, camera, mirror)):
+        driven = recording.rig.devices
+        if not (output and (camera or "camera" in driven) and (mirror or "mirror" in driven)):
             raise typer.BadParameter(
                 "--to-rig needs -o FILE, --camera PORT and --mirror PORT, or [devices] in its rig file"
             )
-        to = with_key(recording.rig, camera, mirror, key)
+        to = common.with_key(recording.rig, camera, mirror, key)
         _replay_to_rig(recording, names, *to, output, overwrite=overwrite, as_json=as_json)
         return
     if camera or mirror or key or output:
@@ -314,7 +291,7 @@ def replay(
         else:
             stdout.print(tables.scores(scores))
     stop.raise_if_asked()
-    check_measured(file, scores)
+    common.check_measured(file, scores)
 
 
 def _replay_control(recording: "Recording", controller: str, estimator: str, *, as_json: bool) -> None:
@@ -330,22 +307,10 @@ def _replay_control(recording: "Recording", controller: str, estimator: str, *, 
         stdout.print(tables.replayed(result))
 
 
-def _are_driven(rig: "Rig", camera: str | None, mirror: str | None) -> bool:
-    """Whether a port or the rig file names the driver of each device."""
-    return all(port or kind in rig.devices for kind, port in (("camera", camera), ("mirror", mirror)))
-
-
 def _replay_to_rig(
-    recording: "Recording",
-    names: list[str],
-    rig: "Rig",
-    camera: str | None,
-    mirror: str | None,
-    output: Path,
-    *,
-    overwrite: bool,
-    as_json: bool,
-) -> None:
+    recording: "Recording", names: list[str], rig: "Rig", camera: str | None, mirror: str | None, output: Path, *,
+    overwrite: bool, as_json: bool,
+) -> None:  # fmt: skip
     from aolink import session
     from aolink.cli.tables import recordings as tables
     from aolink.cli.tables import sessions
@@ -392,12 +357,12 @@ def demo(
     from aolink.recording.reader import Recording
     from aolink.recording.reestimate import scored
 
-    loaded = load_checked(rig)
+    loaded = common.load_checked(rig)
     folder = new_folder(out)
     get_ready(loaded, possible_estimators(loaded))
     stop = StopRequest()
     try:
-        with progress_bar(stderr, exposures) as tell:
+        with progress_bar(common.stderr, exposures) as tell:
             result = run_demo(
                 loaded, rig, folder, exposures=exposures, seed=seed, real_time=real_time,
                 control=control or "", stoppable=stop.installed, progress=tell,

@@ -48,14 +48,9 @@ class AdaptedCamera(Adapted):
     chunks_refused = 0
 
     def __init__(
-        self,
-        rig: Rig,
-        driver: SimpleCamera,
-        mirror: Mirror,
-        delay: Delay,
-        now_ns: Callable[[], int],
-        monotonic_ns: Callable[[], int] = time.monotonic_ns,
-    ) -> None:
+        self, rig: Rig, driver: SimpleCamera, mirror: Mirror, delay: Delay, now_ns: Callable[[], int], monotonic_ns:
+        Callable[[], int] = time.monotonic_ns,
+    ) -> None:  # fmt: skip
         super().__init__("camera", driver, delay, now_ns)
         if rig.scene is not None:
             raise DeviceError("the rig file has a [scene], and the camera's driver no second picture: take it out")
@@ -170,20 +165,13 @@ class AdaptedCamera(Adapted):
             return []
         self._end_step = first_step + n_steps
         frame = Frame(
-            frame_id=frame_id,
-            first_step=first_step,
-            last_step=self._end_step - 1,
+            frame_id=frame_id, first_step=first_step, last_step=self._end_step - 1,
             pixels=pixels.astype(np.uint16, copy=False),
-            mask=np.ones(pixels.shape, dtype=np.bool_) if raw.mask is None else raw.mask,
-            chunks_lost=raw.chunks_lost,
-            frames_lost_before=lost,
-            device_start_ns=start_ns,
-            device_end_ns=start_ns + raw.exposure_ns,
-            host_first_byte_ns=now_ns,
-            host_receive_ns=now_ns,
-            alignment_sigma_ns=sigma_ns,
+            mask=np.ones(pixels.shape, dtype=np.bool_) if raw.mask is None else raw.mask, chunks_lost=raw.chunks_lost,
+            frames_lost_before=lost, device_start_ns=start_ns, device_end_ns=start_ns + raw.exposure_ns,
+            host_first_byte_ns=now_ns, host_receive_ns=now_ns, alignment_sigma_ns=sigma_ns,
             exposure_offset_ns=part * self._step_ns // _OFFSETS,
-        )
+        )  # fmt: skip
         if raw.truth is None or n_steps < self._rig.timing.exposure_steps:  # the truth covers all steps
             return [frame]
         return [frame, truth_message(frame_id, raw.truth)]

@@ -169,14 +169,11 @@ class AdaptedMirror(Adapted):
             steps = [*run]
             events.append(
                 pb.Applied(
-                    block_id=block_id,
-                    first_step=steps[0],
-                    n_steps=len(steps),
-                    u=u[steps[0] - first_step : steps[-1] + 1 - first_step].ravel(),
-                    source=source,
+                    block_id=block_id, first_step=steps[0], n_steps=len(steps),
+                    u=u[steps[0] - first_step : steps[-1] + 1 - first_step].ravel(), source=source,
                     device_ns=(steps[-1] + 1) * self._step_ns,
                 )
-            )
+            )  # fmt: skip
         for step in range(begin, end):
             self._commanded.pop(step, None)
         return events

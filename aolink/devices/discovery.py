@@ -108,12 +108,7 @@ def identify_port(port: str, key: str | Path | None = None) -> FoundDevice:
         parked = ", parked by its watchdog" if mirror.latched else ", parked" if mirror.parked else ""
         geometry = f"{mirror.n_inputs} inputs, queue of {mirror.queue_steps} steps{parked}"
     return FoundDevice(
-        port=port,
-        kind=pb.Identity.Kind.Name(identity.kind).lower(),
-        model=identity.model,
-        serial_number=identity.serial_number,
-        firmware=identity.firmware,
-        protocol_version=identity.protocol_version,
-        geometry=geometry,
-        virtual_time=identity.virtual_time,
-    )
+        port=port, kind=pb.Identity.Kind.Name(identity.kind).lower(), model=identity.model,
+        serial_number=identity.serial_number, firmware=identity.firmware, protocol_version=identity.protocol_version,
+        geometry=geometry, virtual_time=identity.virtual_time,
+    )  # fmt: skip

@@ -54,6 +54,12 @@ def lie(device: str, field: str, found: object, expected: str) -> DeviceError:
     )
 
 
+def require(ok: bool, device: str, field: str, found: object, expected: object) -> None:
+    """Raise the error of `lie` for a field unless its value is ``ok``."""
+    if not ok:
+        raise lie(device, field, found, str(expected))
+
+
 def printable(text: str) -> str:
     """A device's text, made safe for a log or a terminal."""
     return "".join(each if each.isprintable() else " " for each in text[:_LONGEST_TEXT])
@@ -122,8 +128,8 @@ class Gate:
     def passes(self, link: Link, message: Message, receive_ns: int) -> bool:
         """Whether to use a message; False for one that is to be dropped. Raises DeviceError naming the field."""
         device = link.name
-        if not isinstance(message, _KINDS[device]):
-            raise lie(device, "a message", type(message).__name__, f"a message that a {device} may send")
+        what = f"a message that a {device} may send"
+        require(isinstance(message, _KINDS[device]), device, "a message", type(message).__name__, what)
         if isinstance(message, pb.FrameChunk):
             self._check_chunk(device, message, receive_ns)
         elif isinstance(message, pb.Applied):
@@ -131,31 +137,28 @@ class Gate:
         elif isinstance(message, pb.CommandAck):
             self._check_command_ack(device, message, receive_ns)
         elif isinstance(message, pb.TruthChunk):
-            self._check_truth_chunk(device, message)
+            fine, what = 0 < message.total <= self._most_truth, f"1 to {self._most_truth} bytes"
+            require(fine, device, "TruthChunk.total", message.total, what)
+            _check_data(device, message)
         elif isinstance(message, pb.ClockReply):
             check_times(device, message, ("device_receive_ns", "device_send_ns"))
         elif isinstance(message, pb.Ack):
             latest = max(self._sent_end, self._end(receive_ns))
-            if message.step > latest:
-                raise lie(device, "Ack.step", message.step, f"at most {latest}, where the device is at most")
+            what = f"at most {latest}, where the device is at most"
+            require(message.step <= latest, device, "Ack.step", message.step, what)
         return True
 
     def check_step(self, device: str, step: int, now_ns: int) -> None:
         """Refuse a fast step, found from a device's clock, that it cannot be in. Raises DeviceError."""
-        slack = round(_SLACK_S * 1e9) // self._step_ns
-        end = self._end(now_ns)
-        if not self._first_step - slack <= step <= end:
-            what = f"a time that puts it between its fast steps {self._first_step - slack} and {end}"
-            raise lie(device, "Identity.step_zero_ns and ClockReply", f"fast step {step}", what)
+        least, end = self._first_step - round(_SLACK_S * 1e9) // self._step_ns, self._end(now_ns)
+        what = f"a time that puts it between its fast steps {least} and {end}"
+        require(least <= step <= end, device, "Identity.step_zero_ns and ClockReply", f"fast step {step}", what)
 
     def check_frame(self, device: str, frame: Frame) -> None:
         """Refuse a frame with counts that its converter cannot give. Raises DeviceError."""
-        bits = self._planes[frame.plane][1]
-        brightest = int(frame.pixels.max())
-        if brightest >> bits:
-            raise lie(
-                device, f"a pixel of frame {frame.frame_id}", brightest, f"at most {(1 << bits) - 1} ({bits} bits)"
-            )
+        bits, brightest = self._planes[frame.plane][1], int(frame.pixels.max())
+        what = f"at most {(1 << bits) - 1} ({bits} bits)"
+        require(not brightest >> bits, device, f"a pixel of frame {frame.frame_id}", brightest, what)
 
     def check_truth(self, device: str, truth: pb.Truth, frame_id: int) -> None:
         """Refuse a truth that this rig cannot have sent. Raises DeviceError."""
@@ -170,11 +173,10 @@ class Gate:
             ("start_state: numbers beyond whole axes", len(truth.start_state) % axes, 0),
         ]
         for name, found, expected in pairs:
-            if found != expected:
-                raise lie(device, f"Truth.{name}", found, str(expected))
+            require(found == expected, device, f"Truth.{name}", found, expected)
         for name, numbers in (("path", path), ("start_state", truth.start_state), ("end_state", truth.end_state)):
-            if not np.isfinite(np.array(numbers)).all():
-                raise lie(device, f"Truth.{name}", "a number that is not finite", "finite ones")
+            finite = bool(np.isfinite(np.array(numbers)).all())
+            require(finite, device, f"Truth.{name}", "a number that is not finite", "finite ones")
 
     def check_virtual_time(self, link: Link, handed: pb.VirtualTime) -> None:
         """Refuse a host time from a simulated rig that is later than it can be. Raises DeviceError.
@@ -186,14 +188,14 @@ class Gate:
         for each in hub.links:
             name = f"{each.name}_bytes"
             taken, least = getattr(handed, name), getattr(before, name) if before else 0
-            if not least <= taken <= each.sent_bytes:
-                raise lie(link.name, f"VirtualTime.{name}", taken, f"{least} to {each.sent_bytes}")
+            what = f"{least} to {each.sent_bytes}"
+            require(least <= taken <= each.sent_bytes, link.name, f"VirtualTime.{name}", taken, what)
         delay_s = _SLACK_S + (_DELAY_S + 4 * self._rig.simulation.latency_s) * sum(e.sent_packets for e in hub.links)
         driven_s = (self._sent_end - self._first_step) * self._step_ns / 1e9 * (1 + MOST_RATE_ERROR)
         first_ns = before.host_ns if before else 0
         last_ns = hub.virtual_since_ns + hub.elapsed_ns + round((driven_s + delay_s) * 1e9)
-        if not first_ns <= handed.host_ns <= last_ns:
-            raise lie(link.name, "VirtualTime.host_ns", handed.host_ns, f"{first_ns} to {last_ns}")
+        fine, what = first_ns <= handed.host_ns <= last_ns, f"{first_ns} to {last_ns}"
+        require(fine, link.name, "VirtualTime.host_ns", handed.host_ns, what)
 
     def _end(self, now_ns: int) -> int:
         """The first fast step that cannot have ended yet."""
@@ -207,14 +209,12 @@ class Gate:
             chunk.frame_id, chunk.plane, chunk.total, chunk.width, chunk.height, chunk.first_step, chunk.last_step,
             chunk.exposure_start_ns, chunk.exposure_end_ns, chunk.exposure_offset_ns,
         )  # fmt: skip
-        if not 0 < len(chunk.data) <= chunk.total - chunk.offset:
-            what = f"1 to {chunk.total - chunk.offset} bytes from offset {chunk.offset} on"
-            raise lie(device, "FrameChunk.data", f"{len(chunk.data)} bytes", what)
+        _check_data(device, chunk)
         if head == self._frame_head:
             return
         timing, end = self._rig.timing, self._end(receive_ns)
-        if chunk.plane >= len(self._planes):
-            raise lie(device, "FrameChunk.plane", chunk.plane, f"below {len(self._planes)}")
+        known = len(self._planes)
+        require(chunk.plane < known, device, "FrameChunk.plane", chunk.plane, f"below {known}")
         rows, columns = self._planes[chunk.plane][0]
         first = chunk.first_step
         pairs = [
@@ -224,18 +224,16 @@ class Gate:
             ("last_step", chunk.last_step, first + timing.exposure_steps - 1),
         ]
         for name, found, expected in pairs:
-            if found != expected:
-                raise lie(device, f"FrameChunk.{name}", found, str(expected))
-        if chunk.last_step >= end:
-            what = f"below {end}, where the device is at most"
-            raise lie(device, "FrameChunk.last_step", chunk.last_step, what)
-        if chunk.exposure_offset_ns >= self._step_ns:
-            raise lie(device, "FrameChunk.exposure_offset_ns", chunk.exposure_offset_ns, f"below {self._step_ns}")
+            require(found == expected, device, f"FrameChunk.{name}", found, expected)
+        what = f"below {end}, where the device is at most"
+        require(chunk.last_step < end, device, "FrameChunk.last_step", chunk.last_step, what)
+        offset_ns, what = chunk.exposure_offset_ns, f"below {self._step_ns}"
+        require(offset_ns < self._step_ns, device, "FrameChunk.exposure_offset_ns", offset_ns, what)
         check_times(device, chunk, ("exposure_start_ns", "exposure_end_ns"))
         if self._frame_id >= 0:
             self._check_order(device, chunk.frame_id, first)
-        elif chunk.frame_id > MOST_STEP:
-            raise lie(device, "FrameChunk.frame_id", chunk.frame_id, "at most 2^53")
+        else:
+            require(chunk.frame_id <= MOST_STEP, device, "FrameChunk.frame_id", chunk.frame_id, "at most 2^53")
         if chunk.frame_id >= self._frame_id:
             self._frame_id, self._frame_step, self._frame_head = chunk.frame_id, first, head
 
@@ -243,87 +241,74 @@ class Gate:
         """Whether a frame can follow the one before: a newer frame begins later, and its id is higher by no more than
         the number of frame periods between them."""
         timing, before, since = self._rig.timing, self._frame_id, first_step - self._frame_step
-        if frame_id == before and since:
-            what = f"{self._frame_step}, as the rest of frame {frame_id} has"
-            raise lie(device, "FrameChunk.first_step", first_step, what)
-        if frame_id > before and since < timing.exposure_steps:
-            what = (
-                f"at least {self._frame_step + timing.exposure_steps}, for frame {before} began at {self._frame_step}"
-            )
-            raise lie(device, "FrameChunk.first_step", first_step, what)
+        what = f"{self._frame_step}, as the rest of frame {frame_id} has"
+        require(frame_id != before or not since, device, "FrameChunk.first_step", first_step, what)
+        if frame_id <= before:
+            return
+        least = self._frame_step + timing.exposure_steps
+        what = f"at least {least}, for frame {before} began at {self._frame_step}"
+        require(first_step >= least, device, "FrameChunk.first_step", first_step, what)
         most = before + since // timing.frame_period_steps + 1
-        if frame_id > before and frame_id > most:
-            what = f"at most {most}, {since} fast steps after frame {before}"
-            raise lie(device, "FrameChunk.frame_id", frame_id, what)
+        what = f"at most {most}, {since} fast steps after frame {before}"
+        require(frame_id <= most, device, "FrameChunk.frame_id", frame_id, what)
 
     def _check_applied(self, device: str, applied: pb.Applied, receive_ns: int) -> bool:
         n_inputs, numbers = self._rig.n_inputs, len(applied.u)
         end, sources = applied.first_step + applied.n_steps, pb.Applied.Source
         sent = [each for each in sources.values() if each not in (pb.Applied.AWAITED, pb.Applied.LATE)]
-        if applied.source not in sent:
-            what = f"one of {sent}"
-            raise lie(device, "Applied.source", applied.source, what)
+        require(applied.source in sent, device, "Applied.source", applied.source, f"one of {sent}")
         known = applied.source != pb.Applied.NOT_REPORTED
-        if not applied.n_steps or numbers != known * applied.n_steps * n_inputs:
-            what = f"as many as it has inputs for, {numbers / n_inputs:g}, at least 1" if known else "no inputs with it"
-            raise lie(device, "Applied.n_steps", applied.n_steps, what)
+        what = f"as many as it has inputs for, {numbers / n_inputs:g}, at least 1" if known else "no inputs with it"
+        whole = applied.n_steps > 0 and numbers == known * applied.n_steps * n_inputs
+        require(whole, device, "Applied.n_steps", applied.n_steps, what)
         if end <= self._first_step:  # from an earlier session
             return False
         latest = self._end(receive_ns)
-        if end > latest:
-            what = f"to end by {latest}, where the device is at most"
-            raise lie(device, "Applied.first_step + n_steps", end, what)
-        if not applied.block_id and applied.source in (pb.Applied.COMMAND, pb.Applied.CLIPPED):
-            raise lie(device, "Applied.block_id", 0, f"a command's, where the source is {sources.Name(applied.source)}")
-        if applied.block_id > self._last_block:
-            raise lie(
-                device, "Applied.block_id", applied.block_id, f"at most {self._last_block}, the newest that was sent"
-            )
-        first_sent, end_sent = self._sent.get(applied.block_id, (0, MOST_STEP))
-        if applied.first_step < first_sent or end > end_sent:
-            what = f"steps {first_sent} to {end_sent - 1} of block {applied.block_id}"
-            raise lie(device, "Applied.first_step", f"{applied.first_step} (to {end - 1})", what)
+        what = f"to end by {latest}, where the device is at most"
+        require(end <= latest, device, "Applied.first_step + n_steps", end, what)
+        block_id, commands = applied.block_id, (pb.Applied.COMMAND, pb.Applied.CLIPPED)
+        what = f"a command's, where the source is {sources.Name(applied.source)}"
+        require(bool(block_id) or applied.source not in commands, device, "Applied.block_id", 0, what)
+        what = f"at most {self._last_block}, the newest that was sent"
+        require(block_id <= self._last_block, device, "Applied.block_id", block_id, what)
+        first_sent, end_sent = self._sent.get(block_id, (0, MOST_STEP))
+        what = f"steps {first_sent} to {end_sent - 1} of block {block_id}"
+        within = first_sent <= applied.first_step and end <= end_sent
+        require(within, device, "Applied.first_step", f"{applied.first_step} (to {end - 1})", what)
         u = np.array(applied.u, dtype=np.float64).reshape(-1, n_inputs)
         inside = (u >= self._input_min) & (u <= self._input_max)
         if not inside.all():  # NaN fails as well
             step, channel = np.argwhere(~inside)[0]
             mirror = self._rig.mirror
             limits = f"{mirror.input_min[channel]:g} to {mirror.input_max[channel]:g}, its limits"
-            raise lie(
-                device,
-                f"Applied.u (input {channel} at fast step {applied.first_step + step})",
-                u[step, channel],
-                limits,
-            )
+            field = f"Applied.u (input {channel} at fast step {applied.first_step + step})"
+            raise lie(device, field, u[step, channel], limits)
         check_times(device, applied, ("device_ns",))
         return True
 
     def _check_command_ack(self, device: str, ack: pb.CommandAck, receive_ns: int) -> None:
-        if not 0 < ack.block_id <= self._last_block:
-            raise lie(device, "CommandAck.block_id", ack.block_id, f"1 to {self._last_block}, those that were sent")
-        if ack.code not in pb.Code.values():
-            raise lie(device, "CommandAck.code", ack.code, f"one of {pb.Code.values()}")
+        what = f"1 to {self._last_block}, those that were sent"
+        require(0 < ack.block_id <= self._last_block, device, "CommandAck.block_id", ack.block_id, what)
+        require(ack.code in pb.Code.values(), device, "CommandAck.code", ack.code, f"one of {pb.Code.values()}")
         if ack.block_id in self._sent:
             first, end = self._sent[ack.block_id]
+            what = f"at most {end - first}, the steps of block {ack.block_id}"
             for name in ("late_steps", "superseded_steps"):
-                if (found := getattr(ack, name)) > end - first:
-                    raise lie(
-                        device, f"CommandAck.{name}", found, f"at most {end - first}, the steps of block {ack.block_id}"
-                    )
+                found = getattr(ack, name)
+                require(found <= end - first, device, f"CommandAck.{name}", found, what)
         latest = max(self._sent_end, self._end(receive_ns))
-        if ack.queue_end_step > latest:
-            raise lie(device, "CommandAck.queue_end_step", ack.queue_end_step, f"at most {latest}")
+        end = ack.queue_end_step
+        require(end <= latest, device, "CommandAck.queue_end_step", end, f"at most {latest}")
 
-    def _check_truth_chunk(self, device: str, chunk: pb.TruthChunk) -> None:
-        if not 0 < chunk.total <= self._most_truth:
-            raise lie(device, "TruthChunk.total", chunk.total, f"1 to {self._most_truth} bytes")
-        if not 0 < len(chunk.data) <= chunk.total - chunk.offset:
-            what = f"1 to {chunk.total - chunk.offset} bytes from offset {chunk.offset} on"
-            raise lie(device, "TruthChunk.data", f"{len(chunk.data)} bytes", what)
+
+def _check_data(device: str, chunk: pb.FrameChunk | pb.TruthChunk) -> None:
+    left = chunk.total - chunk.offset
+    if not 0 < len(chunk.data) <= left:
+        what = f"1 to {left} bytes from offset {chunk.offset} on"
+        raise lie(device, f"{type(chunk).__name__}.data", f"{len(chunk.data)} bytes", what)
 
 
 def check_times(device: str, message: Message, names: Iterable[str]) -> None:
     for name in names:
-        if abs(time_ns := getattr(message, name)) > MOST_TIME_NS:
-            field = f"{type(message).__name__}.{name}"
-            raise lie(device, field, time_ns, f"within {MOST_TIME_NS} ns of the device's zero")
+        field, time_ns = f"{type(message).__name__}.{name}", getattr(message, name)
+        require(abs(time_ns) <= MOST_TIME_NS, device, field, time_ns, f"within {MOST_TIME_NS} ns of the device's zero")

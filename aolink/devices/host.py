@@ -40,5 +40,4 @@ class Host(Hub):
             if came := device.watch_port(now_ns := self.now_ns()):
                 yield Happened(device, came, now_ns)
         for polled in self.polled:
-            events = polled.poll()
-            yield Happened(polled, events, self.now_ns())
+            yield Happened(polled, polled.poll(), self.now_ns())

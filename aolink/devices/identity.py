@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import secrets
 
-from aolink.devices.gate import MOST_STEP, check_times, lie
+from aolink.devices.gate import MOST_STEP, check_times, require
 from aolink.errors import DeviceError, PortError
 from aolink.rig import Rig
 from aolink.wire import messages_pb2 as pb
@@ -86,21 +86,15 @@ def check_kind(link: Link, identity: pb.Identity, kind: pb.Identity.Kind) -> Non
 
 def check_identity(link: Link, identity: pb.Identity) -> None:
     """Refuse an Identity with impossible numbers or names. Raises DeviceError naming the field."""
-    if identity.kind not in (pb.Identity.CAMERA, pb.Identity.MIRROR):
-        raise lie(link.name, "Identity.kind", identity.kind, "1 (camera) or 2 (mirror)")
-    for name in ("model", "serial_number", "firmware", "rig_digest"):
-        text = getattr(identity, name)
-        if len(text) > _LONGEST_NAME or not text.isprintable():
-            raise lie(
-                link.name,
-                f"Identity.{name}",
-                repr(text[:40]),
-                f"at most {_LONGEST_NAME} characters that can be printed",
-            )
-    if not 0 < identity.fast_step_ns <= 10**10:
-        raise lie(link.name, "Identity.fast_step_ns", identity.fast_step_ns, "1 to 10^10")
-    if identity.next_step > MOST_STEP:
-        raise lie(link.name, "Identity.next_step", identity.next_step, "at most 2^53")
+    name, found = link.name, identity.kind
+    require(found in (pb.Identity.CAMERA, pb.Identity.MIRROR), name, "Identity.kind", found, "1 (camera) or 2 (mirror)")
+    for field in ("model", "serial_number", "firmware", "rig_digest"):
+        text = getattr(identity, field)
+        fine, what = len(text) <= _LONGEST_NAME and text.isprintable(), "characters that can be printed"
+        require(fine, name, f"Identity.{field}", repr(text[:40]), f"at most {_LONGEST_NAME} {what}")
+    step_ns, step = identity.fast_step_ns, identity.next_step
+    require(0 < step_ns <= 10**10, name, "Identity.fast_step_ns", step_ns, "1 to 10^10")
+    require(step <= MOST_STEP, name, "Identity.next_step", step, "at most 2^53")
     check_times(link.name, identity, ("step_zero_ns",))
 
 
@@ -122,14 +116,11 @@ def check_against_rig(rig: Rig, identities: dict[str, pb.Identity]) -> list[str]
     ]
     if "camera" in identities:
         camera, scene = identities["camera"].camera, rig.scene
+        shape = scene.shape if scene else (0, 0)
         pairs += [
             ("sensor shape (rows, columns)", (camera.height, camera.width), rig.sensor.shape),
             ("sensor.bit_depth", camera.bit_depth, rig.sensor.bit_depth),
-            (
-                "scene.pixels (rows, columns)",
-                (camera.scene_height, camera.scene_width),
-                scene.shape if scene else (0, 0),
-            ),
+            ("scene.pixels (rows, columns)", (camera.scene_height, camera.scene_width), shape),
             ("scene.bit_depth", camera.scene_bit_depth, scene.bit_depth if scene else 0),
             ("timing.exposure_steps", camera.exposure_steps, rig.timing.exposure_steps),
             ("timing.frame_period_steps", camera.frame_period_steps, rig.timing.frame_period_steps),

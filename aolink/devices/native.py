@@ -79,10 +79,10 @@ class _NativeDevice:
         """Open the port again where it has vanished, and ask the device for its identity. Raises PortError once that
         took too long."""
         events = self.port.poll(now_ns)
-        return [*self._broken_off(), *events] if events else []
+        return [*self.flush(), *events] if events else []
 
-    def _broken_off(self) -> list[Frame]:
-        """The parts of a frame that had come when the port vanished."""
+    def flush(self) -> list[Frame]:
+        """The frames that are still incomplete, as they are."""
         return []
 
     def _come_back(self, message: Message, now_ns: int) -> list[Event]:
@@ -127,13 +127,9 @@ class _NativeDevice:
         raise NotImplementedError
 
     def _request(
-        self,
-        message: pb.CameraControl | pb.Park | pb.Rearm,
-        what: str,
-        answer_s: float = ANSWER_S,
-        tries: int = TRIES,
+        self, message: pb.CameraControl | pb.Park | pb.Rearm, what: str, answer_s: float = ANSWER_S, tries: int = TRIES,
         codes: Sequence[int] = (pb.OK,),
-    ) -> pb.Ack:
+    ) -> pb.Ack:  # fmt: skip
         """Send a request until it is answered; gives the answer. Raises DeviceError if its code is not among
         ``codes``."""
         ack = self._hub.request(
@@ -162,8 +158,7 @@ class NativeCamera(_NativeDevice):
 
     def start(self, first_step: int, exposures: int) -> bool:
         message = pb.CameraControl(run=True, first_step=first_step, exposures=exposures)
-        ack = self._request(message, "start", _START_ANSWER_S, _START_TRIES, (pb.OK, pb.TOO_LATE))
-        return ack.code == pb.OK
+        return self._request(message, "start", _START_ANSWER_S, _START_TRIES, (pb.OK, pb.TOO_LATE)).code == pb.OK
 
     def stop(self) -> None:
         self._request(pb.CameraControl(run=False), "stop")
@@ -174,9 +169,6 @@ class NativeCamera(_NativeDevice):
     @property
     def chunks_refused(self) -> int:
         return self._frames.refused
-
-    def _broken_off(self) -> list[Frame]:
-        return self._frames.flush()
 
     def _take(self, message: Message, receive_ns: int) -> list[Event]:
         if isinstance(message, pb.FrameChunk):
@@ -243,9 +235,8 @@ class NativeMirror(_NativeDevice):
         self.latched = identity.mirror.latched
         self.outage_s = 0.0
         self._watchdog_s = identity.mirror.watchdog_s
-        self._full_s = (
-            identity.mirror.queue_steps * identity.fast_step_ns / 1e9 + _PATIENCE_WATCHDOGS * self._watchdog_s
-        )
+        queue_s = identity.mirror.queue_steps * identity.fast_step_ns / 1e9
+        self._full_s = queue_s + _PATIENCE_WATCHDOGS * self._watchdog_s
         """A queue that stays full for longer will stay full forever."""
         self._block_ids = count(1)
         self._flights: dict[int, _Flight] = {}
@@ -288,12 +279,9 @@ class NativeMirror(_NativeDevice):
     def send_block(self, first_step: int, u: NDArray[np.float64], cause_frame_id: int, now_ns: int) -> pb.CommandBlock:
         u = self._gate.limits.take(first_step, u)
         block = pb.CommandBlock(
-            block_id=next(self._block_ids),
-            first_step=first_step,
-            n_steps=len(u),
-            u=u.ravel(),
+            block_id=next(self._block_ids), first_step=first_step, n_steps=len(u), u=u.ravel(),
             cause_frame_id=cause_frame_id,
-        )
+        )  # fmt: skip
         first_ns, over_ns = self._begins_ns(first_step), self._begins_ns(first_step + len(u))
         flight = _Flight(block, first_ns - self._timeout_ns() / 2, over_ns, now_ns, now_ns)
         self._gate.sent(block)
@@ -436,6 +424,5 @@ class NativeMirror(_NativeDevice):
 
 
 def _reason(ack: pb.Ack | pb.CommandAck) -> str:
-    """The reason for which a device refused a message, in words."""
     known = pb.Code.Name(ack.code) if ack.code in pb.Code.values() else f"code {ack.code}"
     return printable(ack.text) or known

@@ -16,7 +16,7 @@ from aolink.devices.drivers import KINDS, NATIVE, DeviceKind, calling, driver_na
 from aolink.devices.gate import Gate
 from aolink.devices.host import Host
 from aolink.devices.identity import check_against_rig, check_kind, identify, new_nonce
-from aolink.devices.interfaces import Camera, Mirror, Opened
+from aolink.devices.interfaces import Mirror, Opened
 from aolink.devices.native import NativeCamera, NativeMirror
 from aolink.devices.no_mirror import NoMirror
 from aolink.devices.paced import PacedMirror
@@ -59,8 +59,7 @@ def open_devices(
     RigError
         The rig file names no driver for a device, or wrong keys for it.
     """
-    given = {kind: _table(rig, kind, port) for kind, port in zip(KINDS, (camera_port, mirror_port), strict=True)}
-    tables = {kind: table for kind, table in given.items() if table is not None}
+    tables = _tables(rig, camera_port, mirror_port)
     if "camera" not in tables:
         raise RigError(
             "nothing says what drives the camera: give --camera PORT, or [devices.camera] in the rig file with one of"
@@ -74,37 +73,31 @@ def open_devices(
     host = Host(stop)
     with ExitStack() as stack:
         stack.callback(host.close)
-        native_camera, native_mirror, warnings = _open_native(
-            rig,
-            host,
-            {kind: _port_and_key(kind, table, rig) for kind, table in tables.items() if table.driver == NATIVE},
-            stop,
-        )
+        ports = {kind: _port_and_key(kind, table, rig) for kind, table in tables.items() if table.driver == NATIVE}
+        native_camera, native_mirror, warnings = _open_native(rig, host, ports, stop)
         if reconnect_s:
             _allow_return(host, stop, reconnect_s)
         mirror: Mirror
-        if native_mirror is not None:
-            mirror = native_mirror
-        elif "mirror" in tables:
-            mirror = adapted_mirror = _open_mirror(rig, tables["mirror"], host, stack)
-            host.polled.append(adapted_mirror)
-        else:
+        if native_mirror is None and "mirror" not in tables:
             mirror = no_mirror = NoMirror(rig, host.now_ns, native_camera.since_zero_ns if native_camera else None)
             host.polled.append(no_mirror)
             if rig.drive.kind != "none":
                 warnings.append("no mirror is named (--mirror, [devices.mirror]): the rig file's drive is not played")
-        camera: Camera
-        if native_camera is None:
-            camera = adapted_camera = _open_camera(rig, tables["camera"], mirror, host, stack)
-            host.polled.append(adapted_camera)
         else:
-            camera = native_camera
+            mirror = native_mirror or _open_mirror(rig, tables["mirror"], host, stack)
+        camera = native_camera or _open_camera(rig, tables["camera"], mirror, host, stack)
         yield Opened(host, camera, mirror, warnings)
 
 
-def _table(rig: Rig, kind: DeviceKind, port: str | None) -> DeviceTable | None:
-    """The driver of a device and its keys, from the port or the rig file; None where nothing names it."""
-    return rig.devices.get(kind) if port is None else DeviceTable(driver=NATIVE, options={"port": port})
+def _tables(rig: Rig, camera_port: str | None, mirror_port: str | None) -> dict[DeviceKind, DeviceTable]:
+    """Drivers and their keys, from the ports or the rig file, for the devices that either names."""
+    tables: dict[DeviceKind, DeviceTable] = {}
+    for kind, port in zip(KINDS, (camera_port, mirror_port), strict=True):
+        if port is not None:
+            tables[kind] = DeviceTable(driver=NATIVE, options={"port": port})
+        elif kind in rig.devices:
+            tables[kind] = rig.devices[kind]
+    return tables
 
 
 def _open_mirror(rig: Rig, table: DeviceTable, host: Host, stack: ExitStack) -> AdaptedMirror:
@@ -117,6 +110,7 @@ def _open_mirror(rig: Rig, table: DeviceTable, host: Host, stack: ExitStack) -> 
             _check_whole("mirror", table, driver, SimpleMirror)
         mirror = AdaptedMirror(rig, driver, table.delay or Delay(), host.now_ns)
         _close_with(stack, mirror.close)
+    host.polled.append(mirror)
     return mirror
 
 
@@ -130,6 +124,7 @@ def _open_camera(rig: Rig, table: DeviceTable, mirror: Mirror, host: Host, stack
         delay = table.delay or (Delay() if tells_time else Delay(mean_s=period_s / 2, sd_s=period_s / math.sqrt(12)))
         camera = AdaptedCamera(rig, driver, mirror, delay, host.now_ns)
         _close_with(stack, camera.close)
+    host.polled.append(camera)
     return camera
 
 
@@ -157,17 +152,11 @@ def _closing_what_fails(kind: DeviceKind, close: Callable[[], None]) -> Iterator
 
 def signed(rig: Rig, camera_port: str | None, mirror_port: str | None, key: str | Path) -> Rig:
     """The rig whose native devices, those at the ports among them, have their packets signed with a key file."""
-    given = {kind: _table(rig, kind, port) for kind, port in zip(KINDS, (camera_port, mirror_port), strict=True)}
-    return replace(
-        rig,
-        devices={
-            kind: replace(table, options={**table.options, "key": Path(key).absolute()})
-            if table.driver == NATIVE
-            else table
-            for kind, table in given.items()
-            if table is not None
-        },
-    )
+    tables = _tables(rig, camera_port, mirror_port)
+    for kind, table in tables.items():
+        if table.driver == NATIVE:
+            tables[kind] = replace(table, options={**table.options, "key": Path(key).absolute()})
+    return replace(rig, devices={str(kind): table for kind, table in tables.items()})
 
 
 def _port_and_key(kind: DeviceKind, table: DeviceTable, rig: Rig) -> tuple[str, bytes | None]:

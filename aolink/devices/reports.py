@@ -112,7 +112,6 @@ class AppliedReports:
         return queries, given_up
 
     def _part(self, applied: pb.Applied, first: int, end: int) -> pb.Applied:
-        """The steps ``first`` to ``end - 1`` of a report."""
         if (first, end) == (applied.first_step, applied.first_step + applied.n_steps):
             return applied
         width = len(applied.u) // applied.n_steps

@@ -56,16 +56,9 @@ class Job:
         """Digest of everything that the result depends on: a job with the same digest need not be done again."""
         status = self.source.stat()
         facts = [
-            str(self.source.resolve()),
-            status.st_size,
-            status.st_mtime_ns,
-            version("aolink"),
-            self.estimators,
-            self.engine,
-            self.only,
-            self.model.rig_text,
-            [[key, str(value)] for key, value in self.model.changes],
-        ]
+            str(self.source.resolve()), status.st_size, status.st_mtime_ns, version("aolink"), self.estimators,
+            self.engine, self.only, self.model.rig_text, [[key, str(value)] for key, value in self.model.changes],
+        ]  # fmt: skip
         return hashlib.sha256(json.dumps(facts).encode()).hexdigest()
 
     def done_before(self) -> Done | None:
@@ -163,15 +156,9 @@ def models(rig_text: str | None, settings: Sequence[str], rig_name: str = "") ->
 
 
 def jobs(
-    sources: Sequence[Path],
-    each: Sequence[Model],
-    estimators: Sequence[str],
-    folder: Path,
-    engine: Engine = "aolink",
-    *,
-    only: bool = False,
-    overwrite: bool = False,
-) -> list[Job]:
+    sources: Sequence[Path], each: Sequence[Model], estimators: Sequence[str], folder: Path, engine: Engine = "aolink",
+    *, only: bool = False, overwrite: bool = False,
+) -> list[Job]:  # fmt: skip
     """Every recording with every model; with ``overwrite`` also those that were done before.
 
     With ``only`` the outputs have no other estimates than the new ones.
@@ -203,15 +190,9 @@ def jobs(
 
 
 def side_jobs(
-    sources: Sequence[str],
-    each: Sequence[Model],
-    estimators: Sequence[str],
-    folder: Path,
-    engine: Engine = "aolink",
-    *,
-    table: bool = False,
-    overwrite: bool = False,
-) -> list[SideJob]:
+    sources: Sequence[str], each: Sequence[Model], estimators: Sequence[str], folder: Path, engine: Engine = "aolink",
+    *, table: bool = False, overwrite: bool = False,
+) -> list[SideJob]:  # fmt: skip
     """Every recording with every model and every estimator; parameters as for `jobs` and `Settings`.
 
     Raises
@@ -261,12 +242,9 @@ def absolute(source: str) -> str:
 
 
 def run_here(
-    todo: Sequence[Job | SideJob],
-    workers: int,
-    *,
-    stop: Callable[[], bool] = lambda: False,
+    todo: Sequence[Job | SideJob], workers: int, *, stop: Callable[[], bool] = lambda: False,
     progress: Progress = no_progress,
-) -> Iterator[Done]:
+) -> Iterator[Done]:  # fmt: skip
     """Do the jobs on ``workers`` processes; gives each when it is done, in no order. A failed one stops no other.
 
     When ``stop()`` gives True no other job is begun, and those under way are ended in good order.

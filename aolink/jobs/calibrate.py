@@ -93,17 +93,10 @@ def read_frames(path: Path, rig: Rig) -> Frames:
 
 
 def record_frames(
-    rig: Rig,
-    camera: str | None,
-    mirror: str | None,
-    folder: Path,
-    *,
-    frames: int,
-    overwrite: bool,
-    ask: Callable[[str], str],
-    stoppable: Callable[[], AbstractContextManager[Callable[[], bool]]],
+    rig: Rig, camera: str | None, mirror: str | None, folder: Path, *, frames: int, overwrite: bool,
+    ask: Callable[[str], str], stoppable: Callable[[], AbstractContextManager[Callable[[], bool]]],
     progress: Callable[[], AbstractContextManager[Callable[[str, int], None]]],
-) -> list[Path]:
+) -> list[Path]:  # fmt: skip
     """Try both ports, and then ask for each kind of light in turn and record it.
 
     Parameters

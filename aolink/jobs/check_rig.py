@@ -351,8 +351,7 @@ def _check_simulation(rig: Rig) -> Iterator[Finding]:
     simulation = rig.simulation
     if abs(simulation.clock_drift_ppm) > _LARGEST_DRIFT_PPM:
         yield _warning(
-            "simulation.clock_drift_ppm",
-            f"{simulation.clock_drift_ppm:g} ppm is a broken clock: quartz keeps to 100",
+            "simulation.clock_drift_ppm", f"{simulation.clock_drift_ppm:g} ppm is a broken clock: quartz keeps to 100"
         )
     if simulation.latency_s > _LONGEST_LATENCY_S:
         yield _warning(

@@ -23,12 +23,9 @@ _POLL_S = 0.02
 
 
 def run_on(
-    address: str,
-    todo: Sequence[Job | SideJob],
-    *,
-    stop: Callable[[], bool] = lambda: False,
+    address: str, todo: Sequence[Job | SideJob], *, stop: Callable[[], bool] = lambda: False,
     progress: Progress = no_progress,
-) -> Iterator[Done]:
+) -> Iterator[Done]:  # fmt: skip
     """Do jobs on the workers of a scheduler; gives each when it is done, in no order. A failed one stops no other.
 
     Recordings and results are where the workers find them: on a file system that all share, or behind URLs. When

@@ -110,17 +110,10 @@ def new_folder(parent: Path) -> Path:
 
 
 def run_demo(
-    rig: Rig,
-    source: str | Path,
-    folder: Path,
-    *,
-    exposures: int,
-    seed: int | None,
-    real_time: bool,
-    control: str = "",
-    stoppable: Callable[[], AbstractContextManager[Callable[[], bool]]],
+    rig: Rig, source: str | Path, folder: Path, *, exposures: int, seed: int | None, real_time: bool,
+    control: str = "", stoppable: Callable[[], AbstractContextManager[Callable[[], bool]]],
     progress: Callable[[str, int], None],
-) -> DemoResult:
+) -> DemoResult:  # fmt: skip
     """Run the demo in ``folder``. Raises AolinkError; the recording up to then stays.
 
     The rig runs from its ``source``, a file or a name; paths in the file are relative to it. ``stoppable`` is entered

@@ -9,30 +9,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from aolink import identification
 from aolink.errors import IdentificationError
 from aolink.exposure import Exposure
-from aolink.identification import (
-    CANDIDATES,
-    Identified,
-    IdentifiedPlant,
-    Maximum,
-    ProcessSum,
-    Readings,
-    Space,
-    Tried,
-    by_pixels,
-    candidates,
-    chosen,
-    identified,
-    identified_text,
-    kinds_of,
-    maxima,
-    readings,
-    refined,
-    scanned,
-    space_of,
-    tried,
-)
+from aolink.identification import Maximum, ProcessSum, Readings, Space, Tried, identified, kinds_of, readings, tried
 from aolink.numerics.arrays import FloatArray
 from aolink.recording.reader import Recording
 from aolink.recording.reestimate import check_has_exposures
@@ -51,7 +31,7 @@ exposure of each."""
 class Wanted:
     """The quantities to identify."""
 
-    models: tuple[str, ...] = CANDIDATES
+    models: tuple[str, ...] = identification.CANDIDATES
     """Sums of kinds to choose from; a single one is taken without a choice."""
     plant: str | None = None
     """Kind of the plant, where it is fitted as well."""
@@ -69,10 +49,10 @@ class IdentifiedModel:
     output: str
     model: ProcessSum
     """The disturbance, without the noise of a plant that was fitted."""
-    plant: IdentifiedPlant | None
+    plant: identification.IdentifiedPlant | None
     noise: float
     wider: float
-    parameters: tuple[Identified, ...]
+    parameters: tuple[identification.Identified, ...]
     tried: tuple[Tried, ...]
     """The models that were tried; empty where one model was asked for."""
     log_likelihood: float
@@ -131,7 +111,7 @@ def from_readings(
     one = found[0]
     if wanted.plant and len(found) > 1:
         raise IdentificationError("a plant is identified where one input moves one output of a copy of it")
-    text = identified_text(
+    text = identification.identified_text(
         rig.toml, rig, [each.model for each in found], plant=one.plant, noise=one.noise, wider=one.wider
     )
     return Result(found=tuple(found), text=text)
@@ -164,7 +144,7 @@ def _of_output(
     rig: Rig, output: str, seen: Sequence[Readings], exposures: Sequence[Exposure], wanted: Wanted, tell: Tell | None
 ) -> IdentifiedModel:  # fmt: skip
     def space(kinds: Sequence[str]) -> Space:
-        return space_of(
+        return identification.space_of(
             kinds, seen, rig.sensor.kernel.variance, with_noise=wanted.noise, with_kernel=wanted.kernel,
             highest_hz=wanted.highest_hz, plant=wanted.plant,
         )  # fmt: skip
@@ -175,13 +155,13 @@ def _of_output(
             if tell:
                 tell(f"models, {output}", number, len(wanted.models))
             scored.append(tried(name, space, seen))
-        name = chosen(scored).name
+        name = identification.chosen(scored).name
     else:
         name = wanted.models[0] if wanted.models else ""
     of = space(kinds_of(name) if name else ())
     if tell:
         tell(f"fit, {output}", 0, len(of.names) + 1)
-    everything = tops = maxima(of, seen)
+    everything = tops = identification.maxima(of, seen)
     x = tops[0].x
     left_hz: dict[int, list[tuple[float, float]]] = {}
     if rig.plant.n_outputs == 1 and rig.plant.axes <= _BY_PIXELS and rig.plant.wandering is None:
@@ -193,14 +173,16 @@ def _of_output(
             if tell:
                 tell(f"pixels, {output}", done, of)
 
-        scan = scanned(of, tops[0], seen, rig_of, exposures, on_pixels)
-        left = by_pixels([*candidates(of, everything, seen), *scan.candidates], rig_of, exposures, on_pixels)
+        scan = identification.scanned(of, tops[0], seen, rig_of, exposures, on_pixels)
+        left = identification.by_pixels(
+            [*identification.candidates(of, everything, seen), *scan.candidates], rig_of, exposures, on_pixels
+        )
         for k, intervals in scan.left.items():
             # What is left of the candidates was compared with the best frequencies of the scan itself.
             hz, damping = np.exp([each.x[k : k + 2] for each in left]).T
             left_hz[k] = [*zip(hz * (1 - damping), hz * (1 + damping), strict=True), *intervals]
         tops = list(dict.fromkeys(each.maximum for each in left))
-        x = refined(of, left[0].x, rig_of, exposures, on_pixels)
+        x = identification.refined(of, left[0].x, rig_of, exposures, on_pixels)
     sets = identified(of, tops, seen, (lambda k: tell(f"fit, {output}", k + 1, len(of.names) + 1)) if tell else None)
     sets = tuple(
         (each.within(left_hz[k]) if k in left_hz else each).at(value)
@@ -230,7 +212,7 @@ def _with_model(rig: Rig, of: Space, x: FloatArray) -> Rig:
     """The rig with the model of a vector of parameters, for a plant of one output."""
     noise, wider = of.others(x)
     models, plant = [_without_plant(of, x)], of.fitted_plant(x)
-    return parse_rig(identified_text(rig.toml, rig, models, plant=plant, noise=noise, wider=wider))
+    return parse_rig(identification.identified_text(rig.toml, rig, models, plant=plant, noise=noise, wider=wider))
 
 
 def _ruled_out(of: Space, found: Sequence[Maximum], left: Sequence[Maximum]) -> list[str]:

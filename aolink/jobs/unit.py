@@ -167,7 +167,6 @@ def exposure_row(time_ns: int, exposure: Exposure, estimate: Estimate) -> dict[s
 
 
 def _estimates(recording: Recording, settings: Settings) -> Iterator[tuple[int, Exposure, Estimate]]:
-    """Give log times, exposures and their estimates."""
     times: deque[int] = deque()
 
     def exposures() -> Iterator[Exposure]:
@@ -193,7 +192,6 @@ def aolink_version() -> str:
 
 
 def _digest(recording: Recording, settings: Settings) -> str:
-    """Digest of all that the result depends on."""
     facts = [
         recording.digest, aolink_version(), settings.estimator, settings.engine, settings.model.rig_text,
         [[key, str(value)] for key, value in settings.model.changes],

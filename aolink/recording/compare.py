@@ -79,15 +79,9 @@ class TopicComparison:
 
 
 def compare(
-    first: Recording,
-    second: Recording,
-    *,
-    relative: float = RELATIVE,
-    absolute: float = ABSOLUTE,
-    only: Sequence[str] = (),
-    relative_to_start: bool = False,
-    progress: Progress = no_progress,
-) -> dict[str, TopicComparison]:
+    first: Recording, second: Recording, *, relative: float = RELATIVE, absolute: float = ABSOLUTE, only: Sequence[str]
+    = (), relative_to_start: bool = False, progress: Progress = no_progress,
+) -> dict[str, TopicComparison]:  # fmt: skip
     """Compare two recordings by topic.
 
     Messages are matched by the exposure or command block that they belong to, or else by their number in the topic, not
@@ -97,7 +91,8 @@ def compare(
     Parameters
     ----------
     only:
-        Topics to compare; all if none is given. One that ends with "/" means all that begin with it.
+        Topics to compare; all if none is given. One that ends with "/" means all that begin with it, and a former name
+        the topic that has another now.
     relative_to_start:
         Count exposures and fast steps from the first of each recording, and leave out clock times: in two sessions of
         one rig they differ.
@@ -107,7 +102,8 @@ def compare(
     RecordingError
         Neither recording has any of the topics; or messages without a counterpart do not fit on the disk.
     """
-    names = {topic for recording in (first, second) for topic in recording.counts if _is_wanted(topic, only)}
+    wanted = [*only, *(topics.FORMER_TOPICS[each] for each in only if each in topics.FORMER_TOPICS)]
+    names = {topic for recording in (first, second) for topic in recording.counts if _is_wanted(topic, wanted)}
     if not names:
         asked = f" of {', '.join(only)}" if only else ""
         raise RecordingError(f"there is nothing{asked} to compare in {first.path} and {second.path}")
@@ -304,12 +300,8 @@ def _numbers_differ(x: Any, y: Any, relative: float, absolute: float) -> tuple[f
         return 0.0, 0.0, False, ""
     k = int(np.argmax(wrong))
     where = f"[{k}] " if a.size > 1 else ""
-    return (
-        float(gap.max()),
-        float(np.nan_to_num(ratio, nan=np.inf).max()),
-        True,
-        f"{where}{a[k]:.10g} against {b[k]:.10g}",
-    )
+    largest = float(gap.max()), float(np.nan_to_num(ratio, nan=np.inf).max())
+    return *largest, True, f"{where}{a[k]:.10g} against {b[k]:.10g}"
 
 
 def _shown(x: Any, y: Any) -> str:

@@ -61,14 +61,10 @@ def control_message(act: Act, controller: str, estimator: str) -> pb.Control:
     """The message of a controller's result for an exposure."""
     fit = act.fit
     return pb.Control(
-        controller=controller,
-        estimator=estimator,
-        state=pb.Control.State.Name(act.state),
-        nis_ratio=math.nan if fit is None else fit.nis_ratio,
-        whiteness=math.nan if fit is None else fit.whiteness,
-        model_fits=fit is None or fit.fits,
-        **{name: getattr(act, name) for name in _OF_ACT},
-    )
+        controller=controller, estimator=estimator, state=pb.Control.State.Name(act.state),
+        nis_ratio=math.nan if fit is None else fit.nis_ratio, whiteness=math.nan if fit is None else fit.whiteness,
+        model_fits=fit is None or fit.fits, **{name: getattr(act, name) for name in _OF_ACT},
+    )  # fmt: skip
 
 
 def restoration_message(done: RestoredPictures) -> pb.Restoration:
@@ -138,19 +134,13 @@ def estimate_message(estimate: Estimate) -> pb.Estimate:
     axes, n_states = estimate.end_state.shape
     spread = estimate.innovation_covariance.ravel()
     message = pb.Estimate(
-        **{name: getattr(estimate, name) for name in _OF_ESTIMATE},
-        status=pb.Estimate.Status.Name(estimate.status),
-        axes=axes,
-        n_states=n_states,
-        n_coefficients=estimate.coefficients.shape[1],
-        n_measurements=estimate.innovation.shape[1],
-        end_state=estimate.end_state.ravel(),
-        coefficients=estimate.coefficients.ravel(),
-        innovation=estimate.innovation.ravel(),
+        **{name: getattr(estimate, name) for name in _OF_ESTIMATE}, status=pb.Estimate.Status.Name(estimate.status),
+        axes=axes, n_states=n_states, n_coefficients=estimate.coefficients.shape[1],
+        n_measurements=estimate.innovation.shape[1], end_state=estimate.end_state.ravel(),
+        coefficients=estimate.coefficients.ravel(), innovation=estimate.innovation.ravel(),
         innovation_covariance=spread if estimate.innovation_covariance.ndim == 3 else None,
-        innovation_variance=spread if estimate.innovation_covariance.ndim == 2 else None,
-        nis=estimate.nis,
-    )
+        innovation_variance=spread if estimate.innovation_covariance.ndim == 2 else None, nis=estimate.nis,
+    )  # fmt: skip
     for name in ("end_covariance", "coefficient_covariance"):
         covariance = getattr(estimate, name)
         if covariance.shape[-1] > LARGE and (data := correlated(covariance)):
@@ -274,21 +264,13 @@ def estimate_from_message(message: pb.Estimate, model: ExposureModel, exposure: 
         )
         start_covariance = alignment.added_to(start_covariance, "coefficients")
     return Estimate(
-        **{name: getattr(message, name) for name in _OF_ESTIMATE},
-        status=Status(message.status),
-        start_state=coefficients[:, :n].copy(),
-        start_covariance=start_covariance,
-        end_state=_array(message.end_state, axes, n),
-        end_covariance=_covariance(message, "end_covariance", axes, n),
-        coefficients=coefficients,
-        coefficient_covariance=covariance,
-        inputs=exposure.inputs,
-        model=model,
-        innovation=_array(message.innovation, axes, m),
-        innovation_covariance=spread,
-        nis=_array(message.nis, axes),
+        **{name: getattr(message, name) for name in _OF_ESTIMATE}, status=Status(message.status),
+        start_state=coefficients[:, :n].copy(), start_covariance=start_covariance,
+        end_state=_array(message.end_state, axes, n), end_covariance=_covariance(message, "end_covariance", axes, n),
+        coefficients=coefficients, coefficient_covariance=covariance, inputs=exposure.inputs, model=model,
+        innovation=_array(message.innovation, axes, m), innovation_covariance=spread, nis=_array(message.nis, axes),
         alignment=alignment,
-    )
+    )  # fmt: skip
 
 
 def truth_from_message(message: wire.Truth) -> Truth:
@@ -310,6 +292,5 @@ def _array(values: object, *shape: int) -> NDArray[np.float64]:
 
 
 def _runs(flags: NDArray[np.bool_]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Starts and lengths of the runs of True."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(np.int8)))
     return edges[::2], edges[1::2] - edges[::2]

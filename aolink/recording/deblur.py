@@ -87,13 +87,9 @@ def write_deblurred(
 
 
 def _written(
-    recording: Recording,
-    copy: RecordingCopy,
-    made: Iterator[tuple[Exposure, Estimate, RestoredPictures]],
-    held: tuple[Exposure, Estimate, RestoredPictures] | None,
-    estimator: str,
-    progress: Progress,
-) -> RestoredCounts:
+    recording: Recording, copy: RecordingCopy, made: Iterator[tuple[Exposure, Estimate, RestoredPictures]],
+    held: tuple[Exposure, Estimate, RestoredPictures] | None, estimator: str, progress: Progress,
+) -> RestoredCounts:  # fmt: skip
     true_scene = recording.true_scene
     summary, log_times = RestoredCounts(), dict[int, int]()
     left_out: tuple[str, ...] = (topics.RESTORED,)

@@ -96,14 +96,12 @@ def _gaps_and_estimates(recording: Recording) -> tuple[dict[str, float], dict[st
 
 
 def _losses(recording: Recording) -> dict[str, int]:
-    """The losses in the session, by cause; and those in the file."""
     known, counted = recording.metadata, {}
-    for name in _LOSSES:
-        value = known.get(name) or known.get(_FORMERLY.get(name, ""), "")
+    values = {name: known.get(name) or known.get(_FORMERLY.get(name, ""), "") for name in _LOSSES}
+    # Exposures, by the estimator that had no time for them.
+    values |= {name: value for name, value in known.items() if name.startswith("skipped_")}
+    for name, value in values.items():
         if value.isdigit() and int(value):
-            counted[name] = int(value)
-    for name, value in known.items():  # exposures, by the estimator that had no time for them
-        if name.startswith("skipped_") and value.isdigit() and int(value):
             counted[name] = int(value)
     if recording.losses:
         counted["parts_of_the_file"] = len(recording.losses)

@@ -67,13 +67,9 @@ class Recording(RecordedMessages, NumberedSeries):
     """
 
     def __init__(
-        self,
-        path: str | Path | Url,
-        *,
-        rig: Rig | None = None,
-        check: bool = False,
-        side: Sequence[str | Path | Url] = (),
-    ) -> None:
+        self, path: str | Path | Url, *, rig: Rig | None = None, check: bool = False, side: Sequence[str | Path | Url] =
+        (),
+    ) -> None:  # fmt: skip
         super().__init__(path, check=check)
         rig_text = self.rig_text
         if rig_text is None:
@@ -379,9 +375,8 @@ def _parsed_rig(text: str) -> Rig:
 
 
 def _restored(info: schemas_pb2.Restoration, pictures: dict[str, RawImage]) -> RestoredPictures:
-    return convert.restored_from_messages(
-        info, pictures.get(topics.RESTORED_SCENE), pictures.get(topics.RESTORED_SPOTS)
-    )
+    scene, spots = pictures.get(topics.RESTORED_SCENE), pictures.get(topics.RESTORED_SPOTS)
+    return convert.restored_from_messages(info, scene, spots)
 
 
 def _check_replaces(rig: Rig | None, recorded: Rig, path: Path | Url) -> None:

@@ -28,11 +28,7 @@ _BYTES_AT_ONCE = 4 << 20
 
 
 def reestimate(
-    recording: Recording,
-    names: Sequence[str],
-    progress: Progress = no_progress,
-    *,
-    as_recorded: bool = False,
+    recording: Recording, names: Sequence[str], progress: Progress = no_progress, *, as_recorded: bool = False
 ) -> dict[str, list[Estimate]]:
     """Run estimators over a recording; gives the estimates by name, one for each exposure.
 
@@ -52,13 +48,9 @@ def reestimate(
 
 
 def reestimated(
-    recording: Recording,
-    names: Sequence[str],
-    progress: Progress = no_progress,
-    engine: Engine = "aolink",
-    *,
+    recording: Recording, names: Sequence[str], progress: Progress = no_progress, engine: Engine = "aolink", *,
     as_recorded: bool = False,
-) -> Iterator[tuple[Exposure, list[Estimate]]]:
+) -> Iterator[tuple[Exposure, list[Estimate]]]:  # fmt: skip
     """The estimates of `reestimate`, exposure by exposure, in the order of ``names``; nothing stays in memory."""
     driver = Driver(recording.rig, names, engine, skipped_by(recording, names) if as_recorded else None)
     for number, done in enumerate(driver.steps(recording.exposures()), 1):
@@ -125,16 +117,9 @@ def check_has_exposures(recording: Recording) -> None:
 
 
 def write_reestimated(
-    recording: Recording,
-    names: Sequence[str],
-    path: str | Path,
-    *,
-    only: bool = False,
-    overwrite: bool = False,
-    progress: Progress = no_progress,
-    engine: Engine = "aolink",
-    as_recorded: bool = False,
-) -> None:
+    recording: Recording, names: Sequence[str], path: str | Path, *, only: bool = False, overwrite: bool = False,
+    progress: Progress = no_progress, engine: Engine = "aolink", as_recorded: bool = False,
+) -> None:  # fmt: skip
     """Copy a recording with new estimates.
 
     Estimates by other names, and pictures restored with them, stay in the copy, unless ``only``; those that were made
@@ -147,23 +132,14 @@ def write_reestimated(
     RecordingError
         ``path`` exists and not ``overwrite``, or cannot be written.
     """
-    path = Path(path)
-    with writing(path, overwrite=overwrite, sources=recording.files, error=RecordingError) as partial:
-        fill_reestimated(
-            recording, names, partial, only=only, progress=progress, engine=engine, as_recorded=as_recorded
-        )  # fmt: skip
+    with writing(Path(path), overwrite=overwrite, sources=recording.files, error=RecordingError) as partial:
+        fill_reestimated(recording, names, partial, only, progress, engine, as_recorded)
 
 
 def fill_reestimated(
-    recording: Recording,
-    names: Sequence[str],
-    path: Path,
-    *,
-    only: bool = False,
-    progress: Progress = no_progress,
-    engine: Engine = "aolink",
-    as_recorded: bool = False,
-) -> None:
+    recording: Recording, names: Sequence[str], path: Path, only: bool = False, progress: Progress = no_progress,
+    engine: Engine = "aolink", as_recorded: bool = False,
+) -> None:  # fmt: skip
     """Write the content of `write_reestimated` into an empty file that is there already. Raises OSError for errors of
     the disk."""
     kept = kept_estimators(recording, names, only=only)

@@ -222,11 +222,10 @@ def _joined(ranges: Sequence[tuple[int, int]]) -> Iterator[tuple[int, int]]:
     """First byte and end of ranges, with neighbouring ones joined."""
     start = end = -1
     for first, length in ranges:
-        if start >= 0 and first - end <= _GAP:
-            end = max(end, first + length)
-            continue
-        if start >= 0:
-            yield start, end
-        start, end = first, first + length
+        if start < 0 or first - end > _GAP:
+            if start >= 0:
+                yield start, end
+            start = first
+        end = max(end, first + length)
     if start >= 0:
         yield start, end

@@ -21,23 +21,11 @@ from typing import IO
 
 import lz4.frame
 import zstandard
+from mcap import records as kinds
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import (
-    Attachment,
-    AttachmentIndex,
-    Channel,
-    Chunk,
-    ChunkIndex,
-    Footer,
-    Header,
-    McapRecord,
-    Metadata,
-    MetadataIndex,
-    Schema,
-    Statistics,
-)
+from mcap.records import AttachmentIndex, Channel, Chunk, ChunkIndex, McapRecord, MetadataIndex, Schema, Statistics
 from mcap.records import Message as McapMessage
 
 from aolink.errors import RecordingError
@@ -53,17 +41,17 @@ _FOOTER_BYTES = HEAD.size + 20 + len(MAGIC)
 
 _CHUNK_INDEX_HEAD = struct.Struct("<QQQQI")
 _PARSERS: dict[int, Callable[[ReadDataStream], McapRecord]] = {
-    Opcode.HEADER: Header.read,
+    Opcode.HEADER: kinds.Header.read,
     Opcode.SCHEMA: Schema.read,
     Opcode.CHANNEL: Channel.read,
     Opcode.CHUNK: Chunk.read,
     Opcode.CHUNK_INDEX: ChunkIndex.read,
-    Opcode.ATTACHMENT: Attachment.read,
+    Opcode.ATTACHMENT: kinds.Attachment.read,
     Opcode.ATTACHMENT_INDEX: AttachmentIndex.read,
     Opcode.STATISTICS: Statistics.read,
-    Opcode.METADATA: Metadata.read,
+    Opcode.METADATA: kinds.Metadata.read,
     Opcode.METADATA_INDEX: MetadataIndex.read,
-    Opcode.FOOTER: Footer.read,
+    Opcode.FOOTER: kinds.Footer.read,
 }
 """The kinds of records that are parsed; message indexes and others are skipped."""
 
@@ -242,11 +230,9 @@ def scan(file: IO[bytes], on_loss: Callable[[Loss], None]) -> Iterator[tuple[Mca
     whole_end: bool | None = None
     readings, budget = _MOST_READINGS * size, Budget(str(getattr(file, "name", "the file")), size)
     while position < size:
-        file.seek(position)
-        head = file.read(HEAD.size)
-        length = HEAD.unpack(head)[1] if len(head) == HEAD.size else 0
+        opcode, length = _head_at(file, position)
         end = position + HEAD.size + length
-        if len(head) < HEAD.size or end > size or not is_plausible(head[0], length, file, before):
+        if end > size or not is_plausible(opcode, length, file, before):
             found = end if begins_a_record(file, end, size) else search.next(position + 1)
             if found is None:
                 what = f"it was cut off: it ends at byte {size}, in the middle of a record"
@@ -268,7 +254,7 @@ def scan(file: IO[bytes], on_loss: Callable[[Loss], None]) -> Iterator[tuple[Mca
         elif record is not None:
             budget.take_records(1)
             yield record, False
-        if head[0] == Opcode.DATA_END:
+        if opcode == Opcode.DATA_END:
             whole_end = read_summary(file) is not None if whole_end is None else whole_end
             if whole_end:
                 if whole:
@@ -279,7 +265,7 @@ def scan(file: IO[bytes], on_loss: Callable[[Loss], None]) -> Iterator[tuple[Mca
             if found is None:
                 return
             end = found
-        position, before = end, head[0]
+        position, before = end, opcode
     lose(Loss(size, 0, f"it was cut off: it ends at byte {size}, without an index"))
 
 
@@ -299,17 +285,16 @@ def grown(file: IO[bytes], position: int, on_loss: Callable[[Loss], None]) -> tu
     size, name = file.seek(0, os.SEEK_END), str(getattr(file, "name", "the file"))
     if size < position:
         raise RecordingError(f"{name} has become shorter while it was read: it was cut or replaced; begin again")
-    file.seek(position)
-    head = file.read(HEAD.size)
-    end = position + HEAD.size + (HEAD.unpack(head)[1] if len(head) == HEAD.size else 0)
-    if len(head) < HEAD.size or end > size:
+    opcode, length = _head_at(file, position)
+    end = position + HEAD.size + length
+    if end > size:
         return position, [], False
-    if not is_plausible(head[0], end - position - HEAD.size, file, 0):
+    if not is_plausible(opcode, length, file, 0):
         raise RecordingError(f"{name} makes no sense at byte {position}: `aolink recover` copies what is whole")
     record = _record_at(file, position, on_loss)
     if isinstance(record, Chunk):
         return end, list(broken_up(record, position, on_loss, Budget(name, size))), False
-    return end, [] if record is None else [record], head[0] == Opcode.DATA_END
+    return end, [] if record is None else [record], opcode == Opcode.DATA_END
 
 
 def _check_data(file: IO[bytes], end: int, on_loss: Callable[[Loss], None]) -> None:
@@ -328,9 +313,8 @@ def chunk_at(
     file: IO[bytes], index: ChunkIndex, on_loss: Callable[[Loss], None], budget: Budget
 ) -> Iterator[McapRecord]:
     """The records in a chunk that the summary names; none if it is damaged."""
-    file.seek(index.chunk_start_offset)
-    head = file.read(HEAD.size)
-    if len(head) < HEAD.size or head[0] != Opcode.CHUNK or HEAD.unpack(head)[1] > limits().record_bytes:
+    opcode, length = _head_at(file, index.chunk_start_offset)
+    if opcode != Opcode.CHUNK or length > limits().record_bytes:
         on_loss(_chunk_loss(index.chunk_start_offset, index.chunk_length, index))
         return
     record = _record_at(file, index.chunk_start_offset, on_loss)
@@ -343,9 +327,8 @@ def record_at(
 ) -> McapRecord | None:
     """An attachment or metadata that the summary names; None, and a loss, if it is damaged."""
     kind = Opcode.ATTACHMENT if isinstance(index, AttachmentIndex) else Opcode.METADATA
-    file.seek(index.offset)
-    head = file.read(HEAD.size)
-    if len(head) == HEAD.size and head[0] == kind and HEAD.unpack(head)[1] <= limits().record_bytes:
+    opcode, length = _head_at(file, index.offset)
+    if opcode == kind and length <= limits().record_bytes:
         return _record_at(file, index.offset, on_loss)
     on_loss(Loss(index.offset, index.length, f"the {kind.name.lower()} {index.name!r} is damaged"))
     return None
@@ -403,10 +386,16 @@ def _chunk_loss(offset: int, length: int, chunk: Chunk | ChunkIndex) -> Loss:
     )
 
 
+def _head_at(file: IO[bytes], position: int) -> tuple[int, int]:
+    """Opcode and length of a record; 0 and 0 where the file ends within them."""
+    file.seek(position)
+    head = file.read(HEAD.size)
+    return HEAD.unpack(head) if len(head) == HEAD.size else (0, 0)
+
+
 def _record_at(file: IO[bytes], position: int, on_loss: Callable[[Loss], None]) -> McapRecord | None:
     """The record at a position, whose length is known to be possible; None if it is damaged or of no interest."""
-    file.seek(position)
-    opcode, length = HEAD.unpack(file.read(HEAD.size))
+    opcode, length = _head_at(file, position)
     if opcode not in _PARSERS and opcode != Opcode.MESSAGE:
         return None
     if opcode == Opcode.ATTACHMENT and length > limits().attachment_bytes:

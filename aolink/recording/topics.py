@@ -39,7 +39,7 @@ CONNECTION_FAULTS = ("bad_crc", "bad_framing", "bad_payload", "sequence_gaps", "
 the end of a recording have the sums over the devices, with ``connection_`` before the names."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Topic:
     """One row of the table."""
 
@@ -61,36 +61,23 @@ class Topic:
 
 
 TOPICS = (
-    Topic(name=EXPOSURE, message=pb.ExposureInfo, belongs_to="exposure", repeatable=True, shown_by="devices.log_drops"),
-    Topic(
-        name=IMAGE,
-        message=RawImage,
-        belongs_to="exposure",
-        after=EXPOSURE,
-        repeatable=True,
-        shown_by="camera.log_frames",
-    ),
-    Topic(
-        name=COMMAND, message=wire.CommandBlock, belongs_to="steps", repeatable=True, shown_by="devices.log_commands"
-    ),
-    Topic(name=APPLIED, message=wire.Applied, belongs_to="steps", repeatable=True, shown_by="devices.log_applied"),
-    Topic(name=SCENE_EXPOSURE, message=pb.ExposureInfo, belongs_to="exposure", shown_by="scene.log_scenes"),
-    Topic(name=SCENE, message=RawImage, belongs_to="exposure", after=SCENE_EXPOSURE, shown_by="scene.log_scenes"),
-    Topic(name=TRUTH, message=wire.Truth, belongs_to="exposure", repeatable=True, shown_by="motion.log_truth"),
-    Topic(name=ESTIMATE, message=pb.Estimate, belongs_to="exposure", repeatable=True, shown_by="motion.log_estimates"),
-    Topic(name=ESTIMATION, message=pb.Estimation, belongs_to="exposure", shown_by="devices.log_estimation"),
-    Topic(name=RESTORATION, message=pb.Restoration, belongs_to="exposure", shown_by="scene.log_restored"),
-    Topic(
-        name=RESTORED_SCENE, message=RawImage, belongs_to="exposure", after=RESTORATION, shown_by="scene.log_restored"
-    ),
-    Topic(
-        name=RESTORED_SPOTS, message=RawImage, belongs_to="exposure", after=RESTORATION, shown_by="scene.log_restored"
-    ),
-    Topic(name=CONTROL, message=pb.Control, belongs_to="exposure", shown_by="devices.log_control"),
-    Topic(name=LATENCY, message=pb.Latency, belongs_to="exposure", shown_by="devices.log_latency"),
-    Topic(name=CONNECTION, message=pb.ConnectionStatistics, shown_by="devices.log_connection"),
-    Topic(name=CLOCK, message=pb.ClockSample, shown_by="devices.log_clock"),
-    Topic(name=LOG, message=Log, shown_by="devices.log_log"),
+    Topic(EXPOSURE, pb.ExposureInfo, "exposure", repeatable=True, shown_by="devices.log_drops"),
+    Topic(IMAGE, RawImage, "exposure", after=EXPOSURE, repeatable=True, shown_by="camera.log_frames"),
+    Topic(COMMAND, wire.CommandBlock, "steps", repeatable=True, shown_by="devices.log_commands"),
+    Topic(APPLIED, wire.Applied, "steps", repeatable=True, shown_by="devices.log_applied"),
+    Topic(SCENE_EXPOSURE, pb.ExposureInfo, "exposure", shown_by="scene.log_scenes"),
+    Topic(SCENE, RawImage, "exposure", after=SCENE_EXPOSURE, shown_by="scene.log_scenes"),
+    Topic(TRUTH, wire.Truth, "exposure", repeatable=True, shown_by="motion.log_truth"),
+    Topic(ESTIMATE, pb.Estimate, "exposure", repeatable=True, shown_by="motion.log_estimates"),
+    Topic(ESTIMATION, pb.Estimation, "exposure", shown_by="devices.log_estimation"),
+    Topic(RESTORATION, pb.Restoration, "exposure", shown_by="scene.log_restored"),
+    Topic(RESTORED_SCENE, RawImage, "exposure", after=RESTORATION, shown_by="scene.log_restored"),
+    Topic(RESTORED_SPOTS, RawImage, "exposure", after=RESTORATION, shown_by="scene.log_restored"),
+    Topic(CONTROL, pb.Control, "exposure", shown_by="devices.log_control"),
+    Topic(LATENCY, pb.Latency, "exposure", shown_by="devices.log_latency"),
+    Topic(CONNECTION, pb.ConnectionStatistics, "time", shown_by="devices.log_connection"),
+    Topic(CLOCK, pb.ClockSample, "time", shown_by="devices.log_clock"),
+    Topic(LOG, Log, "time", shown_by="devices.log_log"),
 )
 
 SCHEMAS = {row.message.DESCRIPTOR.full_name: row.message for row in TOPICS}
@@ -99,9 +86,9 @@ PICTURES = {row.after: tuple(each.name for each in TOPICS if each.after == row.a
 """The topics with facts about an exposure's pictures, and the topics of the pictures that follow them."""
 RUNS = {row.name: row.message.DESCRIPTOR.full_name for row in TOPICS if row.belongs_to == "steps"}
 """The topics with runs of steps, and their schemas."""
-_UNKNOWN = Topic(name="", message=Message)
+_UNKNOWN = Topic("", Message)
 
-_FORMER_TOPICS = {"/link": CONNECTION}
+FORMER_TOPICS = {"/link": CONNECTION}
 _FORMER_SCHEMAS = {"aolink.recording.LinkStatistics": pb.ConnectionStatistics.DESCRIPTOR.full_name}
 """Names in older recordings, and what they are called now. A message keeps the numbers of its fields, so its bytes stay
 what they were."""
@@ -117,7 +104,7 @@ def present_names(topic: str, schema: str) -> tuple[str, str]:
     """The topic and the schema of a file's channel by their present names. A topic that other software gave one of the
     former names, with messages of its own, keeps it."""
     schema = _FORMER_SCHEMAS.get(schema, schema)
-    renamed = _FORMER_TOPICS.get(topic, topic)
+    renamed = FORMER_TOPICS.get(topic, topic)
     return (renamed if named(renamed).message is SCHEMAS.get(schema) else topic), schema
 
 

@@ -12,7 +12,7 @@ import re
 import threading
 import time
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Self
 
@@ -103,17 +103,10 @@ class RecordingWriter:
     """
 
     def __init__(
-        self,
-        path: str | Path,
-        rig: Rig,
-        metadata: dict[str, str],
-        start_ns: int,
-        *,
-        overwrite: bool = False,
-        deterministic: bool = False,
-        attachments: Mapping[str, bytes] | None = None,
-        options: WriteOptions | None = None,
-    ) -> None:
+        self, path: str | Path, rig: Rig, metadata: dict[str, str], start_ns: int, *, overwrite: bool = False,
+        deterministic: bool = False, attachments: Mapping[str, bytes] | None = None, options: WriteOptions | None =
+        None,
+    ) -> None:  # fmt: skip
         self.path = Path(path)
         self.paths: list[Path] = []
         """The files so far."""
@@ -204,21 +197,18 @@ class RecordingWriter:
         folder = self.path.parent
         try:
             known = sorted(each for each in folder.iterdir() if name.fullmatch(each.name)) if folder.is_dir() else []
-            self._remove(known)
+            if known and not self._overwrite:
+                raise RecordingError(
+                    f"{known[0]} exists and is not overwritten: give another name, or --overwrite to remove"
+                    f" {'it' if len(known) == 1 else f'all {len(known)} parts'}"
+                )
+            for each in known:
+                if files.is_being_written(each):
+                    raise RecordingError(f"{each} is being written by another command: give another name")
+            for each in known:
+                each.unlink()
         except OSError as error:
             raise RecordingError(f"cannot write {self.path}: {files.why_not(error)}") from None
-
-    def _remove(self, known: Sequence[Path]) -> None:
-        if known and not self._overwrite:
-            raise RecordingError(
-                f"{known[0]} exists and is not overwritten: give another name, or --overwrite to remove"
-                f" {'it' if len(known) == 1 else f'all {len(known)} parts'}"
-            )
-        for each in known:
-            if files.is_being_written(each):
-                raise RecordingError(f"{each} is being written by another command: give another name")
-        for each in known:
-            each.unlink()
 
     def _begin(self, start_ns: int) -> None:
         """Create the file, or the next of several."""

@@ -7,24 +7,7 @@ from aolink.rig.sensor_tables import CalibrationTable
 from aolink.rig.tables import parse_light, with_faults
 
 __all__ = [
-    "CalibrationTable",
-    "Control",
-    "Drive",
-    "Faults",
-    "Kernel",
-    "Light",
-    "MirrorDriver",
-    "Plant",
-    "Rig",
-    "Sensor",
-    "Simulation",
-    "SpotSensor",
-    "Timing",
-    "Wandering",
-    "Wanders",
-    "builtin_rigs",
-    "load_rig",
-    "parse_light",
-    "parse_rig",
-    "with_faults",
-]
+    "CalibrationTable", "Control", "Drive", "Faults", "Kernel", "Light", "MirrorDriver", "Plant", "Rig", "Sensor",
+    "Simulation", "SpotSensor", "Timing", "Wandering", "Wanders", "builtin_rigs", "load_rig", "parse_light",
+    "parse_rig", "with_faults",
+]  # fmt: skip

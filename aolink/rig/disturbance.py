@@ -14,7 +14,7 @@ from aolink.numerics.arrays import FloatArray
 from aolink.numerics.block_diagonal import stationary_covariance
 from aolink.optics.mirror import second_order
 from aolink.optics.turbulence import Layer
-from aolink.rig.toml_table import Table, shape_text
+from aolink.rig.toml_table import Table
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,18 +98,12 @@ def _sum(parts: Sequence[DisturbanceModel]) -> DisturbanceModel | None:
 def _model(table: Table, n_outputs: int, fast_step_s: float) -> DisturbanceModel:
     """One part of ``disturbance.model``: a system given by its kind, for each of its mode shapes, or by its
     matrices."""
-    kinds = ("resonance", "ornstein-uhlenbeck", "random-walk", "ar", "matrices")
-    kind = table.choice("kind", kinds)
+    kind = table.choice("kind", ("resonance", "ornstein-uhlenbeck", "random-walk", "ar", "matrices"))
     if kind == "matrices":
         return _model_by_matrices(table, n_outputs)
     modes = table.matrix("modes", (n_outputs, None), "outputs x modes") if table.has("modes") else np.eye(n_outputs)
     if kind == "resonance":
-        frequency = table.number("frequency_hz", above=0.0)
-        if frequency >= 0.5 / fast_step_s:
-            raise RigError(
-                f"{table.key('frequency_hz')} = {frequency:g} is beyond what steps of {fast_step_s:g} s can follow,"
-                f" {0.5 / fast_step_s:g} Hz"
-            )
+        frequency = table.frequency("frequency_hz", fast_step_s)
         A, B_w = second_order(frequency, table.number("damping", above=0.0), fast_step_s)
     elif kind == "ornstein-uhlenbeck":
         A, B_w = np.array([[math.exp(-fast_step_s / table.number("correlation_s", above=0.0))]]), np.eye(1)
@@ -141,15 +135,11 @@ def _autoregressive(table: Table) -> tuple[FloatArray, FloatArray]:
 
 
 def _model_by_matrices(table: Table, n_outputs: int) -> DisturbanceModel:
-    A = table.matrix("A", (None, None), "states x states")
+    A = table.square("A", "states x states")
     n = len(A)
-    if A.shape != (n, n):
-        raise RigError(f"{table.key('A')} has shape {shape_text(A)}, expected a square matrix (states x states)")
     _check_dies_out(table, "A", A)
     B_w = table.matrix("B_w", (n, None), "states x process noises")
-    W = np.diag(table.vector("process_noise", B_w.shape[1], "noises: the variance of each"))
-    if (W < 0).any():
-        raise RigError(f"{table.key('process_noise')} has a variance below zero")
+    W = table.variances("process_noise", B_w.shape[1], "noises: the variance of each")
     return DisturbanceModel(
         A=A, B_w=B_w, C=table.matrix("C", (n_outputs, n), "outputs x states"), process_noise=W,
         initial_covariance=stationary_covariance(A, B_w @ W @ B_w.T),

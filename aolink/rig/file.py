@@ -17,21 +17,14 @@ from pathlib import Path
 from aolink.errors import RigError
 from aolink.optics.scene import SceneSensor
 from aolink.optics.sensor import BaseSensor
+from aolink.rig import tables
 from aolink.rig.device_tables import DeviceTable, read_devices
 from aolink.rig.disturbance import Disturbance, read_disturbance
 from aolink.rig.optical_plant import Optics, read_optics
 from aolink.rig.parts import Control, Drive, MirrorDriver, Plant, Simulation, Timing
 from aolink.rig.scene_table import read_scene
 from aolink.rig.sensor_tables import CalibrationTable, read_calibration, read_grid, read_sensor
-from aolink.rig.tables import (
-    read_control,
-    read_drive,
-    read_mirror,
-    read_plant,
-    read_simulation,
-    read_timing,
-    with_disturbance,
-)
+from aolink.rig.tables import read_control, read_drive, read_mirror, read_plant, read_simulation, read_timing
 from aolink.rig.toml_table import Table, named_file
 
 _TABLES = (
@@ -170,7 +163,7 @@ def parse_rig(text: str, folder: Path | None = None) -> Rig:
     if disturbance and optics is None and (disturbance.layers or len(disturbance.zernike_m)):
         raise RigError("disturbance: turbulence and aberrations need [lenslets], to know the slopes that they make")
     if disturbance and disturbance.model:
-        plant = with_disturbance(plant, disturbance.model)
+        plant = tables.with_disturbance(plant, disturbance.model)
     scene = root.read_any("scene", read_scene)
     simulation = root.read("simulation", read_simulation, optional=True)
     calibration = root.read_any("calibration", read_calibration)

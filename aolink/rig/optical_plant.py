@@ -137,12 +137,7 @@ def read_membrane(table: Table, optics: Optics, fast_step_s: float) -> MirrorPla
 
 def _dynamics(table: Table, fast_step_s: float) -> tuple[tuple[FloatArray, FloatArray], float | None]:
     """Resonance of an actuator, and the share of a drift that is left after a fast step."""
-    frequency = table.number("resonance_hz", above=0.0)
-    if frequency >= 0.5 / fast_step_s:
-        raise RigError(
-            f"{table.key('resonance_hz')} = {frequency:g} is beyond what steps of {fast_step_s:g} s can follow,"
-            f" {0.5 / fast_step_s:g} Hz"
-        )
+    frequency = table.frequency("resonance_hz", fast_step_s)
     dynamics = second_order(frequency, table.number("damping", above=0.0), fast_step_s)
     drift_s = table.number("drift_s", above=0.0) if table.has("drift_s") else None
     return dynamics, None if drift_s is None else math.exp(-fast_step_s / drift_s)

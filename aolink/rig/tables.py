@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import asdict, replace
+from typing import Any
 
 import numpy as np
 import scipy
@@ -12,24 +13,12 @@ import scipy
 from aolink.errors import RigError
 from aolink.numerics.arrays import FloatArray
 from aolink.numerics.block_diagonal import stationary_covariance
+from aolink.rig import parts
 from aolink.rig.disturbance import DisturbanceModel
 from aolink.rig.optical_plant import Optics, read_membrane, read_tip_tilt, read_voltage
-from aolink.rig.parts import (
-    FAULT_NAMES,
-    Control,
-    Drive,
-    Faults,
-    Light,
-    MirrorDriver,
-    Plant,
-    Simulation,
-    Timing,
-    UnmodelledSlopes,
-    Wandering,
-    Wanders,
-)
+from aolink.rig.parts import FAULT_NAMES, Control, Drive, Faults, Light, MirrorDriver, Plant, Timing, UnmodelledSlopes
 from aolink.rig.sensor_tables import read_grid
-from aolink.rig.toml_table import Table, shape_text
+from aolink.rig.toml_table import Table
 
 # One row of inputs, and their limits, must fit into a message of the protocol.
 _MOST_INPUTS = 10_000
@@ -38,7 +27,7 @@ _MOST_INPUTS = 10_000
 _MOST_UNMODELLED = 512
 _MOST_FAULT_S = 60.0
 # Largest relative changes that estimators follow: a plant that differs more from its matrices should be identified.
-_WANDERING: dict[Wanders, float] = {
+_WANDERING: dict[parts.Wanders, float] = {
     "frequency": 0.2, "gain": 0.5, "process_noise": 3.0, "kernel_width": 0.5, "sensor_noise": 3.0,
 }  # fmt: skip
 
@@ -56,28 +45,23 @@ def read_plant(table: Table, root: Table, optics: Optics | None, timing: Timing)
     else:
         return _plant_by_matrices(table, timing)
     # A number is the variance of each noise.
-    W = np.diag(table.vector("process_noise", model.B_w.shape[1], "noises"))
-    if (W < 0).any():
-        raise RigError("plant.process_noise has a variance below zero")
-    unmodelled = _read_unmodelled(table, len(model.C), timing)
-    wandering = table.read_any("wandering", _wandering)
+    W = table.variances("process_noise", model.B_w.shape[1], "noises")
     initial = stationary_covariance(model.A, model.B_w @ W @ model.B_w.T)
     return Plant(
         A=model.A, B=model.B, B_w=model.B_w, C=model.C, process_noise=W, initial_mean=np.zeros(len(model.A)),
-        initial_covariance=initial, axes=1, unmodelled=unmodelled, wandering=wandering,
+        initial_covariance=initial, axes=1, **_beside_the_model(table, len(model.C), timing),
     )  # fmt: skip
 
 
-def _read_unmodelled(table: Table, n_outputs: int, timing: Timing) -> UnmodelledSlopes | None:
-    """Read the table ``[plant.unmodelled]``; None where the file has none."""
-    if not table.has("unmodelled"):
-        return None
-    if n_outputs > _MOST_UNMODELLED:
+def _beside_the_model(table: Table, n_outputs: int, timing: Timing) -> dict[str, Any]:
+    """Read the tables ``[plant.unmodelled]`` and ``[plant.wandering]``."""
+    if table.has("unmodelled") and n_outputs > _MOST_UNMODELLED:
         raise RigError(
             f"{table.key('unmodelled')} is for at most {_MOST_UNMODELLED} slopes of one plant, this one has"
             f" {n_outputs}: leave it out"
         )
-    return table.read("unmodelled", _unmodelled, timing.fast_step_s)
+    unmodelled = table.read_any("unmodelled", _unmodelled, timing.fast_step_s)
+    return {"unmodelled": unmodelled, "wandering": table.read_any("wandering", _wandering)}
 
 
 def _unmodelled(table: Table, fast_step_s: float) -> UnmodelledSlopes:
@@ -85,14 +69,14 @@ def _unmodelled(table: Table, fast_step_s: float) -> UnmodelledSlopes:
     return UnmodelledSlopes(sd=table.number("sd", above=0.0), correlation_steps=correlation_s / fast_step_s)
 
 
-def _wandering(table: Table) -> Wandering:
+def _wandering(table: Table) -> parts.Wandering:
     given = [name for name in _WANDERING if table.has(name)]
     if len(given) != 1:
         raise RigError(
             f"plant.wandering has {' and '.join(given) or 'nothing that drifts'}: give one of {', '.join(_WANDERING)}"
         )
     (name,) = given
-    return Wandering(
+    return parts.Wandering(
         parameter=name,
         largest=table.number(name, above=0.0, high=_WANDERING[name]),
         rate_per_minute=table.number("rate_per_minute", above=0.0, high=_WANDERING[name]),
@@ -100,10 +84,8 @@ def _wandering(table: Table) -> Wandering:
 
 
 def _plant_by_matrices(table: Table, timing: Timing) -> Plant:
-    A = table.matrix("A", (None, None), "states x states")
-    n = A.shape[0]
-    if A.shape != (n, n):
-        raise RigError(f"plant.A has shape {shape_text(A)}, expected a square matrix (states x states)")
+    A = table.square("A", "states x states")
+    n = len(A)
     radius = float(np.abs(np.linalg.eigvals(A)).max())
     if radius > 1 + 1e-9:
         raise RigError(f"plant.A is unstable: its largest eigenvalue has modulus {radius:.6g}, it must be at most 1")
@@ -125,11 +107,9 @@ def _plant_by_matrices(table: Table, timing: Timing) -> Plant:
     else:
         covariance = _covariance(table, "initial_covariance", n, "states x states")
     axes = table.integer("axes", 1, low=1, high=10_000)
-    unmodelled = _read_unmodelled(table, len(C), timing)
-    wandering = table.read_any("wandering", _wandering)
     return Plant(
         A=A, B=B, B_w=B_w, C=C, process_noise=W, initial_mean=mean, initial_covariance=covariance, axes=axes,
-        unmodelled=unmodelled, wandering=wandering,
+        **_beside_the_model(table, len(C), timing),
     )  # fmt: skip
 
 
@@ -137,16 +117,12 @@ def with_disturbance(plant: Plant, model: DisturbanceModel) -> Plant:
     """A plant with the states of a disturbance's model behind its own, and the sum of both as its outputs."""
     n = len(model.A)
     return replace(
-        plant,
-        A=_beside(plant.A, model.A),
-        B=np.vstack([plant.B, np.zeros((n, plant.n_inputs))]),
-        B_w=_beside(plant.B_w, model.B_w),
-        C=np.hstack([plant.C, model.C]),
+        plant, A=_beside(plant.A, model.A), B=np.vstack([plant.B, np.zeros((n, plant.n_inputs))]),
+        B_w=_beside(plant.B_w, model.B_w), C=np.hstack([plant.C, model.C]),
         process_noise=_beside(plant.process_noise, model.process_noise),
         initial_mean=np.append(plant.initial_mean, np.zeros(n)),
-        initial_covariance=_beside(plant.initial_covariance, model.initial_covariance),
-        disturbance_states=n,
-    )
+        initial_covariance=_beside(plant.initial_covariance, model.initial_covariance), disturbance_states=n,
+    )  # fmt: skip
 
 
 def _beside(first: FloatArray, second: FloatArray) -> FloatArray:
@@ -210,16 +186,10 @@ def read_mirror(table: Table, n_inputs: int) -> MirrorDriver:
     if queue < 2 * block:
         raise RigError(f"mirror.queue_steps = {queue} must hold at least two blocks of mirror.block_steps = {block}")
     return MirrorDriver(
-        input_min=low,
-        input_max=high,
-        park=park,
-        dac_bits=table.integer("dac_bits", 16, low=0, high=32),
-        block_steps=block,
-        queue_steps=queue,
-        watchdog_s=table.number("watchdog_s", 1.0, above=0.0),
-        slew_max_per_s=table.number("slew_max_per_s", 0.0, low=0.0),
-        voltage=law,
-    )
+        input_min=low, input_max=high, park=park, dac_bits=table.integer("dac_bits", 16, low=0, high=32),
+        block_steps=block, queue_steps=queue, watchdog_s=table.number("watchdog_s", 1.0, above=0.0),
+        slew_max_per_s=table.number("slew_max_per_s", 0.0, low=0.0), voltage=law,
+    )  # fmt: skip
 
 
 def read_drive(table: Table, n_inputs: int, mirror: MirrorDriver) -> Drive:
@@ -260,9 +230,9 @@ def read_control(table: Table, timing: Timing) -> Control:
     return control
 
 
-def read_simulation(table: Table) -> Simulation:
+def read_simulation(table: Table) -> parts.Simulation:
     """Read the table ``[simulation]``. Raises `RigError`."""
-    return Simulation(
+    return parts.Simulation(
         seed=table.integer("seed", 1, low=0),
         light=parse_light(table.text("light", "moving"), table.key("light")),
         clock_offset_s=table.number("clock_offset_s", 0.0),

@@ -140,14 +140,9 @@ class Table:
         return value
 
     def number(
-        self,
-        name: str,
-        default: float | None = None,
-        *,
-        low: float = -math.inf,
-        above: float = -math.inf,
-        high: float = math.inf,
-    ) -> float:
+        self, name: str, default: float | None = None, *, low: float = -math.inf, above: float = -math.inf, high: float
+        = math.inf,
+    ) -> float:  # fmt: skip
         value = self.get(name, default)
         is_number = isinstance(value, int | float) and not isinstance(value, bool)
         self._expect(name, value, is_number and abs(value) <= sys.float_info.max, "a finite number")
@@ -155,6 +150,14 @@ class Table:
             bound = f"at least {low:g}" if value < low else f"at most {high:g}" if value > high else f"above {above:g}"
             raise RigError(f"{self.key(name)} = {value:g} must be {bound}")
         return float(value)
+
+    def frequency(self, name: str, fast_step_s: float) -> float:
+        value, most = self.number(name, above=0.0), 0.5 / fast_step_s
+        if value >= most:
+            raise RigError(
+                f"{self.key(name)} = {value:g} is beyond what steps of {fast_step_s:g} s can follow, {most:g} Hz"
+            )
+        return value
 
     def optional_number(self, name: str, *, low: float) -> float | None:
         return self.number(name, low=low) if self.has(name) else None
@@ -191,12 +194,25 @@ class Table:
             array = array.reshape(1, 1)
         if (
             array.ndim != 2
-            or 0 in array.shape
-            or any(s is not None and s != a for s, a in zip(shape, array.shape, strict=True))
+            or not array.size
+            or any(s not in (None, a) for s, a in zip(shape, array.shape, strict=True))
         ):
             wanted = " x ".join("any" if s is None else str(s) for s in shape)
-            raise RigError(f"{self.key(name)} has shape {shape_text(array)}, expected {wanted} ({why})")
+            raise self._misshapen(name, array, f"{wanted} ({why})")
         return array
+
+    def square(self, name: str, why: str) -> FloatArray:
+        matrix = self.matrix(name, (None, None), why)
+        if matrix.shape[0] != matrix.shape[1]:
+            raise self._misshapen(name, matrix, f"a square matrix ({why})")
+        return matrix
+
+    def variances(self, name: str, size: int, why: str) -> FloatArray:
+        """A diagonal matrix of variances; a number is that of each."""
+        matrix = np.diag(self.vector(name, size, why))
+        if (matrix < 0).any():
+            raise RigError(f"{self.key(name)} has a variance below zero")
+        return matrix
 
     def vector(self, name: str, size: int, why: str, default: float | None = None) -> FloatArray:
         """A vector; a number is repeated."""
@@ -204,15 +220,19 @@ class Table:
         if array.ndim == 0:
             return np.full(size, float(array))
         if array.shape != (size,):
-            raise RigError(f"{self.key(name)} has shape {shape_text(array)}, expected {size} ({why})")
+            raise self._misshapen(name, array, f"{size} ({why})")
         return array
 
     def numbers(self, name: str, why: str, *, most: int) -> FloatArray:
         """A vector of one to ``most`` numbers; a number is one of them."""
         array = np.atleast_1d(self._array(name, self.get(name)))
         if array.ndim != 1 or not 0 < len(array) <= most:
-            raise RigError(f"{self.key(name)} has shape {shape_text(array)}, expected 1 to {most} numbers ({why})")
+            raise self._misshapen(name, array, f"1 to {most} numbers ({why})")
         return array
+
+    def _misshapen(self, name: str, array: FloatArray, expected: str) -> RigError:
+        shape = " x ".join(map(str, array.shape)) or "number"
+        return RigError(f"{self.key(name)} has shape {shape}, expected {expected}")
 
     def _array(self, name: str, value: Any) -> FloatArray:
         try:
@@ -240,11 +260,6 @@ class Table:
             hint = did_you_mean([name], self._asked)
             more = f": {hint}" if hint else f"; known here: {', '.join(sorted(self._asked))}"
             raise RigError(f"{self.key(name)} is not a key that aolink knows{more}")
-
-
-def shape_text(array: FloatArray) -> str:
-    """Sizes in the form for an error."""
-    return " x ".join(map(str, array.shape)) or "number"
 
 
 def shown(value: Any) -> str:

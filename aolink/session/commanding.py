@@ -49,17 +49,9 @@ class Commanding:
     """
 
     def __init__(
-        self,
-        rig: Rig,
-        time: Time,
-        mirror: Mirror,
-        inputs: Inputs | None,
-        controlling: Controlling | None,
-        assembler: Assembler,
-        account: Account,
-        journal: Journal,
-        latencies: LatencyBook,
-    ) -> None:
+        self, rig: Rig, time: Time, mirror: Mirror, inputs: Inputs | None, controlling: Controlling | None,
+        assembler: Assembler, account: Account, journal: Journal, latencies: LatencyBook,
+    ) -> None:  # fmt: skip
         self._rig, self._time, self._mirror, self._controlling = rig, time, mirror, controlling
         self._inputs = inputs or partial(rig.drive.inputs, fast_step_s=rig.timing.fast_step_s)
         self._assembler, self._account, self._journal, self._latencies = assembler, account, journal, latencies
@@ -152,10 +144,10 @@ class Commanding:
         ones."""
         if self._controlling is None or self.ended:
             return
-        change = self._controlling.see(exposure, estimate, self._reached_step())
-        if (first_step := change.first_step) < self.queued_until:
+        message, first_step, warning = self._controlling.see(exposure, estimate, self._reached_step())
+        if first_step < self.queued_until:
             # No later than the first changed step: the limits apply from the input that the controller continues from.
             self.queued_until = min(first_step, max(self.device_step() + 1, self._mirror.withdraw(first_step)))
-        self._journal.record(topics.CONTROL, change.message, log_time_ns)
-        if change.warning:
-            self._journal.warn(change.warning)
+        self._journal.record(topics.CONTROL, message, log_time_ns)
+        if warning:
+            self._journal.warn(warning)

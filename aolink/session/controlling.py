@@ -4,7 +4,6 @@ loop."""
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -20,17 +19,6 @@ from aolink.wire import messages_pb2 as wire
 
 MARGIN_S = 0.003
 """Real time: how long a block may take to the mirror, at least, before its first step begins."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class ControlEffect:
-    """The effect of an exposure on the session."""
-
-    message: pb.Control
-    first_step: int
-    """Commands from this fast step on are to be sent anew."""
-    warning: str
-    """A warning for the user; empty while nothing has changed."""
 
 
 class Controlling:
@@ -78,16 +66,18 @@ class Controlling:
         if applied.u:
             self.loop.applied(applied.first_step, np.array(applied.u).reshape(applied.n_steps, self._n_inputs))
 
-    def see(self, exposure: Exposure, estimate: Estimate | None, earliest_step: int) -> ControlEffect:
-        """Take the next exposure, or its estimate. Raises ControlError where the controller fails."""
+    def see(self, exposure: Exposure, estimate: Estimate | None, earliest_step: int) -> tuple[pb.Control, int, str]:
+        """Take the next exposure, or its estimate. Raises ControlError where the controller fails.
+
+        Gives what is recorded, the fast step from which on commands are to be sent anew, and a warning for the user,
+        which is empty while nothing has changed.
+        """
         act = self.loop.see(exposure, estimate, earliest_step)
         self.cause_frame = act.frame_id
         self.report.add(act, self._step_s)
-        message = convert.control_message(act, self.loop.name, self.estimator)
-        return ControlEffect(message=message, first_step=act.first_step, warning=self._news(act))
+        return convert.control_message(act, self.loop.name, self.estimator), act.first_step, self._news(act)
 
     def _news(self, act: Act) -> str:
-        """The changes of the loop's state with an exposure, in words."""
         news, frame = [], act.frame_id
         if act.state is not self._state:
             held = "the mirror holds its input" if act.state is State.HELD else "the mirror goes to its safe input"

@@ -35,20 +35,10 @@ class DryRun:
 
 
 def dry_run(
-    rig: Rig,
-    camera_port: str | None,
-    mirror_port: str | None,
-    path: str | Path,
-    *,
-    estimators: Sequence[str] = (),
-    exposures: int = 0,
-    calibration: str = "",
-    inputs: Inputs | None = None,
-    control: str = "",
-    force: bool = False,
-    overwrite: bool = False,
-    stop: Callable[[], bool] = lambda: False,
-) -> DryRun:
+    rig: Rig, camera_port: str | None, mirror_port: str | None, path: str | Path, *, estimators: Sequence[str] = (),
+    exposures: int = 0, calibration: str = "", inputs: Inputs | None = None, control: str = "", force: bool = False,
+    overwrite: bool = False, stop: Callable[[], bool] = lambda: False,
+) -> DryRun:  # fmt: skip
     """Check a session as far as possible without moving the mirror; parameters as for `aolink.session.record`.
 
     The devices are opened, asked for their time, and closed. Opening parks a mirror that has a queue of its own,

@@ -59,12 +59,9 @@ class Outcome:
     def account(self) -> pb.Estimation:
         """The message that is recorded besides the estimate."""
         return pb.Estimation(
-            estimator=self.estimator,
-            frame_id=self.exposure.frame_id,
-            skipped=self.message is None,
-            reason=self.reason,
-            took_ns=self.took_ns,
-        )
+            estimator=self.estimator, frame_id=self.exposure.frame_id, skipped=self.message is None,
+            reason=self.reason, took_ns=self.took_ns,
+        )  # fmt: skip
 
     def estimate(self, rig: Rig) -> Estimate:
         """The estimate as plain data. Only for an outcome that has one."""
@@ -333,7 +330,6 @@ class EstimatorProcess:
 
 
 def _how(process: subprocess.Popen[bytes]) -> str:
-    """How a process ended, in words; empty where that is not known."""
     with contextlib.suppress(subprocess.TimeoutExpired):
         code = process.wait(_REAP_S)
         return f" by signal {-code}" if code < 0 else f" with exit code {code}"

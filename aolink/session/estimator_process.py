@@ -90,15 +90,10 @@ def _received(stream: Any) -> Any:
 def _dark(rig: Rig) -> Exposure:
     steps, shape = rig.timing.exposure_steps, rig.sensor.shape
     return Exposure(
-        frame_id=0,
-        first_step=0,
-        n_steps=steps,
-        pixels=np.zeros(shape, dtype=np.uint16),
-        mask=np.ones(shape, dtype=bool),
-        inputs=np.zeros((steps, rig.n_inputs)),
-        lead_inputs=np.zeros((0, rig.n_inputs)),
-        start_offset=rig.timing.exposure_offset,
-    )
+        frame_id=0, first_step=0, n_steps=steps, pixels=np.zeros(shape, dtype=np.uint16),
+        mask=np.ones(shape, dtype=bool), inputs=np.zeros((steps, rig.n_inputs)),
+        lead_inputs=np.zeros((0, rig.n_inputs)), start_offset=rig.timing.exposure_offset,
+    )  # fmt: skip
 
 
 def _end_with(parent: int) -> None:

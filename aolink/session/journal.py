@@ -4,6 +4,7 @@ and connections."""
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import asdict
 
 from foxglove_schemas_protobuf.Log_pb2 import Log
 
@@ -44,13 +45,7 @@ class Journal:
         """Record the comparison of a device's clock with the host's."""
         clock, exchange, report = device.clock, sampled.exchange, self.report
         sample = pb.ClockSample(
-            device=device.name,
-            host_send_ns=exchange.host_send_ns,
-            device_receive_ns=exchange.device_receive_ns,
-            device_send_ns=exchange.device_send_ns,
-            host_receive_ns=exchange.host_receive_ns,
-            round_trip_ns=exchange.round_trip_ns,
-            accepted=sampled.accepted,
+            device=device.name, round_trip_ns=exchange.round_trip_ns, accepted=sampled.accepted, **asdict(exchange)
         )
         if clock.ready:
             _, sigma_ns = clock.device_ns(exchange.host_receive_ns)

@@ -33,16 +33,9 @@ class LiveExposures:
     """
 
     def __init__(
-        self,
-        rig: Rig,
-        time: Time,
-        journal: Journal,
-        latencies: LatencyBook,
-        estimating: Estimating,
-        show: Show | None,
-        control: TellController | None,
-        serves: str,
-    ) -> None:
+        self, rig: Rig, time: Time, journal: Journal, latencies: LatencyBook, estimating: Estimating,
+        show: Show | None, control: TellController | None, serves: str,
+    ) -> None:  # fmt: skip
         self._rig, self._time, self._journal, self._latencies = rig, time, journal, latencies
         self._report = journal.report
         self._estimating, self._show, self._control, self._serves = estimating, show, control, serves

@@ -12,18 +12,9 @@ from collections.abc import Callable, Sequence
 from foxglove_schemas_protobuf.Log_pb2 import Log
 
 from aolink.assembly import Assembler, Frame
+from aolink.devices import interfaces
 from aolink.devices.clock import QUERY_PERIOD_S, SUSPICION_PERIOD_S, WARM_UP_QUERIES
-from aolink.devices.interfaces import (
-    Camera,
-    ClockSampled,
-    CommandAnswered,
-    Device,
-    Event,
-    Mirror,
-    Returned,
-    Time,
-    Vanished,
-)
+from aolink.devices.interfaces import Camera, ClockSampled, CommandAnswered, Device, Event, Mirror, Returned, Time
 from aolink.errors import DeviceError, PortError
 from aolink.estimation import Driver
 from aolink.recording import topics
@@ -62,19 +53,10 @@ class SessionLoop:
     """One session, from the first command to the last frame."""
 
     def __init__(
-        self,
-        rig: Rig,
-        time: Time,
-        camera: Camera,
-        mirror: Mirror,
-        writer: RecordingWriter,
-        driver: Driver,
-        inputs: Inputs | None = None,
-        show: Show | None = None,
-        beside: Estimating | None = None,
-        report: Report | None = None,
-        controlling: Controlling | None = None,
-    ) -> None:
+        self, rig: Rig, time: Time, camera: Camera, mirror: Mirror, writer: RecordingWriter, driver: Driver,
+        inputs: Inputs | None = None, show: Show | None = None, beside: Estimating | None = None,
+        report: Report | None = None, controlling: Controlling | None = None,
+    ) -> None:  # fmt: skip
         self.report = report or Report()
         self.report.virtual_time = time.virtual
         self._rig, self._time, self._camera, self._mirror = rig, time, camera, mirror
@@ -312,11 +294,8 @@ class SessionLoop:
 
     def _is_over(self, exposures: int) -> bool:
         if self._time.virtual:
-            return (
-                self._end_step is not None
-                and self._commanding.queued_until >= self._end_step
-                and not self._mirror.in_flight
-            )
+            all_sent = self._end_step is not None and self._commanding.queued_until >= self._end_step
+            return all_sent and not self._mirror.in_flight
         now, timing = self._time.now_ns(), self._rig.timing
         if self._absent:
             self._last_frame_ns = now
@@ -377,7 +356,7 @@ class SessionLoop:
                 self._journal.clock(device, event)
             elif isinstance(event, CommandAnswered):
                 self._take_answer(event, receive_ns)
-            elif isinstance(event, Vanished):
+            elif isinstance(event, interfaces.Vanished):
                 self._vanished(device, event.why)
             elif isinstance(event, Returned):
                 self._has_returned(device, event.away_s)
@@ -405,11 +384,10 @@ class SessionLoop:
             end_ns, _ = self._mirror.host_ns(applied.device_ns, since_zero_ns, receive_ns)
             if applied.block_id and not self._time.virtual:
                 self._latencies.applied(applied.block_id, end_ns - applied.n_steps * self._step_ns, receive_ns)
-        report, end = self.report, applied.first_step + applied.n_steps
-        end = end if self._end_step is None else min(end, self._end_step)
-        n_steps = max(0, end - max(applied.first_step, self._first_step))  # it belongs to this session
         if applied.source in (wire.Applied.PARKED, wire.Applied.WATCHDOG):
-            report.steps_parked += n_steps
+            end = applied.first_step + applied.n_steps
+            end = end if self._end_step is None else min(end, self._end_step)
+            self.report.steps_parked += max(0, end - max(applied.first_step, self._first_step))  # of this session
         self._live.take(self._assembler.add_applied(applied), receive_ns)
 
     def _take_answer(self, answer: CommandAnswered, receive_ns: int) -> None:

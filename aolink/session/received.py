@@ -63,14 +63,11 @@ class ReceivedFrames:
             )
         if self._latencies is not None:
             host_end_ns, _ = self._camera.clock.host_ns(frame.device_end_ns)
-            self._latencies.frame(
-                pb.Latency(
-                    frame_id=frame.frame_id,
-                    exposure_end_ns=host_end_ns,
-                    first_byte_ns=frame.host_first_byte_ns,
-                    complete_ns=frame.host_receive_ns,
-                )
-            )
+            latency = pb.Latency(
+                frame_id=frame.frame_id, exposure_end_ns=host_end_ns, first_byte_ns=frame.host_first_byte_ns,
+                complete_ns=frame.host_receive_ns,
+            )  # fmt: skip
+            self._latencies.frame(latency)
         return frame
 
     def _with_missed(self, frame: Frame) -> Frame:

@@ -25,16 +25,10 @@ _NAP_S = 0.1
 
 
 def replay(
-    recording: Recording,
-    names: Sequence[str],
-    *,
-    rate: float = 0.0,
-    start_s: float = 0.0,
-    end_s: float = float("inf"),
-    stop: Callable[[], bool] = lambda: False,
-    now_s: Callable[[], float] = time.monotonic,
-    sleep: Callable[[float], None] = time.sleep,
-) -> Iterator[tuple[Exposure, list[Estimate]]]:
+    recording: Recording, names: Sequence[str], *, rate: float = 0.0, start_s: float = 0.0, end_s: float = float("inf"),
+    stop: Callable[[], bool] = lambda: False, now_s: Callable[[], float] = time.monotonic, sleep: Callable[[float],
+    None] = time.sleep,
+) -> Iterator[tuple[Exposure, list[Estimate]]]:  # fmt: skip
     """Run estimators over a recording, exposure by exposure; each skips the exposures that it skipped in the session.
 
     Parameters
@@ -159,8 +153,7 @@ class RecordedCommands:
         """Inputs of fast steps counted from the session's first, (n_steps, n_inputs); must be asked for in order."""
         while self._known < first_step + n_steps and self._read():
             pass
-        rows = [self._rows.pop(k, self._park) for k in range(first_step, first_step + n_steps)]
-        return np.array(rows)
+        return np.array([self._rows.pop(k, self._park) for k in range(first_step, first_step + n_steps)])
 
     def _read(self) -> bool:
         block = next(self._blocks, None)

@@ -196,50 +196,31 @@ class SimulatedDevices:
     def _identity(self, line: LineName, nonce: int) -> pb.Identity:
         rig = self.rig
         identity = pb.Identity(
-            nonce=nonce,
-            model=rig.name,
-            serial_number=self._serial_number,
-            firmware=FIRMWARE,
-            protocol_version=PROTOCOL_VERSION,
-            schema_hash=schema_hash(),
-            fast_step_ns=rig.timing.fast_step_ns,
-            next_step=self.queue_end,
-            step_zero_ns=self._stamp_ns(0),
-            virtual_time=self._virtual_time,
+            nonce=nonce, model=rig.name, serial_number=self._serial_number, firmware=FIRMWARE,
+            protocol_version=PROTOCOL_VERSION, schema_hash=schema_hash(), fast_step_ns=rig.timing.fast_step_ns,
+            next_step=self.queue_end, step_zero_ns=self._stamp_ns(0), virtual_time=self._virtual_time,
             rig_digest=rig.digest,
-        )
+        )  # fmt: skip
         if line == "camera":
             identity.kind = pb.Identity.CAMERA
             height, width = rig.sensor.shape
-            identity.camera.CopyFrom(
-                pb.CameraGeometry(
-                    width=width,
-                    height=height,
-                    bit_depth=rig.sensor.bit_depth,
-                    exposure_steps=rig.timing.exposure_steps,
-                    frame_period_steps=rig.timing.frame_period_steps,
-                )
-            )
+            camera = pb.CameraGeometry(
+                width=width, height=height, bit_depth=rig.sensor.bit_depth,
+                exposure_steps=rig.timing.exposure_steps, frame_period_steps=rig.timing.frame_period_steps,
+            )  # fmt: skip
+            identity.camera.CopyFrom(camera)
             if rig.scene is not None:
                 identity.camera.scene_height, identity.camera.scene_width = rig.scene.shape
                 identity.camera.scene_bit_depth = rig.scene.bit_depth
         else:
             identity.kind = pb.Identity.MIRROR
             mirror = rig.mirror
-            identity.mirror.CopyFrom(
-                pb.MirrorLimits(
-                    n_inputs=rig.n_inputs,
-                    input_min=mirror.input_min,
-                    input_max=mirror.input_max,
-                    park=mirror.park,
-                    dac_bits=mirror.dac_bits,
-                    queue_steps=mirror.queue_steps,
-                    watchdog_s=mirror.watchdog_s,
-                    parked=self.parked,
-                    latched=self.latched,
-                    history_steps=history_steps(self.rig),
-                )
-            )
+            limits = pb.MirrorLimits(
+                n_inputs=rig.n_inputs, input_min=mirror.input_min, input_max=mirror.input_max, park=mirror.park,
+                dac_bits=mirror.dac_bits, queue_steps=mirror.queue_steps, watchdog_s=mirror.watchdog_s,
+                parked=self.parked, latched=self.latched, history_steps=history_steps(rig),
+            )  # fmt: skip
+            identity.mirror.CopyFrom(limits)
         return identity
 
     def _take_block(self, block: pb.CommandBlock) -> pb.CommandAck:
@@ -321,16 +302,12 @@ class SimulatedDevices:
         for k in range(1, len(held) + 1):
             if k < len(held) and held[k][:2] == held[start][:2] and k - start < most:
                 continue
-            runs.append(
-                pb.Applied(
-                    block_id=held[start].block_id,
-                    first_step=first + start,
-                    n_steps=k - start,
-                    u=np.concatenate([each.u for each in held[start:k]]),
-                    source=held[start].source,
-                    device_ns=self._stamp_ns(first + k),
-                )
-            )
+            run = pb.Applied(
+                block_id=held[start].block_id, first_step=first + start, n_steps=k - start,
+                u=np.concatenate([each.u for each in held[start:k]]), source=held[start].source,
+                device_ns=self._stamp_ns(first + k),
+            )  # fmt: skip
+            runs.append(run)
             start = k
         return runs
 
@@ -340,11 +317,9 @@ class SimulatedDevices:
         last_step = frame.first_step + frame.n_steps - 1
         self._send_picture(frame, frame.pixels, plane=0)
         data = truth_message(frame.frame_id, frame.truth).SerializeToString()
-        for offset in range(0, len(data), MAX_CHUNK):
-            piece = data[offset : offset + MAX_CHUNK]
-            self._say(
-                "camera", pb.TruthChunk(frame_id=frame.frame_id, offset=offset, total=len(data), data=piece), last_step
-            )
+        for offset, piece in _chunks(data):
+            truth = pb.TruthChunk(frame_id=frame.frame_id, offset=offset, total=len(data), data=piece)
+            self._say("camera", truth, last_step)
         if frame.scene is not None:
             self._send_picture(frame, frame.scene, plane=1)
 
@@ -353,22 +328,19 @@ class SimulatedDevices:
         last_step = frame.first_step + frame.n_steps - 1
         late_ns = self.rig.timing.exposure_offset_ns
         data = pixels.astype("<u2").tobytes()
-        for offset in range(0, len(data), MAX_CHUNK):
+        for offset, piece in _chunks(data):
             picture = pb.FrameChunk(
-                frame_id=frame.frame_id,
-                offset=offset,
-                total=len(data),
-                width=width,
-                height=height,
-                first_step=frame.first_step,
-                last_step=last_step,
+                frame_id=frame.frame_id, offset=offset, total=len(data), width=width, height=height,
+                first_step=frame.first_step, last_step=last_step,
                 exposure_start_ns=self._stamp_ns(frame.first_step) + late_ns,
                 exposure_end_ns=self._stamp_ns(last_step + 1) + late_ns,
-                exposure_offset_ns=late_ns,
-                data=data[offset : offset + MAX_CHUNK],
-                plane=plane,
-            )
+                exposure_offset_ns=late_ns, data=piece, plane=plane,
+            )  # fmt: skip
             self._say("camera", picture, last_step)
+
+
+def _chunks(data: bytes) -> list[tuple[int, bytes]]:
+    return [(offset, data[offset : offset + MAX_CHUNK]) for offset in range(0, len(data), MAX_CHUNK)]
 
 
 def history_steps(rig: Rig) -> int:

@@ -126,19 +126,15 @@ class RigPhysics:
         if sensor.photoelectrons:
             density_of_one = shot_gain(sensor)
             density = np.asarray(self._electrons.poisson(np.maximum(density, 0) / density_of_one) * density_of_one)
-        noise = self._pixel_noise.standard_normal(sensor.shape)
-        density = density + pixel_noise_sd(sensor) * noise
+        density = density + pixel_noise_sd(sensor) * self._pixel_noise.standard_normal(sensor.shape)
         pixels = to_counts(sensor, density)
         if faults.saturation_rate:
             pixels[self._faulty.random(pixels.shape) < faults.saturation_rate] = (1 << sensor.bit_depth) - 1
         return CameraFrame(
-            frame_id=self._frames,
-            first_step=first_step,
-            n_steps=path.shape[1],
-            pixels=pixels,
+            frame_id=self._frames, first_step=first_step, n_steps=path.shape[1], pixels=pixels,
             scene=None if self._scene is None else self._scene.frame(*self._held(path, end_state), self._light.kind),
             truth=Truth(start_state=self._start_state.copy(), end_state=end_state.copy(), path=path),
-        )
+        )  # fmt: skip
 
     def _illuminate(self, path: FloatArray, end_state: FloatArray) -> tuple[FloatArray, FloatArray]:
         """The path that the camera sees and the mean densities, (n_outputs, steps) and (rows, columns)."""
@@ -217,19 +213,11 @@ def exposure_of(rig: Rig, frame: CameraFrame, inputs: FloatArray, lead_inputs: F
     start, end = frame.first_step, frame.first_step + frame.n_steps
     step_ns, late_ns = rig.timing.fast_step_ns, rig.timing.exposure_offset_ns
     return Exposure(
-        frame_id=frame.frame_id,
-        first_step=start,
-        n_steps=frame.n_steps,
-        pixels=frame.pixels,
-        mask=np.ones(frame.pixels.shape, dtype=np.bool_),
-        inputs=inputs,
-        lead_inputs=lead_inputs,
-        start_offset=late_ns / step_ns,
-        device_start_ns=start * step_ns + late_ns,
-        device_end_ns=end * step_ns + late_ns,
-        host_start_ns=start * step_ns + late_ns,
-        host_receive_ns=end * step_ns + late_ns,
-        clock_sigma_ns=0.0,
+        frame_id=frame.frame_id, first_step=start, n_steps=frame.n_steps, pixels=frame.pixels,
+        mask=np.ones(frame.pixels.shape, dtype=np.bool_), inputs=inputs, lead_inputs=lead_inputs,
+        start_offset=late_ns / step_ns, device_start_ns=start * step_ns + late_ns,
+        device_end_ns=end * step_ns + late_ns, host_start_ns=start * step_ns + late_ns,
+        host_receive_ns=end * step_ns + late_ns, clock_sigma_ns=0.0,
         scene=None if frame.scene is None else Picture(pixels=frame.scene, mask=np.ones(frame.scene.shape, dtype=bool)),
         truth=frame.truth,
-    )
+    )  # fmt: skip

@@ -22,14 +22,7 @@ from aolink.simulation.devices import LineName, Outgoing, SimulatedDevices
 from aolink.simulation.faults import Way
 from aolink.simulation.streams import VERSIONS, Stream, refusal_event
 from aolink.wire import messages_pb2 as pb
-from aolink.wire.packet import (
-    DELIMITER,
-    MessageDecoder,
-    Packet,
-    PacketDecoder,
-    PacketType,
-    encode_packets,
-)
+from aolink.wire.packet import DELIMITER, MessageDecoder, Packet, PacketDecoder, PacketType, encode_packets
 from aolink.wire.signing import refusal
 
 VIRTUAL_EPOCH_NS = 1_767_225_600_000_000_000
@@ -184,14 +177,9 @@ class RigServer:
     """Runs the simulated devices behind two serial lines until it is stopped."""
 
     def __init__(
-        self,
-        rig: Rig,
-        streams: dict[LineName, Stream],
-        *,
-        seed: int | None = None,
-        real_time: bool = False,
-        clock_ns: Callable[[], int] = time.monotonic_ns,
-    ) -> None:
+        self, rig: Rig, streams: dict[LineName, Stream], *, seed: int | None = None, real_time: bool = False, clock_ns:
+        Callable[[], int] = time.monotonic_ns,
+    ) -> None:  # fmt: skip
         simulation = rig.simulation
         if simulation.faults.vanish_rate and not real_time:
             raise RigError("simulation.faults.vanish_rate: ports vanish in real time only: add --real-time")

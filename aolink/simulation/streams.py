@@ -24,15 +24,8 @@ from google.protobuf.message import DecodeError
 from aolink.errors import PortError
 from aolink.simulation.devices import LineName
 from aolink.wire import messages_pb2 as pb
-from aolink.wire.packet import (
-    DELIMITER,
-    PROTOCOL_VERSION,
-    SIGNED_VERSION,
-    MessageDecoder,
-    PacketDecoder,
-    PacketType,
-    encode_message,
-)
+from aolink.wire import packet as wire_packet
+from aolink.wire.packet import DELIMITER, PROTOCOL_VERSION, SIGNED_VERSION, MessageDecoder, PacketDecoder, PacketType
 from aolink.wire.signing import Signing, refusal
 
 INTRODUCTION_S = 2.0
@@ -196,7 +189,7 @@ class TcpStream:
             guest.introduction += data or b""
             begun = begins_with_identify(guest.introduction, self.signing)
             if isinstance(begun, str):
-                message = encode_message(refusal_event(begun), 0, self.signing)
+                message = wire_packet.encode_message(refusal_event(begun), 0, self.signing)
                 with contextlib.suppress(OSError):
                     guest.connection.send(message)
                 guest.introduction, begun = b"", None

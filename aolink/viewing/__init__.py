@@ -29,17 +29,9 @@ else:  # the type checker would accept any name
     )
 
 __all__ = [
-    "LiveView",
-    "Look",
-    "check_display",
-    "live_viewer",
-    "open_viewer",
-    "save_rrd",
-    "screenshot",
-    "serve",
-    "serve_web",
+    "LiveView", "Look", "check_display", "live_viewer", "open_viewer", "save_rrd", "screenshot", "serve", "serve_web",
     "show",
-]
+]  # fmt: skip
 
 
 def __dir__() -> list[str]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import rerun.blueprint as rrb
@@ -58,6 +58,11 @@ class Contents:
     """The contents of the recording that is shown beside it."""
 
     @property
+    def sides(self) -> list[Contents]:
+        """These, and those of the recording that is shown beside it."""
+        return [self, *([self.compared] if self.compared else [])]
+
+    @property
     def focus(self) -> str | None:
         """The estimator that is shown first."""
         return self.estimators[-1] if self.estimators else None
@@ -86,21 +91,15 @@ def blueprint(contents: Contents) -> rrb.Blueprint:
     if contents.scenes:
         scenes = rrb.Vertical(contents=[_scene(contents, path) for path in contents.scenes])
         layout = rrb.Horizontal(contents=[layout, scenes], column_shares=[4, 1])
-    return rrb.Blueprint(
-        layout,
-        rrb.BlueprintPanel(state="collapsed"),
-        rrb.SelectionPanel(state="collapsed"),
-        rrb.TimePanel(state="collapsed", timeline=TIME),
-    )
+    panels = rrb.BlueprintPanel(state="collapsed"), rrb.SelectionPanel(state="collapsed")
+    return rrb.Blueprint(layout, *panels, rrb.TimePanel(state="collapsed", timeline=TIME))
 
 
 def _camera(contents: Contents) -> rrb.Container | rrb.View:
     """The frame and the page that the exposure is on; a tab for the recording that is compared."""
     sensor = contents.rig.sensor
     views: list[rrb.View] = []
-    for each in (contents, contents.compared):
-        if each is None:
-            continue
+    for each in contents.sides:
         root, title = each.drawn.root, "Compared: " if each.drawn.root else "Camera: "
         if sensor.directions == 2:
             shown = [entities.FRAME, *(f"{entities.FRAME}/path/{name}" for name in _drawn_paths(each))]
@@ -115,7 +114,11 @@ def _camera(contents: Contents) -> rrb.Container | rrb.View:
             views.append(_picture([root + entities.RESTORED_SPOTS], f"{title}frame restored (pixels)", *sensor.shape))
     if contents.alone and contents.restored_spots:
         return rrb.Horizontal(contents=views)
-    return rrb.Tabs(contents=views, active_tab=0) if len(views) > 1 else views[0]
+    return _tabs(views) if len(views) > 1 else views[0]
+
+
+def _tabs(views: Sequence[rrb.Container | rrb.View]) -> rrb.Tabs:
+    return rrb.Tabs(contents=views, active_tab=0)
 
 
 def _drawn_paths(contents: Contents) -> list[str]:
@@ -125,12 +128,8 @@ def _drawn_paths(contents: Contents) -> list[str]:
 
 def _scene(contents: Contents, path: str) -> rrb.View:
     assert contents.rig.scene is not None
-    name = {
-        entities.SCENE: "Scene as it came",
-        entities.RESTORED_SCENE: "Scene restored",
-        entities.TRUE_SCENE: "Scene at rest (truth)",
-    }[path]
-    return _picture([path], f"{name} (pixels)", *contents.rig.scene.shape)
+    names = dict(zip(entities.SCENES, ("as it came", "restored", "at rest (truth)"), strict=True))
+    return _picture([path], f"Scene {names[path]} (pixels)", *contents.rig.scene.shape)
 
 
 def _picture(paths: list[str], name: str, rows: int, columns: int) -> rrb.View:
@@ -141,9 +140,7 @@ def _picture(paths: list[str], name: str, rows: int, columns: int) -> rrb.View:
 def _profile(contents: Contents) -> rrb.Container | rrb.View:
     """The explanation of the blur: path, histogram and intensity over one axis, with the key of all colours."""
     views: list[rrb.View] = []
-    for each in (contents, contents.compared):
-        if each is None:
-            continue
+    for each in contents.sides:
         names = 1 + len(each.estimators) + each.truth
         x_range, y_range = profile_bounds(each.rig.sensor.profile, each.density_top, names)
         title = "Compared: path" if each.drawn.root else "Path"
@@ -154,7 +151,7 @@ def _profile(contents: Contents) -> rrb.Container | rrb.View:
                 visual_bounds=rrb.VisualBounds2D(x_range=x_range, y_range=y_range),
             )
         )
-    return rrb.Tabs(contents=views, active_tab=0) if len(views) > 1 else views[0]
+    return _tabs(views) if len(views) > 1 else views[0]
 
 
 def _paths(contents: Contents) -> rrb.Container | rrb.View:
@@ -174,7 +171,7 @@ def _paths(contents: Contents) -> rrb.Container | rrb.View:
         return rrb.TextDocumentView(origin=entities.SESSION, name="No paths: no estimates, no truth")
     everyone = [path for name in names for path in _path(contents, name)]
     tabs.append(_lines(contents, f"Path, all (slope units{what})", [*truth, *everyone], window=not contents.alone))
-    return rrb.Tabs(contents=tabs, active_tab=0)
+    return _tabs(tabs)
 
 
 def _path(contents: Contents, name: str, what: str = entities.PATH) -> list[str]:
@@ -203,7 +200,7 @@ def _errors(contents: Contents) -> list[rrb.Container | rrb.View]:
             for i in range(_states_of(contents))
         ],
     ]  # fmt: skip
-    return [rrb.Tabs(contents=views, active_tab=0)]
+    return [_tabs(views)]
 
 
 def _nis(contents: Contents) -> list[rrb.View]:
@@ -223,7 +220,7 @@ def _states(contents: Contents) -> list[rrb.Container]:
             if contents.focus is not None:
                 shown.append(entities.band(entities.state(where, i, contents.focus)))
             tabs.append(_lines(contents, f"{where.capitalize()} state x{i + 1} (plant's units)", shown))
-    return [rrb.Tabs(contents=tabs, active_tab=0)] if tabs else []
+    return [_tabs(tabs)] if tabs else []
 
 
 def _states_of(contents: Contents) -> int:
@@ -262,7 +259,7 @@ def _devices(contents: Contents) -> list[rrb.Container | rrb.View]:
             ("Loop: steps clipped (count)", [f"{entities.CONTROL}/clipped"]),
         ]
         lines = [_lines(contents, title, shown, legend=True) for title, shown in loop]
-        views.append(rrb.Tabs(contents=lines, active_tab=0))
+        views.append(_tabs(lines))
     if topics.LATENCY in contents.topics:
         views.append(_lines(contents, "Latency since exposure end (ms)", [f"{entities.LATENCY}/**"], legend=True))
     health = [_lines(contents, "Lost since start (count)", [f"{entities.LOST}/**"], legend=True)]
@@ -275,16 +272,14 @@ def _devices(contents: Contents) -> list[rrb.Container | rrb.View]:
             _lines(contents, "Received (kB/s)", [f"{entities.RECEIVED}/**"], legend=True),
         ]
     if topics.EXPOSURE in contents.topics:
-        views.append(rrb.Tabs(contents=health, active_tab=0))
+        views.append(_tabs(health))
     if topics.CLOCK in contents.topics:
         clocks = [
-            ("sigma", "Clock offset sd (µs)"),
-            ("offset", "Clock offset change (µs)"),
-            ("frequency", "Clock rate (ppm)"),
-            ("round_trip", "Clock round trip (µs)"),
-        ]
+            ("sigma", "Clock offset sd (µs)"), ("offset", "Clock offset change (µs)"),
+            ("frequency", "Clock rate (ppm)"), ("round_trip", "Clock round trip (µs)"),
+        ]  # fmt: skip
         lines = [_lines(contents, title, [f"{entities.CLOCK}/{name}/**"], legend=True) for name, title in clocks]
-        views.append(rrb.Tabs(contents=lines, active_tab=0))
+        views.append(_tabs(lines))
     views.append(rrb.StateTimelineView(origin=entities.STATUS, name="Exposures, status of estimators and mirror"))
     views.append(_texts(contents))
     return views
@@ -298,7 +293,7 @@ def _texts(contents: Contents) -> rrb.Container:
         texts.append(rrb.TextLogView(origin=entities.LOG, name="Log"))
     if contents.compared:
         texts.append(rrb.TextDocumentView(origin=contents.compared.drawn.root + entities.SESSION, name="Compared"))
-    return rrb.Tabs(contents=texts, active_tab=0)
+    return _tabs(texts)
 
 
 def _lines(
@@ -314,17 +309,12 @@ def _lines(
     if not window:
         whole = rrb.TimeRange(rrb.TimeRangeBoundary.infinite(), rrb.TimeRangeBoundary.infinite())
         axis_x = rrb.archetypes.TimeAxis(view_range=whole)
-        return rrb.TimeSeriesView(
-            name=name, contents=expressions, axis_x=axis_x, axis_y=axis_y, plot_legend=corner
-        )  # fmt: skip
-    timing = contents.rig.timing
-    steps = PATH_WINDOW * timing.frame_period_steps
-    near = rrb.TimeRangeBoundary.cursor_relative
+        return rrb.TimeSeriesView(name=name, contents=expressions, axis_x=axis_x, axis_y=axis_y, plot_legend=corner)
+    steps = PATH_WINDOW * contents.rig.timing.frame_period_steps
+    near, span_s = rrb.TimeRangeBoundary.cursor_relative, steps * contents.rig.timing.fast_step_s
     ranges = [
         rrb.VisibleTimeRange(FAST_STEP, start=near(seq=-steps), end=near(seq=steps)),
-        rrb.VisibleTimeRange(
-            TIME, start=near(seconds=-steps * timing.fast_step_s), end=near(seconds=steps * timing.fast_step_s)
-        ),
+        rrb.VisibleTimeRange(TIME, start=near(seconds=-span_s), end=near(seconds=span_s)),
     ]
     return rrb.TimeSeriesView(name=name, contents=expressions, time_ranges=ranges, plot_legend=corner)
 

@@ -365,11 +365,7 @@ def _send_strips(
 
 
 def _send_at_starts(
-    drawing: Drawing,
-    path: str,
-    timebase: Timebase,
-    exposures: Sequence[Exposure],
-    columns: rr.ComponentColumnList,
+    drawing: Drawing, path: str, timebase: Timebase, exposures: Sequence[Exposure], columns: rr.ComponentColumnList
 ) -> None:
     """Send one row an exposure, at its start."""
     steps = [e.first_step for e in exposures]

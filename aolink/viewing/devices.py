@@ -67,9 +67,8 @@ def log_latency(drawing: Drawing, timebase: Timebase, records: Sequence[Timed]) 
         at = [getattr(m, field) for m in latencies]
         milliseconds = [(t - m.exposure_end_ns) / 1e6 if t else np.nan for t, m in zip(at, latencies, strict=True)]
         if not np.isnan(milliseconds).all():
-            send_line(
-                drawing, f"{LATENCY}/{field.removesuffix('_ns')}", times, milliseconds, Style(name, series_colour(i))
-            )
+            style = Style(name, series_colour(i))
+            send_line(drawing, f"{LATENCY}/{field.removesuffix('_ns')}", times, milliseconds, style)
 
 
 def log_estimation(drawing: Drawing, timebase: Timebase, records: Sequence[Timed]) -> None:
@@ -101,13 +100,8 @@ def log_connection(drawing: Drawing, timebase: Timebase, records: Sequence[Timed
         host = np.array([r.log_time_ns for r in samples], dtype=np.int64)
         times = timebase.at_host(host)
         total = [sum(getattr(r.message, field) for field in CONNECTION_COUNTS) for r in samples]
-        send_line(
-            drawing,
-            f"{FAULTS}/{device}",
-            times,
-            total,
-            Style(f"{device} connection faults", series_colour(d), steps=True),
-        )
+        style = Style(f"{device} connection faults", series_colour(d), steps=True)
+        send_line(drawing, f"{FAULTS}/{device}", times, total, style)
         for i, field in enumerate(CONNECTION_COUNTS):
             counts = [getattr(r.message, field) for r in samples]
             if not any(counts):

@@ -103,15 +103,10 @@ class LiveView:
 
     def _lay_out(self, exposure: Exposure) -> None:
         contents = Contents(
-            rig=self._rig,
-            estimators=self._names,
-            measuring=[name for name in self._names if name in self._measuring],
-            density_top=self._top or 1.0,
-            truth=exposure.truth is not None,
-            scenes=self._scenes,
-            drawn=self._drawing,
-            warnings=True,
-        )
+            rig=self._rig, estimators=self._names,
+            measuring=[name for name in self._names if name in self._measuring], density_top=self._top or 1.0,
+            truth=exposure.truth is not None, scenes=self._scenes, drawn=self._drawing, warnings=True,
+        )  # fmt: skip
         self._drawing.stream.send_blueprint(blueprint(contents), make_active=True, make_default=True)
 
 

@@ -56,7 +56,8 @@ def log_estimates(drawing: Drawing, timebase: Timebase, estimates: Sequence[Esti
     if not estimates:
         return
     name, chosen = estimates[0].estimator, drawing.chosen
-    line, band = Style(name, estimator_colour(name), width=1.8), _band_style(name)
+    line = Style(name, estimator_colour(name), width=1.8)
+    band = Style(f"{name} ± {BAND:g} sd", line.colour, width=1.0, alpha=150)
     outputs = list(chosen.outputs)
     means = [(e.first_step, e.path) for e in estimates]
     deviations = [BAND * e.path_sd[outputs] for e in estimates]
@@ -95,10 +96,8 @@ def log_errors(
     name = known[0][0].estimator
     style = Style(name, estimator_colour(name))
     errors = [e.path - truth.path for e, truth in known]
-    _send_path(
-        drawing, f"{PATH_ERROR}/{name}", timebase,
-        [(e.first_step, error) for (e, _), error in zip(known, errors, strict=True)], style,
-    )  # fmt: skip
+    paths = [(e.first_step, error) for (e, _), error in zip(known, errors, strict=True)]
+    _send_path(drawing, f"{PATH_ERROR}/{name}", timebase, paths, style)
     frames = [e.frame_id for e, _ in known]
     starts = np.array([e.first_step for e, _ in known])
     rms = [np.sqrt(np.mean(error**2, axis=1)) for error in errors]
@@ -123,18 +122,16 @@ def log_residual(
     left = [(each.first_step, residual_rms([each])) for each in exposures]
     if left:
         steps = timebase.first_step + np.array([step for step, _ in left]) - left[0][0]
-        send_line(
-            drawing, f"{RESIDUAL}/{name}", timebase.at_steps(steps), [rms for _, rms in left], Style(name, colour)
-        )
+        times, values = timebase.at_steps(steps), [rms for _, rms in left]
+        send_line(drawing, f"{RESIDUAL}/{name}", times, values, Style(name, colour))
 
 
 def _send_table(drawing: Drawing, path: str, times: Sequence[rr.TimeColumn], estimates: Sequence[Estimate]) -> None:
     """Columns ``status`` and ``reason``, and those of `estimate_scalars` with a number for each axis."""
     words = rr.AnyValues.columns(status=[e.status.name for e in estimates], reason=[e.reason for e in estimates])
     scalars = [estimate_scalars(e) for e in estimates]
-    numbers = rr.AnyValues.columns(
-        True, **{name: np.concatenate([each[name] for each in scalars]) for name in scalars[0]}
-    )
+    joined = {name: np.concatenate([each[name] for each in scalars]) for name in scalars[0]}
+    numbers = rr.AnyValues.columns(True, **joined)
     drawing.send_columns(path, times, [*words, *numbers.partition([len(e.start_state) for e in estimates])])
 
 
@@ -154,10 +151,6 @@ def _log_nis(drawing: Drawing, timebase: Timebase, estimates: Sequence[Estimate]
     ends = timebase.at_steps([measured[k].first_step for k in kept], [measured[k].frame_id for k in kept])
     label = f"{name}, {NIS_COVERAGE:.0%} bounds"
     send_line(drawing, entities.nis_bounds(name), ends, bounds[kept], Style(label, line.colour, width=1.0, alpha=140))
-
-
-def _band_style(name: str) -> Style:
-    return Style(f"{name} ± {BAND:g} sd", estimator_colour(name), width=1.0, alpha=150)
 
 
 def _send_path(

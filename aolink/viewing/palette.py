@@ -14,13 +14,8 @@ NOTHING: Colour = (13, 13, 13)
 """Colour of places without an exposure yet: the viewer's own background."""
 
 _SERIES: tuple[Colour, ...] = (
-    (86, 180, 233),
-    (240, 110, 50),
-    (0, 175, 125),
-    (204, 121, 167),
-    (240, 228, 100),
-    (190, 130, 80),
-)
+    (86, 180, 233), (240, 110, 50), (0, 175, 125), (204, 121, 167), (240, 228, 100), (190, 130, 80),
+)  # fmt: skip
 
 STATUS_COLOURS: dict[str, Colour] = {
     "OK": (45, 110, 75),

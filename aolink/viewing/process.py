@@ -154,15 +154,12 @@ def running_rerun(options: Sequence[str], said: IO[bytes]) -> Iterator[subproces
     """Rerun's program, which ends with the block."""
     # It leaves its own temporary files behind when it is ended.
     with tempfile.TemporaryDirectory(prefix="aolink-", ignore_cleanup_errors=True) as temporary:
+        environment = {**os.environ, "NO_COLOR": "1", "TMPDIR": temporary}
+        # With a session of its own: Ctrl-C comes to this process alone, which ends Rerun's.
         process = subprocess.Popen(
-            [str(_program()), "--bind", HOST, *options],
-            stdin=subprocess.DEVNULL,
-            stdout=said,
-            stderr=said,
-            env={**os.environ, "NO_COLOR": "1", "TMPDIR": temporary},
-            start_new_session=True,  # Ctrl-C comes to this process alone, which ends Rerun's
-            preexec_fn=_end_with_parent,
-        )
+            [str(_program()), "--bind", HOST, *options], stdin=subprocess.DEVNULL, stdout=said, stderr=said,
+            env=environment, start_new_session=True, preexec_fn=_end_with_parent,
+        )  # fmt: skip
         try:
             yield process
         finally:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cached_property
-from itertools import compress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -122,8 +121,7 @@ class Sender:
     def __init__(self, stream: rr.RecordingStream, recording: Recording, look: Look, root: str = "") -> None:
         check_stands_alone(recording)
         self._recording, self._look, self._rig = recording, look, recording.rig
-        whole = range(len(recording))
-        self._numbers = look.exposures if look.exposures is not None else whole
+        self._numbers = range(len(recording)) if look.exposures is None else look.exposures
         few = len(self._numbers) <= 2 * PATH_WINDOW + 1
         chosen = Chosen.of(recording.rig, look.spot)
         self._drawing = Drawing(stream=stream, chosen=chosen, root=root, points=None if few else POINTS)
@@ -213,9 +211,8 @@ class Sender:
         restored: list[RestoredPictures], following: Exposure | None,
     ) -> None:  # fmt: skip
         drawing, rig = self._drawing, self._rig
-        self._timebase = timebase = (
-            Timebase.of(rig, exposures) if self._timebase is None else self._timebase.followed_by(exposures)
-        )
+        known = self._timebase
+        self._timebase = timebase = known.followed_by(exposures) if known else Timebase.of(rig, exposures)
         names = [*(["truth"] if any(e.truth is not None for e in exposures) else ()), *self._names]
         self._top = send_camera(drawing, rig, timebase, exposures, estimates, names, top=self._top, following=following)
         motion.log_truth(drawing, timebase, exposures)
@@ -231,9 +228,7 @@ class Sender:
                 if exposure.frame_id in by_frame:
                     self._scorers[name].add(exposure, by_frame[exposure.frame_id])
         incidents.log_exposures(drawing, timebase, exposures, self._last)
-        self._warnings += incidents.log_warnings(
-            drawing, timebase, exposures, estimates, self._skipped, self._last
-        )  # fmt: skip
+        self._warnings += incidents.log_warnings(drawing, timebase, exposures, estimates, self._skipped, self._last)
         before = self._last.frame_id if self._last else exposures[0].frame_id - 1
         self._lost += exposures[-1].frame_id - before - len(exposures)
         self._last = exposures[-1]
@@ -274,11 +269,8 @@ class Sender:
                 inside = message.first_step < end and message.first_step + message.n_steps > first.first_step
             else:
                 frame = getattr(message, "frame_id", None)
-                inside = (
-                    first.host_start_ns <= each.log_time_ns < ended_ns
-                    if frame is None
-                    else first.frame_id <= frame <= last.frame_id
-                )
+                inside = frame is not None and first.frame_id <= frame <= last.frame_id
+                inside = inside or (frame is None and first.host_start_ns <= each.log_time_ns < ended_ns)
             if inside:
                 yield each
 
@@ -294,22 +286,16 @@ class Sender:
 
     def contents(self, other: Sender | None = None) -> Contents:
         """The contents that have been sent, for the layout."""
+        known = self._known
         return Contents(
-            rig=self._rig,
-            estimators=self._names,
-            measuring=[name for name in self._names if name in self._measuring],
-            density_top=self._top or 1.0,
-            truth="truth" in self._known,
-            scenes=list(compress(entities.SCENES, (each in self._known for each in entities.SCENES))),
-            restored_spots=entities.RESTORED_SPOTS in self._known,
-            loops=list(self._look.loops),
-            topics=frozenset(self._known.intersection(self._shown) if self._finished else self._shown),
-            drawn=self._drawing,
-            maps=self._scales,
-            warnings=self._warnings > 0,
-            alone=len(self._numbers) == 1,
+            rig=self._rig, estimators=self._names, measuring=[name for name in self._names if name in self._measuring],
+            density_top=self._top or 1.0, truth="truth" in known,
+            scenes=[each for each in entities.SCENES if each in known],
+            restored_spots=entities.RESTORED_SPOTS in known, loops=list(self._look.loops),
+            topics=frozenset(known.intersection(self._shown) if self._finished else self._shown), drawn=self._drawing,
+            maps=self._scales, warnings=self._warnings > 0, alone=len(self._numbers) == 1,
             compared=other.contents() if other else None,
-        )
+        )  # fmt: skip
 
     def _summary(self) -> str:
         """A page of Markdown about a session, with the data that it lacks and, where the truth is known, the
@@ -335,9 +321,8 @@ class Sender:
             ]
         for name, scorer in self._scorers.items():
             result = scorer.result()
-            path, end = (
-                f"{x:.4f}" if result.exposures else "truth unknown" for x in (result.path_rmse, result.end_rmse)
-            )
+            errors = result.path_rmse, result.end_rmse
+            path, end = (f"{x:.4f}" if result.exposures else "truth unknown" for x in errors)
             nis = result.nis
             shown = "" if np.isnan(nis.mean) else f"{nis.mean:.2f} ({nis.low:.2f} to {nis.high:.2f})"
             lines.append(f"| {name} | {path} | {end} | {shown} | {result.gated} of {result.estimated} |")

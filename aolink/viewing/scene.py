@@ -51,11 +51,8 @@ def log_restored(
     starts = {e.frame_id: e.first_step for e in exposures}
     known = [each for each in restored if each.frame_id in starts]
     scenes = [(each.frame_id, _grey(each.scene)) for each in known if each.scene is not None]
-    spots = [
-        (each.frame_id, _grey(each.spots / max(float(each.spots.max()), 1e-6)))
-        for each in known
-        if each.spots is not None
-    ]
+    lit = [(each.frame_id, each.spots) for each in known if each.spots is not None]
+    spots = [(frame_id, _grey(light / max(float(light.max()), 1e-6))) for frame_id, light in lit]
     for path, pictures in ((RESTORED_SCENE, scenes), (RESTORED_SPOTS, spots)):
         frames = [frame_id for frame_id, _ in pictures]
         _send(drawing, path, timebase, [starts[k] for k in frames], frames, [picture for _, picture in pictures])

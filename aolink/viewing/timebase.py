@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 import rerun as rr
@@ -48,22 +47,18 @@ class Timebase:
             raise ViewerError(
                 "there is no exposure in this recording, so nothing to view; `aolink info` says what it holds"
             )
+        first = exposures[0]
         return cls(
-            fast_step_ns=rig.timing.fast_step_ns,
-            frame_period_steps=rig.timing.frame_period_steps,
-            first_step=exposures[0].first_step,
-            frame_id=exposures[0].frame_id,
-            origin_ns=exposures[0].device_start_ns,
+            fast_step_ns=rig.timing.fast_step_ns, frame_period_steps=rig.timing.frame_period_steps,
+            first_step=first.first_step, frame_id=first.frame_id, origin_ns=first.device_start_ns,
             device_ns=np.array([e.device_start_ns for e in exposures], dtype=np.int64),
             host_ns=np.array([e.host_start_ns for e in exposures], dtype=np.int64),
-        )
+        )  # fmt: skip
 
     def followed_by(self, exposures: Sequence[Exposure]) -> Timebase:
         """The timebase with the times of later exposures added."""
         device, host = ([getattr(e, name) for e in exposures] for name in ("device_start_ns", "host_start_ns"))
-        return replace(
-            self, device_ns=np.append(self.device_ns, device), host_ns=np.append(self.host_ns, host)
-        )  # fmt: skip
+        return replace(self, device_ns=np.append(self.device_ns, device), host_ns=np.append(self.host_ns, host))
 
     def device_of_step(self, steps: ArrayLike) -> IntArray:
         """Device time at which a fast step begins, ns."""
@@ -86,12 +81,12 @@ class Timebase:
     def every_step(self, steps: ArrayLike) -> list[rr.TimeColumn]:
         """Columns for values at fast steps; they have no frame number, or a frame's 200 would share one place."""
         steps = np.asarray(steps, dtype=np.int64)
-        return [_sequence(FAST_STEP, steps), self._seconds(self.device_of_step(steps))]
+        return [rr.TimeColumn(FAST_STEP, sequence=steps), self._seconds(self.device_of_step(steps))]
 
     def at_steps(self, steps: ArrayLike, frames: ArrayLike | None = None) -> list[rr.TimeColumn]:
         """Columns on all three timelines for values that come once a frame."""
         frames = self.frame_of_step(steps) if frames is None else np.asarray(frames, dtype=np.int64)
-        return [*self.every_step(steps), _sequence(FRAME, frames)]
+        return [*self.every_step(steps), rr.TimeColumn(FRAME, sequence=frames)]
 
     def at_frames(self, frames: ArrayLike) -> list[rr.TimeColumn]:
         """Columns on all three timelines for values that belong to frames: at the start of their exposures."""
@@ -106,11 +101,8 @@ class Timebase:
         """Columns on all three timelines for values that only have a host time."""
         device = self.device_of_host(host_ns)
         steps = self.first_step + (device - self.origin_ns) // self.fast_step_ns
-        return [_sequence(FAST_STEP, steps), self._seconds(device), _sequence(FRAME, self.frame_of_step(steps))]
+        frames = rr.TimeColumn(FRAME, sequence=self.frame_of_step(steps))
+        return [rr.TimeColumn(FAST_STEP, sequence=steps), self._seconds(device), frames]
 
     def _seconds(self, device_ns: IntArray) -> rr.TimeColumn:
         return rr.TimeColumn(TIME, duration=(device_ns - self.origin_ns).astype("timedelta64[ns]"))
-
-
-def _sequence(name: str, values: Any) -> rr.TimeColumn:
-    return rr.TimeColumn(name, sequence=values)

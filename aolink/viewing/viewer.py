@@ -18,17 +18,8 @@ from rerun.experimental import ViewerClient
 
 from aolink.errors import ViewerError
 from aolink.files import check_target, writing
-from aolink.viewing.process import (
-    HOST,
-    POLL_S,
-    ended,
-    existing,
-    free_port,
-    is_free,
-    running_rerun,
-    wait_for,
-    why_it_ended,
-)
+from aolink.viewing import process as rerun_process
+from aolink.viewing.process import HOST, POLL_S, ended, existing, free_port, is_free, running_rerun, wait_for
 from aolink.viewing.timebase import FAST_STEP, TIME
 
 PICTURE_SIZE = (1920, 1200)
@@ -104,7 +95,7 @@ def headless_viewer(rrd_path: str | Path, size: tuple[int, int] = PICTURE_SIZE) 
             # A viewer that cannot draw answers at first and ends with its first frame, during any of these calls;
             # the call's own error then ("transport error") is not the cause.
             if ended(process):
-                raise why_it_ended(said) from None
+                raise rerun_process.why_it_ended(said) from None
             if isinstance(error, ViewerError):
                 raise
             raise ViewerError(f"the viewer cannot show {path}: {_one_line(error)}") from None

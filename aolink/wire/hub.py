@@ -129,14 +129,9 @@ class Hub:
         return pending
 
     def request(
-        self,
-        link: Link,
-        request: Message,
-        answers: type[AnyMessage],
-        is_it: Callable[[AnyMessage, int], bool],
-        answer_s: float = ANSWER_S,
-        tries: int = TRIES,
-    ) -> AnyMessage | None:
+        self, link: Link, request: Message, answers: type[AnyMessage], is_it: Callable[[AnyMessage, int], bool],
+        answer_s: float = ANSWER_S, tries: int = TRIES,
+    ) -> AnyMessage | None:  # fmt: skip
         """Send a request until its answer comes; None if it never does. Other messages wait for `wait`.
 
         ``is_it(answer, sequence)`` says whether an answer belongs to the request of that sequence number: that of the

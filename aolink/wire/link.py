@@ -10,14 +10,7 @@ from google.protobuf.message import DecodeError, Message
 
 from aolink.errors import PortError
 from aolink.wire import messages_pb2 as pb
-from aolink.wire.packet import (
-    DELIMITER,
-    MessageDecoder,
-    Packet,
-    PacketDecoder,
-    PacketType,
-    encode_packets,
-)
+from aolink.wire.packet import DELIMITER, MessageDecoder, Packet, PacketDecoder, PacketType, encode_packets
 from aolink.wire.port import Transport
 from aolink.wire.signing import Signing, refusal
 

@@ -187,16 +187,11 @@ class PacketDecoder:
     def feed(self, data: bytes) -> list[Packet]:
         """Take bytes as they came, give the packets that they complete, in order."""
         *pieces, rest = (self._rest + data).split(DELIMITER)
-        packets = []
-        for piece in pieces:
-            if piece or self._overlong:
-                packet = self._decode(piece)
-                if packet is not None:
-                    packets.append(packet)
+        packets = [self._decode(piece) for piece in pieces if piece or self._overlong]
         if len(rest) > _MAX_ENCODED:
             self._overlong, rest = True, b""
         self._rest = rest
-        return packets
+        return [packet for packet in packets if packet is not None]
 
     def _decode(self, piece: bytes) -> Packet | None:
         self.seen += 1

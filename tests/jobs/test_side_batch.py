@@ -79,6 +79,20 @@ def test_parts_with_a_table_of_a_name_have_one_each(aolink: Run, tmp_path: Path)
     assert not (tmp_path / "all.parquet").exists()
 
 
+def test_the_folder_of_the_table_is_made(aolink: Run, tmp_path: Path) -> None:
+    """As that of the side files is, which may be the same; where it cannot be made, nothing is done."""
+    write_small(tmp_path / "s.mcap", 2)
+    every = ("estimate", "s.mcap", "-e", "o1", "--side", "-o", "out", "--table")
+    for table in ("out/all.parquet", "other/deep/all.parquet"):
+        done = aolink(*every, table)
+        assert done.returncode == 0, done.stderr
+        assert [row["recording"] for row in pq.read_table(tmp_path / table).to_pylist()] == ["s.mcap"]
+        assert (tmp_path / table).with_name("all.exposures.parquet").exists()
+    done = aolink("estimate", "s.mcap", "-e", "o1", "--side", "-o", "none", "--table", "s.mcap/all.parquet")
+    assert done.stderr.splitlines() == ["aolink: cannot make the folder s.mcap: file exists"]
+    assert not (tmp_path / "none").exists()
+
+
 def test_both_tables_in_parquet(aolink: Run, tmp_path: Path) -> None:
     """A failed recording is in the first; models by their names."""
     names = [write_small(tmp_path / f"s{k}.mcap", 3 + k).name for k in range(2)]

@@ -56,6 +56,15 @@ def test_an_older_recording_is_read_by_the_present_names() -> None:
     assert found == counted(Recording(OLD, check=True)), "with and without the index"
 
 
+def test_a_former_name_asks_for_the_topic_that_has_another_now(tmp_path: Path) -> None:
+    for path in (OLD, shutil.copy(OLD, tmp_path / "again.mcap")):
+        found = compare(Recording(OLD), Recording(path), only=["/link"])
+        assert found.keys() == {topics.CONNECTION}
+        assert found[topics.CONNECTION].same
+    both = compare(Recording(OLD), Recording(OLD), only=["/link", "/camera/"])
+    assert both.keys() == {topics.CONNECTION, topics.EXPOSURE, topics.IMAGE}
+
+
 def test_an_older_recording_is_shown(tmp_path: Path) -> None:
     save_rrd(Recording(OLD), tmp_path / "a.rrd")
     shown = read_rrd(tmp_path / "a.rrd")

@@ -20,6 +20,8 @@ from typing import Any
 from aolink.batch import Settings, estimate_file
 from aolink.jobs import batch
 from aolink.numerics.workers import processes as pool_of
+from aolink.recording import topics
+from aolink.recording.reader import Recording
 from bench_rows.recording import record_long
 from bench_rows.row import Effort, Row, resident_mb, timed
 
@@ -60,14 +62,11 @@ def tiny_recordings(effort: Effort) -> list[Row]:
     growth = marks[-1] - marks[0]
     return [
         Row(
-            f"{count} tiny recordings, each",
-            f"{overhead_ms:.1f} ms",
-            f"limit 20 ms; processor {cpu_ms:.1f} ms",
-            20 / overhead_ms,
-            1.0,
+            f"{count} tiny recordings, each", f"{overhead_ms:.1f} ms", f"limit 20 ms; processor {cpu_ms:.1f} ms",
+            20 / overhead_ms, 1.0,
         ),
         Row(f"memory over {count} recordings", f"+{growth:.1f} MB", "limit 10 MB", 10 / max(growth, 0.1), 1.0),
-    ]
+    ]  # fmt: skip
 
 
 def read_over_needed(effort: Effort) -> list[Row]:
@@ -77,9 +76,6 @@ def read_over_needed(effort: Effort) -> list[Row]:
     its index.
     """
     import s3fs
-
-    from aolink.recording import topics
-    from aolink.recording.reader import Recording
 
     with tempfile.TemporaryDirectory() as name, _serving_s3() as sent:
         source = Path(name) / "a.mcap"
@@ -225,13 +221,8 @@ def cluster_workers(effort: Effort) -> Row:
         rounds = [[timed(run) for run in runs] for _ in range(effort.of(2))]
         one, two, process, processes = (statistics.median(each) for each in zip(*rounds, strict=True))
     share = statistics.median(busy) / (2 * two)
-    return Row(
-        "8 recordings on 2 Dask workers",
-        f"{two:.1f} s, workers busy {share:.0%}",
-        f"on one {one:.1f} s; two plain processes {process / processes:.2f} times one",
-        one / two,
-        1.8,
-    )
+    beside = f"on one {one:.1f} s; two plain processes {process / processes:.2f} times one"
+    return Row("8 recordings on 2 Dask workers", f"{two:.1f} s, workers busy {share:.0%}", beside, one / two, 1.8)
 
 
 @contextmanager

@@ -6,6 +6,8 @@ from __future__ import annotations
 import numpy as np
 from scipy import stats
 
+from aolink.devices import clock as clocks
+from aolink.devices.clock import QUERY_PERIOD_S, SUSPICION_PERIOD_S, WARM_UP_QUERIES, ClockExchange, ClockRegression
 from bench_rows.row import Effort, Row
 
 _SEEDS = 100
@@ -29,15 +31,6 @@ def _session(seed: int, duration_s: float, *, stamps_show_it: bool) -> tuple[np.
     Where no stamp shows the step (a device that counts its fast steps from its clock), those frames are flagged that
     began after the last query which agreed with the old clock, once the step is found.
     """
-    from aolink.devices.clock import (
-        QUERY_PERIOD_S,
-        SUSPICION_PERIOD_S,
-        WARM_UP_QUERIES,
-        ClockExchange,
-        ClockRegression,
-        StepClock,
-    )
-
     rng = np.random.default_rng(seed)
     there_ns = _ROUND_TRIP_NS * rng.uniform()
     step_at_s = duration_s * rng.uniform(0.3, 0.7)
@@ -62,7 +55,7 @@ def _session(seed: int, duration_s: float, *, stamps_show_it: bool) -> tuple[np.
     clock, frames = ClockRegression(), list[tuple[int, int, float]]()
     for k in range(WARM_UP_QUERIES):
         clock.add(exchange(0.05 * k))
-    steps, due_s = StepClock(clock, device_ns(0.0), 1_000_000), 0.5
+    steps, due_s = clocks.StepClock(clock, device_ns(0.0), 1_000_000), 0.5
     for second in np.arange(0.5, duration_s, 0.1).tolist():
         while due_s <= second:
             clock.add(exchange(due_s))

@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from pathlib import Path
 
 import numpy as np
 from scipy import linalg, optimize, signal
@@ -14,6 +15,7 @@ from aolink.identification import Process, ProcessSum
 from aolink.numerics.arrays import FloatArray
 from aolink.numerics.covariance import psd_root
 from aolink.optics.turbulence import FrozenFlow, Layer
+from aolink.rig import Rig, load_rig
 
 STEP_S = 1e-3
 PUPIL_M = 0.5
@@ -42,6 +44,30 @@ class DisturbanceRun:
     C: FloatArray
     model: ProcessSum
     """The model that an estimator is given."""
+
+
+def played(believes: Rig, slopes: FloatArray, path: Path) -> Rig:
+    """A rig with a file of its own that these slopes (steps, 1) disturb, whatever its model is."""
+    np.save(path.with_suffix(".npy"), slopes)
+    table = f'[disturbance]\nplant_noise = false\nrecorded = "{path.stem}.npy"\n\n[simulation]'
+    path.write_text(believes.toml.replace("[simulation]", table, 1))
+    return load_rig(path)
+
+
+def by_model(
+    rig: Rig, steps: int, random: np.random.Generator, state: FloatArray | None
+) -> tuple[FloatArray, FloatArray]:
+    """Slopes (steps, 1) by a rig's own model of its disturbance, and the state after them; without a state to begin
+    with it is drawn."""
+    model = None if rig.disturbance is None else rig.disturbance.model
+    assert model is not None
+    if state is None:
+        state = psd_root(model.initial_covariance) @ random.standard_normal(len(model.A))
+    root, slopes = model.B_w @ psd_root(model.process_noise), np.empty((steps, 1))
+    for k, push in enumerate(random.standard_normal((steps, root.shape[1]))):
+        slopes[k] = model.C @ state
+        state = model.A @ state + root @ push
+    return slopes, state
 
 
 def together(parts: Sequence[DisturbanceRun]) -> DisturbanceRun:

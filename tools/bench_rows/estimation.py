@@ -8,16 +8,34 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
+import lz4.frame
 import numpy as np
+from filterpy.kalman import ExtendedKalmanFilter
+from paper_report.ensemble import side_by_side
 
+from aolink.assembly import Assembler, FrameReassembly
+from aolink.estimation import Driver, make_estimator, run, score
+from aolink.estimation.frames.frame_data import Measurement
+from aolink.estimation.kalman.filter import BlurFilter
+from aolink.estimation.kalman.gaussian import Gaussian
+from aolink.estimation.kalman.information_form import information_update
+from aolink.estimation.kalman.path_moments import PathMoments
+from aolink.estimation.kalman.update import blocked_update, joseph_update, small_update, two_state_update
+from aolink.estimation.model.dense import DenseModel
+from aolink.estimation.model.exposure_model import exposure_model
+from aolink.numerics import batched, entrywise
+from aolink.plant.alike import alike_systems
+from aolink.recording.convert import estimate_message
 from aolink.rig import Rig, load_rig, parse_rig
+from aolink.simulation.devices import SimulatedDevices
+from aolink.simulation.model import simulate
+from aolink.wire import messages_pb2 as pb
+from aolink.wire.packet import MessageDecoder, PacketDecoder, encode_message
 from bench_rows.row import Effort, Row, median_s, timed
 
 
 def filterpy_loop(model: Any, R: Any, values: Any) -> Callable[[], None]:
     """The same step with filterpy, axis by axis, for a plant without inputs, from moments (axes, 2) and their noise."""
-    from filterpy.kalman import ExtendedKalmanFilter
-
     A, Q, row, M = model.transition, model.process_noise, model.mean_row, model.quadratic[0]
     filters = []
     for value in values:
@@ -27,11 +45,7 @@ def filterpy_loop(model: Any, R: Any, values: Any) -> Callable[[], None]:
 
     def loop() -> None:
         for ekf, z in filters:
-            ekf.update(
-                z,
-                lambda x: np.vstack([row, 2 * (M @ x).T]),
-                lambda x: np.vstack([row @ x, x.T @ M @ x]),
-            )
+            ekf.update(z, lambda x: np.vstack([row, 2 * (M @ x).T]), lambda x: np.vstack([row @ x, x.T @ M @ x]))
             ekf.predict()
 
     return loop
@@ -39,11 +53,6 @@ def filterpy_loop(model: Any, R: Any, values: Any) -> Callable[[], None]:
 
 def o3_step(effort: Effort) -> Row:
     """One exposure of 1800 axes, given their moments: correction and prediction."""
-    from aolink.estimation.frames.frame_data import Measurement
-    from aolink.estimation.kalman.filter import BlurFilter
-    from aolink.estimation.kalman.path_moments import PathMoments
-    from aolink.estimation.model.exposure_model import exposure_model
-
     axes, sample = 1800, effort.of(100)
     rig = load_rig("section-vi-lively")
     plant = replace(rig.plant, axes=axes)
@@ -61,21 +70,12 @@ def o3_step(effort: Effort) -> Row:
 
     step, loop = median_s(steps, effort.of(15), peer)
     step, loop = step / turns, loop * axes / sample
-    return Row(
-        "o3 step of 1800 axes, given the moments",
-        f"{step * 1e3:.2f} ms",
-        f"filterpy {loop * 1e3:.0f} ms",
-        loop / step,
-        200,
-    )
+    figure = "o3 step of 1800 axes, given the moments"
+    return Row(figure, f"{step * 1e3:.2f} ms", f"filterpy {loop * 1e3:.0f} ms", loop / step, 200)
 
 
 def update_forms(effort: Effort) -> list[Row]:
     """Each form of the Kalman update beside Joseph's, with as many axes, states and measurements as it is for."""
-    from aolink.estimation.kalman.gaussian import Gaussian
-    from aolink.estimation.kalman.information_form import information_update
-    from aolink.estimation.kalman.update import blocked_update, joseph_update, small_update, two_state_update
-    from aolink.numerics import batched, entrywise
 
     def row(form: str, axes: int, n: int, m: int, turns: int) -> Row:
         rng = np.random.default_rng(1)
@@ -104,32 +104,19 @@ def update_forms(effort: Effort) -> list[Row]:
 
 def many_lenslets() -> Rig:
     """A sensor of 30 x 30 lenslets with windows of 16 x 16 pixels."""
-    text = load_rig("sh-4x4").toml
-    for old, new in (
-        ("axes = 32", "axes = 1800"),
-        ("[4, 4]", "[30, 30]"),
-        ("[24, 24]", "[16, 16]"),
-        ("block_steps", "#"),
-    ):
-        text = text.replace(old, new)
-    return parse_rig(text)
+    text = load_rig("sh-4x4").toml.replace("axes = 32", "axes = 1800").replace("[4, 4]", "[30, 30]")
+    return parse_rig(text.replace("[24, 24]", "[16, 16]").replace("block_steps", "#"))
 
 
 def frame_moments_and_o3(effort: Effort) -> Row:
     """Moments and o3 of a frame of 900 spots: against one matrix product for the moments and filterpy's loop."""
-    from aolink.estimation import make_estimator
-    from aolink.estimation.model.exposure_model import exposure_model
-    from aolink.simulation.model import simulate
-
     rig, sample = many_lenslets(), effort.of(100)
     (exposure,) = simulate(rig, 1)
     model, o3 = exposure_model(rig.plant, 200), make_estimator(rig, "o3")
     found = o3.step(exposure)
     loop = filterpy_loop(model, found.innovation_covariance[0], found.innovation[:sample])
     centre = np.arange(-15.0, 16, 2)
-    weights = np.stack(
-        [np.tile(centre, 16), np.tile(centre**2, 16), np.repeat(centre, 16), np.repeat(centre**2, 16)], axis=1
-    )
+    weights = np.stack([each(centre**k, 16) for each in (np.tile, np.repeat) for k in (1, 2)], axis=1)
 
     def product() -> None:
         windows = exposure.pixels.reshape(30, 16, 30, 16).swapaxes(1, 2).reshape(900, 256)
@@ -142,22 +129,14 @@ def frame_moments_and_o3(effort: Effort) -> Row:
     moments, filtering = median_s(product, effort.of(15), loop)
     theirs = moments + filtering * 1800 / sample
     return Row(
-        "moments and o3 of 900 spots, 1800 axes",
-        f"{ours * 1e3:.2f} ms, p99 {p99 * 1e3:.2f}",
+        "moments and o3 of 900 spots, 1800 axes", f"{ours * 1e3:.2f} ms, p99 {p99 * 1e3:.2f}",
         f"1 ms (p99 3); product {moments * 1e3:.2f}, filterpy {theirs * 1e3:.0f}",
-        min(1e-3 / ours, 3e-3 / p99, theirs / ours / 60),
-        1,
-    )
+        min(1e-3 / ours, 3e-3 / p99, theirs / ours / 60), 1,
+    )  # fmt: skip
 
 
 def frame_from_last_byte(effort: Effort) -> Row:
     """A frame of 480 x 480 pixels from the bytes of its packets to o3's estimate, p99."""
-    from aolink.assembly import Assembler, FrameReassembly
-    from aolink.estimation import Driver
-    from aolink.simulation.devices import SimulatedDevices
-    from aolink.wire import messages_pb2 as pb
-    from aolink.wire.packet import MessageDecoder, PacketDecoder, encode_message
-
     rig = many_lenslets()
     devices = SimulatedDevices(rig, virtual_time=True, step_zero_ns=0)
     devices.handle("camera", pb.CameraControl(run=True, exposures=3), 0)
@@ -167,11 +146,8 @@ def frame_from_last_byte(effort: Effort) -> Row:
         if isinstance(out.message, pb.FrameChunk):
             chunks = lines.setdefault(out.message.frame_id, [])
             chunks.append(encode_message(out.message, len(chunks)))
-    assembler, driver, frames = (
-        Assembler(rig),
-        Driver(rig, ["o3"]),
-        FrameReassembly(rig.sensor.shape, rig.timing.fast_step_ns),
-    )
+    assembler, driver = Assembler(rig), Driver(rig, ["o3"])
+    frames = FrameReassembly(rig.sensor.shape, rig.timing.fast_step_ns)
     packets, messages, times = PacketDecoder(), MessageDecoder(), []
     for number in range(effort.of(100)):
         stream = b"".join(lines[1 + number % 3])
@@ -190,22 +166,12 @@ def frame_from_last_byte(effort: Effort) -> Row:
 
         times.append(timed(work))
     p50, p99 = np.percentile(times, [50, 99])
-    return Row(
-        "frame of 900 spots, from its bytes to o3's estimate",
-        f"{p50 * 1e3:.1f} ms, p99 {p99 * 1e3:.1f}",
-        "p99 15 ms",
-        15e-3 / p99,
-        1,
-    )
+    figure = "frame of 900 spots, from its bytes to o3's estimate"
+    return Row(figure, f"{p50 * 1e3:.1f} ms, p99 {p99 * 1e3:.1f}", "p99 15 ms", 15e-3 / p99, 1)
 
 
 def _of_many_axes(name: str, limit_ms: float, effort: Effort) -> Row:
     """One exposure of 1800 line sensors of 16 pixels, against the time available at 5 Hz."""
-    from paper_report.ensemble import side_by_side
-
-    from aolink.estimation import make_estimator
-    from aolink.simulation.model import simulate
-
     axes, rig = effort.of(1800), load_rig("section-vi-lively")
     line, runs = rig.sensor.profile, effort.of(5)
     narrow = replace(line, pixels=16, kernel=replace(line.kernel, sigma=0.1))
@@ -235,9 +201,6 @@ def mixture_of_many_axes(effort: Effort) -> Row:
 
 def profile_of_tip_tilt(effort: Effort) -> Row:
     """An exposure of one spot on a plane, whose two slopes one mirror moves."""
-    from aolink.estimation import make_estimator
-    from aolink.simulation.model import simulate
-
     rig = load_rig("tip-tilt")
     exposures = simulate(rig, effort.of(40, 8), seed=1)
     profile = make_estimator(rig, "profile")
@@ -247,10 +210,6 @@ def profile_of_tip_tilt(effort: Effort) -> Row:
 
 def spots_under_turbulence(effort: Effort) -> list[Row]:
     """An exposure of sh-8x8, 48 spots whose slopes the membrane cannot all make, and `moments` beside o1 there."""
-    from aolink.estimation import run, score
-    from aolink.estimation.registry import make_estimator
-    from aolink.simulation.model import simulate
-
     rig = load_rig("sh-8x8")
     exposures = simulate(rig, effort.of(40, 8), seed=1)
     moments = make_estimator(rig, "moments")
@@ -261,25 +220,14 @@ def spots_under_turbulence(effort: Effort) -> list[Row]:
     return [
         Row("moments of 48 states, 48 lenslets", f"{1e3 * took:.0f} ms", "limit 50 ms", 0.05 / took, 1),
         Row(
-            "their path under turbulence",
-            f"{ours.path_rmse:.4f} mrad, {ours.gated} of {len(exposures)} gated",
-            f"o1 {theirs.path_rmse:.4f} mrad",
-            theirs.path_rmse / ours.path_rmse,
-            1 / 1.02,
+            "their path under turbulence", f"{ours.path_rmse:.4f} mrad, {ours.gated} of {len(exposures)} gated",
+            f"o1 {theirs.path_rmse:.4f} mrad", theirs.path_rmse / ours.path_rmse, 1 / 1.02,
         ),
-    ]
+    ]  # fmt: skip
 
 
 def membrane_in_real_time(effort: Effort) -> list[Row]:
     """An exposure of membrane-12x12, 288 states seen by 100 lenslets, at 5 Hz; and the memory that it takes."""
-    import lz4.frame
-
-    from aolink.estimation import make_estimator
-    from aolink.estimation.model.dense import DenseModel
-    from aolink.plant.alike import alike_systems
-    from aolink.recording.convert import estimate_message
-    from aolink.simulation.model import simulate
-
     rig = load_rig("membrane-12x12")
     first = effort.of(5)  # they make the model, and are wider
     exposures = simulate(rig, first + 1 + effort.of(18))
@@ -293,13 +241,11 @@ def membrane_in_real_time(effort: Effort) -> list[Row]:
     rows = [
         Row(
             f"{name} of 288 states, 100 lenslets",
-            f"{1e3 * statistics.median(each):.0f} ms, slowest {1e3 * max(each):.0f}",
-            "5 Hz: 200 ms",
-            0.2 / statistics.median(each),
-            1,
+            f"{1e3 * statistics.median(each):.0f} ms, slowest {1e3 * max(each):.0f}", "5 Hz: 200 ms",
+            0.2 / statistics.median(each), 1,
         )
         for name, each in times.items()
-    ]
+    ]  # fmt: skip
     together = statistics.median(sum(each) for each in zip(*times.values(), strict=True))
     rows.append(Row("the three of them together", f"{1e3 * together:.0f} ms", "5 Hz: 200 ms", 0.2 / together, 1))
     tracemalloc.start()

@@ -22,8 +22,8 @@ from aolink.exposure import Exposure
 from aolink.identification import Identified, Process, ProcessSum, Readings, identified, maxima, readings, space_of
 from aolink.jobs.follow import Following, Offer
 from aolink.jobs.identify import Wanted, from_readings
-from aolink.numerics.covariance import psd_root
 from aolink.rig import Rig, load_rig, parse_rig
+from bench_rows.disturbances import by_model, played
 from bench_rows.row import FULL, Effort, Row
 
 _KINDS = (
@@ -143,12 +143,9 @@ def coverage(effort: Effort) -> list[Row]:
 def coverage_with_pixels(effort: Effort) -> list[Row]:
     """The same for `aolink identify` as a whole, on recordings of one vibration: of others the pixels decide nothing,
     and of a sum they take minutes."""
-    seeds = [seed for seed in range(_FIRST_SEED_WITH_PIXELS, _FIRST_SEED_WITH_PIXELS + 120) if _alone(seed)]
+    seeds = range(_FIRST_SEED_WITH_PIXELS, _FIRST_SEED_WITH_PIXELS + 120)
+    seeds = [seed for seed in seeds if _KINDS[seed % len(_KINDS)] == "resonance"]
     return _coverage("a vibration alone, with its pixels: 95 % sets of", held_by_job, seeds[: effort.of(40)])
-
-
-def _alone(seed: int) -> bool:
-    return _KINDS[seed % len(_KINDS)] == "resonance"
 
 
 def _coverage(what: str, judge: Callable[[int], dict[str, bool]], seeds: Sequence[int]) -> list[Row]:
@@ -244,29 +241,12 @@ def _frequency(offer: Offer) -> Identified:
 def changed(change: DisturbanceChange, exposures: int, seed: int) -> list[Exposure]:
     """A log of the rig `loop` whose disturbance goes on from the state that it is in when its model changes."""
     rig, random = load_rig("loop"), np.random.default_rng(seed)
-    slopes = _slopes([(rig, _CHANGED_AFTER), (change.rig(), max(exposures - _CHANGED_AFTER, 0) + 2)], random)
+    period = rig.timing.frame_period_steps
+    before, state = by_model(rig, _CHANGED_AFTER * period, random, None)
+    after, _ = by_model(change.rig(), (max(exposures - _CHANGED_AFTER, 0) + 2) * period, random, state)
     with TemporaryDirectory() as folder:
-        np.save(Path(folder) / "slopes.npy", slopes)
-        table = '[disturbance]\nplant_noise = false\nrecorded = "slopes.npy"\n\n[simulation]'
-        path = Path(folder) / "rig.toml"
-        path.write_text(rig.toml.replace("[simulation]", table, 1))
-        return list(aolink.simulate(load_rig(path), exposures, seed=seed))
-
-
-def _slopes(parts: list[tuple[Rig, int]], random: np.random.Generator) -> NDArray[np.float64]:
-    """Slopes at each fast step, (steps, 1), by the models of several rigs, each for so many exposures."""
-    out: list[NDArray[np.float64]] = []
-    state = None
-    for rig, exposures in parts:
-        model = None if rig.disturbance is None else rig.disturbance.model
-        assert model is not None
-        if state is None:
-            state = psd_root(model.initial_covariance) @ random.standard_normal(len(model.A))
-        root = model.B_w @ psd_root(model.process_noise)
-        for push in random.standard_normal((exposures * rig.timing.frame_period_steps, root.shape[1])):
-            out.append(model.C @ state)
-            state = model.A @ state + root @ push
-    return np.array(out)
+        disturbed = played(rig, np.concatenate([before, after]), Path(folder) / "rig.toml")
+        return list(aolink.simulate(disturbed, exposures, seed=seed))
 
 
 _PICTURES = 12

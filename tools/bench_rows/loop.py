@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from aolink.exposure import residual_rms
 from aolink.jobs.closed_loop import closed_loop
-from aolink.numerics.covariance import psd_root
 from aolink.optics.turbulence import FrozenFlow, Layer
 from aolink.rig import Rig, load_rig, parse_rig
+from bench_rows.disturbances import by_model, played
 from bench_rows.row import Effort, Row
 
 _FREQUENCIES_HZ = (12.0, 30.0, 48.0)
@@ -45,7 +45,7 @@ def residual_slopes(effort: Effort) -> list[Row]:
     gains = _GAINS if effort.share >= 1 else _GAINS[:1]
     rows = []
     for frequency in _FREQUENCIES_HZ:
-        rig = parse_rig(load_rig("loop").toml.replace("frequency_hz = 12.0", f"frequency_hz = {frequency}"))
+        rig = _with_vibration(frequency)
         still = [residual(rig, "", "", exposures, seed) for seed in seeds]
         tried = [
             [residual(replace(rig, control=replace(rig.control, gain=gain)), "integrator", "", exposures, seed)
@@ -116,31 +116,12 @@ def _disturbed(believed: Rig, series: Series | None, exposures: int, seed: int, 
     if series is None:
         return believed
     steps = (exposures + 2) * believed.timing.frame_period_steps
-    np.save(folder / "slopes.npy", series(steps, np.random.default_rng(1000 + seed)))
-    table = '[disturbance]\nplant_noise = false\nrecorded = "slopes.npy"\n\n[simulation]'
-    path = folder / "rig.toml"
-    path.write_text(believed.toml.replace("[simulation]", table, 1))
-    return load_rig(path)
+    return played(believed, series(steps, np.random.default_rng(1000 + seed)), folder / "rig.toml")
 
 
 def _by_model(frequency_hz: float) -> Series:
     """The disturbance of the rig's model with its vibration at another frequency."""
-
-    def series(steps: int, rng: np.random.Generator) -> NDArray[np.float64]:
-        disturbance = _with_vibration(frequency_hz).disturbance
-        assert disturbance is not None
-        assert disturbance.model is not None
-        model = disturbance.model
-        state = psd_root(model.initial_covariance) @ rng.standard_normal(len(model.A))
-        noise_input = model.B_w @ psd_root(model.process_noise)
-        pushes = rng.standard_normal((steps, noise_input.shape[1]))
-        slopes = np.empty((steps, 1))
-        for k, push in enumerate(pushes):
-            slopes[k] = model.C @ state
-            state = model.A @ state + noise_input @ push
-        return slopes
-
-    return series
+    return lambda steps, rng: by_model(_with_vibration(frequency_hz), steps, rng, None)[0]
 
 
 def _turbulence(wind_m_s: float) -> Series:

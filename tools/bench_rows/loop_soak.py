@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import time
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -13,7 +12,7 @@ from aolink.jobs.demo import simulated_rig
 from aolink.recording.reader import Recording
 from aolink.rig import load_rig
 from aolink.session import record
-from bench_rows.row import Effort, Row
+from bench_rows.row import Effort, Row, resident_mb
 
 _HOUR_S, _SHORT_S = 3600.0, 5.0
 _SETTLED = 1 / 6
@@ -35,7 +34,7 @@ def closed_loop_soak(effort: Effort) -> Row:
     def progress(so_far: int) -> None:
         nonlocal settled_mb
         if not settled_mb and so_far >= _SETTLED * exposures:
-            settled_mb = _resident_mb()
+            settled_mb = resident_mb()
 
     with TemporaryDirectory() as name:
         folder = Path(name)
@@ -45,7 +44,7 @@ def closed_loop_soak(effort: Effort) -> Row:
             report = record(
                 load_rig(file), *ports, path, estimators=["o1"], control="lqg", exposures=exposures, progress=progress
             )
-        growth_mb = _resident_mb() - settled_mb  # before the recording is read, which takes memory of its own
+        growth_mb = resident_mb() - settled_mb  # before the recording is read, which takes memory of its own
         recorded, size_mb = len(Recording(path)), path.stat().st_size / 1e6
         with path.open("rb") as recording:
             summary = make_reader(recording).get_summary()
@@ -63,9 +62,3 @@ def closed_loop_soak(effort: Effort) -> Row:
         f"{growth_mb:.1f} MB", f"limit {_MOST_GROWTH_MB:g} MB and the recording's index, {index_mb:.0f} MB",
         (_MOST_GROWTH_MB + index_mb) / max(growth_mb, 0.1), 1.0,
     )  # fmt: skip
-
-
-def _resident_mb() -> float:
-    """Resident memory, MB, of this process, which holds the session and the writer."""
-    pages = int(Path("/proc/self/statm").read_text().split()[1])
-    return pages * os.sysconf("SC_PAGE_SIZE") / 1e6

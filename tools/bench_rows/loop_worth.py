@@ -15,25 +15,15 @@ from tempfile import TemporaryDirectory
 import numpy as np
 from scipy import stats
 
+from aolink import identification
 from aolink.control import ControllerRow
 from aolink.control.loop import centroids
 from aolink.exposure import Exposure, residual_rms
-from aolink.identification import (
-    Process,
-    ProcessSum,
-    by_pixels,
-    candidates,
-    identified_text,
-    maxima,
-    readings,
-    refined,
-    scanned,
-    space_of,
-)
+from aolink.identification import Process, ProcessSum, by_pixels, candidates, identified_text, maxima, readings
 from aolink.jobs.closed_loop import closed_loop
 from aolink.numerics.arrays import FloatArray
 from aolink.rig import Rig, load_rig, parse_rig
-from bench_rows.disturbances import STEP_S, DisturbanceRun, likeliest, together, turbulence, vibration
+from bench_rows.disturbances import STEP_S, DisturbanceRun, likeliest, played, together, turbulence, vibration
 from bench_rows.rivals import PREDICTORS, predicted, with_true_state
 from bench_rows.row import Effort, Row
 
@@ -240,14 +230,14 @@ def _of_seed(cell: Cell, seed: int, size: Size) -> tuple[dict[str, float], Proce
             series = [seen.exposure for seen in closed_loop(rig, controller, estimator, size.exposures, seed=seed)]
             rms[name] = residual_rms(series[size.settled :])
 
-        def played(model: ProcessSum) -> Rig:
-            return _played(cell.rig(model), ahead.slopes, Path(folder) / "ahead.toml")
+        def disturbed(model: ProcessSum) -> Rig:
+            return played(cell.rig(model), ahead.slopes[:, None], Path(folder) / "ahead.toml")
 
-        rig = played(whole.model)
+        rig = disturbed(whole.model)
         run("open", rig, "")
         for gain in size.gains:
             run(f"integrator {gain:g}", replace(rig, control=replace(rig.control, gain=gain)), "integrator")
-        before = _played(cell.rig(whole.model), whole.slopes[:past], Path(folder) / "before.toml")
+        before = played(cell.rig(whole.model), whole.slopes[:past, None], Path(folder) / "before.toml")
         earlier = [seen.exposure for seen in closed_loop(before, "", "", size.past, seed=seed + 10_000)]
         for name in PREDICTORS:
             run(name, rig, predicted(name, np.array([centroids(rig, exposure) for exposure in earlier])))
@@ -255,34 +245,29 @@ def _of_seed(cell: Cell, seed: int, size: Size) -> tuple[dict[str, float], Proce
             run(estimator, rig, "lqg", estimator)
         if cell.identified:
             identified = _identified(cell, before, earlier)
-            own = played(identified)
+            own = disturbed(identified)
             for estimator in cell.identified:
                 run(f"identified {estimator}", own, "lqg", estimator)
-            run(FROM_PATH, played(_from_path(cell, whole, past)), "lqg", "o1")
+            run(FROM_PATH, disturbed(_from_path(cell, whole, past)), "lqg", "o1")
         run("true state", rig, with_true_state(ahead))
     return rms, identified
-
-
-def _played(believes: Rig, slopes: FloatArray, path: Path) -> Rig:
-    """A rig that these slopes disturb, whatever its model is."""
-    np.save(path.with_suffix(".npy"), slopes[:, None])
-    table = f'[disturbance]\nplant_noise = false\nrecorded = "{path.stem}.npy"\n\n[simulation]'
-    path.write_text(believes.toml.replace("[simulation]", table, 1))
-    return load_rig(path)
 
 
 def _identified(cell: Cell, rig: Rig, exposures: list[Exposure]) -> ProcessSum:
     """The model that `aolink identify --model` finds from blurred frames alone, without its intervals."""
     seen = [readings(rig, exposures)]
-    space = space_of(cell.kinds, seen, rig.sensor.kernel.variance, with_noise=False, with_kernel=False)
+    space = identification.space_of(cell.kinds, seen, rig.sensor.kernel.variance, with_noise=False, with_kernel=False)
 
     def rig_of(x: FloatArray) -> Rig:
         return cell.rig(space.model(x))
 
     tops = maxima(space, seen)
-    found = [*candidates(space, tops, seen), *scanned(space, tops[0], seen, rig_of, exposures).candidates]
+    found = [
+        *candidates(space, tops, seen),
+        *identification.scanned(space, tops[0], seen, rig_of, exposures).candidates,
+    ]
     left = by_pixels(found, rig_of, exposures)
-    return space.model(refined(space, left[0].x, rig_of, exposures))
+    return space.model(identification.refined(space, left[0].x, rig_of, exposures))
 
 
 def _from_path(cell: Cell, whole: DisturbanceRun, past: int) -> ProcessSum:
@@ -325,7 +310,7 @@ def _fitted_over_known(cell: Cell, seed: int, past: int, longest: int, short: bo
     left = []
     with TemporaryDirectory() as folder:
         for model in (fitted, whole.model):
-            rig = _played(cell.rig(model), whole.slopes[known:], Path(folder) / "ahead.toml")
+            rig = played(cell.rig(model), whole.slopes[known:, None], Path(folder) / "ahead.toml")
             series = [seen.exposure for seen in closed_loop(rig, "lqg", "o1", size.exposures, seed=seed)]
             left.append(residual_rms(series[size.settled :]))
     return left[0] / left[1]

@@ -4,16 +4,21 @@ from __future__ import annotations
 
 import numpy as np
 
+from aolink.estimation import make_estimator
+from aolink.optics.frame import spots_density
+from aolink.optics.kernel import pixel_mass
+from aolink.optics.lenslets import Lenslets
+from aolink.optics.sensor import Kernel
+from aolink.optics.synthesis import Psi, light_in_windows
+from aolink.optics.turbulence import FrozenFlow, Layer
+from aolink.optics.wavefront import SpotReconstructor
 from aolink.rig import load_rig, parse_rig
+from aolink.simulation.model import simulate
 from bench_rows.row import Effort, Row, median_s
 
 
 def frame_synthesis(effort: Effort) -> Row:
     """Exposures of 30 x 30 spots on 16 x 16 pixels over 200 fast steps, against error functions at every step."""
-    from aolink.optics.frame import spots_density
-    from aolink.optics.kernel import pixel_mass
-    from aolink.optics.sensor import Kernel
-
     kernel, edges = Kernel(shape="gaussian", sigma=0.1), np.linspace(-1, 1, 17)
     path = np.cumsum(0.01 * np.random.default_rng(1).standard_normal((900, 2, 200)), axis=2)
 
@@ -27,8 +32,6 @@ def frame_synthesis(effort: Effort) -> Row:
 
 def diffraction_synthesis(effort: Effort) -> Row:
     """Frames of 900 spots whose kernel is a lenslet's diffraction."""
-    from aolink.optics.synthesis import Psi, light_in_windows
-
     path = 7.5 + np.cumsum(np.random.default_rng(0).normal(0, 0.05, (900, 2, 200)), axis=2)
     psi = Psi(shape="sinc2", zero_px=2.0)
     light_in_windows(psi, 16, path)
@@ -38,8 +41,6 @@ def diffraction_synthesis(effort: Effort) -> Row:
 
 def picture_synthesis(effort: Effort) -> Row:
     """Frames of 900 spots whose kernel is a picture of 33 x 33 points, four of them a pixel."""
-    from aolink.optics.synthesis import Psi, light_in_windows
-
     path = 7.5 + np.cumsum(np.random.default_rng(0).normal(0, 0.05, (900, 2, 200)), axis=2)
     psi = Psi(shape="image", image=np.random.default_rng(1).random((33, 33)), finer=4)
     ours = 1 / median_s(lambda: light_in_windows(psi, 16, path), effort.of(5))[0]
@@ -48,9 +49,6 @@ def picture_synthesis(effort: Effort) -> Row:
 
 def coupled_exposure(effort: Effort) -> Row:
     """An exposure of sh-30x30, one plant with 1800 slopes, with o1 and o3: measured, corrected, predicted."""
-    from aolink.estimation import make_estimator
-    from aolink.simulation.model import simulate
-
     rig = load_rig("sh-30x30")
     runs = effort.of(11)
     exposures = iter(simulate(rig, 1 + runs))
@@ -68,39 +66,26 @@ def coupled_exposure(effort: Effort) -> Row:
 
 def cost_against_lenslets(effort: Effort) -> Row:
     """Frames and o3 of 100 to 2500 spots: the cost of a spot among the fewest over that among the most."""
-    from aolink.estimation import make_estimator
-    from aolink.simulation.model import simulate
 
     def cost(side: int) -> float:
-        text = load_rig("sh-30x30").toml.replace("grid = [30, 30]", f"grid = [{side}, {side}]")
-        rig = parse_rig(text)
+        rig = parse_rig(load_rig("sh-30x30").toml.replace("grid = [30, 30]", f"grid = [{side}, {side}]"))
         runs = effort.of(7)
-        series = iter(simulate(rig, 1 + runs))
-        estimator = make_estimator(rig, "o3")
+        series, estimator = iter(simulate(rig, 1 + runs)), make_estimator(rig, "o3")
 
         def step() -> None:
-            exposure = next(series)
-            estimator.step(exposure)
+            estimator.step(next(series))
 
         step()
         simulated = median_s(lambda: simulate(rig, 1), effort.of(3))[0]
         return (median_s(step, runs)[0] + simulated) / side**2
 
     few, many = cost(10), cost(50)
-    return Row(
-        "cost against lenslets, 100 to 2500",
-        f"{many * 1e6:.0f} us a spot",
-        f"{few * 1e6:.0f} us of 100",
-        few / many,
-        0.7,
-    )
+    figure = "cost against lenslets, 100 to 2500"
+    return Row(figure, f"{many * 1e6:.0f} us a spot", f"{few * 1e6:.0f} us of 100", few / many, 0.7)
 
 
 def turbulence(effort: Effort) -> Row:
     """Slopes of 30 x 30 lenslets in frozen flow: faster than a mirror's fast steps go by."""
-    from aolink.optics.lenslets import Lenslets
-    from aolink.optics.turbulence import FrozenFlow, Layer
-
     lenslets = Lenslets(grid=(30, 30), pitch_m=0.1, focal_length_m=1.0)
     flow = FrozenFlow(Layer(r0_m=0.15, wind_m_s=(8.0, 3.0)), np.random.default_rng(0), shortest_m=0.05)
     waves = flow.slope_waves(lenslets).reshape(1800, -1)
@@ -116,8 +101,6 @@ def turbulence(effort: Effort) -> Row:
 
 def zonal_wavefront(effort: Effort) -> Row:
     """The wavefront over 50 x 50 lenslets from their slopes, against the dense pseudo-inverse."""
-    from aolink.optics.wavefront import SpotReconstructor
-
     number = np.arange(2500).reshape(50, 50)
     pairs = ((number[:, :-1], number[:, 1:]), (number[:-1], number[1:]))
     edges = np.concatenate([np.stack([a.ravel(), b.ravel()], axis=1) for a, b in pairs])

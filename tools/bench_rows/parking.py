@@ -229,13 +229,8 @@ def time_to_park(effort: Effort) -> list[Row]:
                 times = [parked_after_s(way, *ports) for _ in range(effort.of(5))]
             # Where it is not parked at all, the time is not a number, and so is the longest.
             longest = math.nan if any(map(math.isnan, times)) else max(times)
-            rows.append(
-                Row(
-                    f"time to park, {name}: {way.name}",
-                    f"{1e3 * statistics.median(times):.0f} ms, longest {1e3 * longest:.0f} of {len(times)}",
-                    f"watchdog {1e3 * watchdog_s:.0f} ms",
-                    0.0 if math.isnan(longest) else watchdog_s / max(longest, 1e-3),
-                    1.0,
-                )
-            )
+            ours = f"{1e3 * statistics.median(times):.0f} ms, longest {1e3 * longest:.0f} of {len(times)}"
+            ratio = 0.0 if math.isnan(longest) else watchdog_s / max(longest, 1e-3)
+            limit = f"watchdog {1e3 * watchdog_s:.0f} ms"
+            rows.append(Row(f"time to park, {name}: {way.name}", ours, limit, ratio, 1.0))
     return rows

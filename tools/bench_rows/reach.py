@@ -8,22 +8,24 @@ import itertools
 import os
 import pty
 import select
-import subprocess
 import tempfile
 import threading
 import time
 import tty
-from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from aolink.jobs.demo import simulated_rig
+from aolink.recording.reader import Recording
+from aolink.rig import Faults, load_rig
+from aolink.session import Report, record
+from aolink.simulation.faults import Way
+from aolink.wire import messages_pb2 as pb
+from aolink.wire.packet import MessageDecoder, PacketDecoder, PacketType
+from aolink.wire.port import SerialPort
+from bench_rows.parking import reference_device
 from bench_rows.row import Effort, Row
-
-if TYPE_CHECKING:
-    from aolink.recording.reader import Recording
-    from aolink.session import Report
 
 _RATES = {1e-6: 0.98, 1e-5: 0.98, 1e-4: 0.0}
 """Bit error rates, and the share of frames that is to come whole."""
@@ -37,7 +39,6 @@ _LATE = {1e-5: 0.0, 1e-4: _MOST_LATE}
 _QUEUE = "queue_steps = 4000\nwatchdog_s = 8"
 """Queue of the simulated rig in real time: four seconds, for which a busy machine may hold a program up."""
 _TURN_S = 0.05
-_DEVICE = Path(__file__).parents[1] / "device"
 
 
 class WrongError(Exception):
@@ -51,11 +52,6 @@ def _require(what: str, number: int) -> None:
 
 def _virtual(folder: Path, rig_name: str, rate: float, exposures: int) -> tuple[Report, Recording]:
     """The report and the recording of a session on virtual time."""
-    from aolink.jobs.demo import simulated_rig
-    from aolink.recording.reader import Recording
-    from aolink.rig import load_rig
-    from aolink.session import record
-
     path = folder / f"{rig_name}-{rate:g}.mcap"
     with simulated_rig(rig_name, "--fault", f"bitflip={rate}") as ports:
         report = record(load_rig(rig_name), *ports, path, exposures=exposures)
@@ -106,8 +102,6 @@ def bit_errors(effort: Effort) -> list[Row]:
 
 def large_frames(effort: Effort) -> Row:
     """Frames of 480 x 480 pixels in 113 chunks each: how many of the chunks come; those that do not are masked."""
-    from aolink.rig import load_rig
-
     frames, rig = effort.of(_LARGE_FRAMES, 3), load_rig("sh-30x30")
     with tempfile.TemporaryDirectory() as name:
         sound = (each for each in _virtual(Path(name), rig.name, 0.0, frames)[1].exposures())
@@ -134,11 +128,6 @@ class Cable:
     """
 
     def __init__(self, port: str, rate: float, seed: int) -> None:
-        from aolink.rig import Faults
-        from aolink.simulation.faults import Way
-        from aolink.wire.packet import MessageDecoder, PacketDecoder
-        from aolink.wire.port import SerialPort
-
         self.pixels: dict[int, bytearray] = {}
         self.held: dict[int, tuple[int, bytes]] = {}
         self.contradictions = 0
@@ -162,8 +151,6 @@ class Cable:
         self._thread.start()
 
     def _run(self) -> None:
-        from aolink.wire.packet import PacketDecoder, PacketType
-
         began = time.monotonic()
         while not self._ended.is_set():
             ready, _, _ = select.select(
@@ -189,8 +176,6 @@ class Cable:
         return self._ways[way].damage(piece + b"\0") if self._faulty and piece else piece + b"\0"
 
     def _note(self, data: bytes) -> None:
-        from aolink.wire import messages_pb2 as pb
-
         for packet in self._packets.feed(data):
             message = self._messages.take(packet)
             if isinstance(message, pb.FrameChunk):
@@ -210,35 +195,16 @@ class Cable:
         os.close(self._slave)
 
 
-@contextlib.contextmanager
-def _reference_device(folder: Path) -> Iterator[tuple[str, str]]:
-    """The C program, built here."""
-    subprocess.run(["make", "-s", "-C", _DEVICE, f"BUILD={folder}"], check=True)
-    process = subprocess.Popen([folder / "device"], stdout=subprocess.PIPE, text=True, bufsize=1)
-    try:
-        assert process.stdout is not None
-        ports = dict(process.stdout.readline().split() for _ in range(2))
-        yield ports["camera"], ports["mirror"]
-    finally:
-        process.terminate()
-        process.wait()
-
-
 def _soak(device: str, rate: float, seconds: int, seed: int, folder: Path) -> Row:
     """A session in real time through two bad lines; its recording and its commands are compared with the device's
     messages."""
-    from aolink.jobs.demo import simulated_rig
-    from aolink.recording.reader import Recording
-    from aolink.rig import load_rig
-    from aolink.session import record
-
     rig, path = load_rig("section-vi"), folder / "a.mcap"
     if device == "simulated rig":
         file = folder / "rig.toml"
         file.write_text(rig.toml.replace("[mirror]", f"[mirror]\n{_QUEUE}", 1))
         rig, serve = load_rig(file), simulated_rig(file, "--real-time")
     else:
-        serve = _reference_device(folder)
+        serve = reference_device()
     with serve as ports:
         cables = [Cable(port, rate, seed + k) for k, port in enumerate(ports)]
         try:

@@ -18,11 +18,18 @@ import numpy as np
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from google.protobuf.message import Message
 from mcap.reader import make_reader
+from mcap.writer import CompressionType
+from mcap_protobuf.writer import Writer
 
-from aolink.recording import schemas_pb2, topics
+import aolink
+from aolink.assembly import Frame
+from aolink.estimation import Driver
+from aolink.jobs import batch
+from aolink.recording import convert, schemas_pb2, topics
 from aolink.recording.editing import recover
 from aolink.recording.mcap_file import McapFile, WriteOptions, schema_of
 from aolink.recording.reader import Recording
+from aolink.recording.reestimate import reestimate, write_reestimated
 from aolink.recording.writer import RecordingWriter, begin_recording
 from aolink.rig import load_rig
 from aolink.wire import messages_pb2 as wire
@@ -33,9 +40,9 @@ _ROWS = 50_000
 _LOOP_S = 20.0
 
 
-def _session(path: Path, seconds: float, options: WriteOptions | None = None) -> list[float]:
+def _session(path: Path, seconds: float) -> list[float]:
     """A 1 kHz loop that records a command, a report and, 50 times a second, a frame; times of its calls, s."""
-    with RecordingWriter(path, load_rig("section-vi"), {}, time.time_ns(), options=options) as writer:
+    with RecordingWriter(path, load_rig("section-vi"), {}, time.time_ns()) as writer:
         return _loop(seconds, writer.write)
 
 
@@ -84,13 +91,8 @@ def kill_at_any_moment(effort: Effort) -> Row:
                 unreadable += 1
     worst = max(ages) if not unreadable else float("inf")
     ours = f"{worst:.0f} ms lost at worst, median {statistics.median(ages):.0f}"
-    return Row(
-        f"kill -9 at a random moment, {effort.of(KILLS, 3)} times, all recovered",
-        ours,
-        "limit 200 ms",
-        200 / worst,
-        1.0,
-    )
+    figure = f"kill -9 at a random moment, {effort.of(KILLS, 3)} times, all recovered"
+    return Row(figure, ours, "limit 200 ms", 200 / worst, 1.0)
 
 
 def _many_chunks(folder: Path) -> tuple[bytes, list[tuple[int, int, int]]]:
@@ -124,13 +126,8 @@ def truncation(effort: Effort) -> Row:
             (path := Path(name) / "cut.mcap").write_bytes(data[:size])
             due += sum(count for _, end, count in chunks if end <= size)
             found += sum(Recording(path).counts.values())
-    return Row(
-        f"cut off at {effort.of(500)} bytes of the last MB",
-        f"{found} messages back",
-        f"{due} in whole chunks",
-        found / due,
-        1.0,
-    )
+    figure = f"cut off at {effort.of(500)} bytes of the last MB"
+    return Row(figure, f"{found} messages back", f"{due} in whole chunks", found / due, 1.0)
 
 
 def flipped_bits(effort: Effort) -> Row:
@@ -146,9 +143,8 @@ def flipped_bits(effort: Effort) -> Row:
             (path := Path(name) / "flipped.mcap").write_bytes(damaged)
             due += sum(count for start, end, count in chunks if not ((start <= hits) & (hits < end)).any())
             found += sum(Recording(path, check=True).counts.values())
-    return Row(
-        f"20 bits flipped, {effort.of(200)} times", f"{found} messages back", f"{due} in whole chunks", found / due, 1.0
-    )
+    figure = f"20 bits flipped, {effort.of(200)} times"
+    return Row(figure, f"{found} messages back", f"{due} in whole chunks", found / due, 1.0)
 
 
 def loop_stall(effort: Effort) -> Row:
@@ -166,15 +162,8 @@ def loop_stall(effort: Effort) -> Row:
 
 def recording_rate(effort: Effort) -> Row:
     """Messages a second into a file: small ones at 1 kHz's ratio to frames."""
-    from mcap.writer import CompressionType
-    from mcap_protobuf.writer import Writer
-
-    from aolink.recording import topics
-    from aolink.recording.writer import RecordingWriter
-    from aolink.wire import messages_pb2 as pb
-
     rig = load_rig("section-vi")
-    messages = [pb.Applied(block_id=k, first_step=k, n_steps=1, u=[0.1]) for k in range(effort.of(60_000))]
+    messages = [wire.Applied(block_id=k, first_step=k, n_steps=1, u=[0.1]) for k in range(effort.of(60_000))]
 
     def ours() -> None:
         with tempfile.TemporaryDirectory() as folder, RecordingWriter(Path(folder) / "a", rig, {}, 0) as writer:
@@ -194,18 +183,12 @@ def recording_rate(effort: Effort) -> Row:
 
 def record_long(path: Path, exposures: int, name: str = "section-vi-lively") -> None:
     """A recording of many exposures of 200 steps, made from a short one played again and again."""
-    import aolink
-    from aolink.assembly import Frame
-    from aolink.recording import convert, topics
-    from aolink.recording.writer import RecordingWriter
-    from aolink.wire import messages_pb2 as pb
-
     rig = load_rig(name)
     some = aolink.simulate(rig, min(100, exposures))
     with RecordingWriter(path, rig, {}, 0, deterministic=True) as writer:
         for k in range(exposures):
             each, first, now = some[k % len(some)], 200 * k, 200_000_000 * k
-            applied = pb.Applied(first_step=first, n_steps=200, u=each.inputs.ravel())
+            applied = wire.Applied(first_step=first, n_steps=200, u=each.inputs.ravel())
             frame = Frame(
                 frame_id=k + 1, first_step=first, last_step=first + 199, pixels=each.pixels, mask=each.mask,
                 chunks_lost=0, frames_lost_before=0, device_start_ns=now, device_end_ns=now, host_first_byte_ns=now,
@@ -219,18 +202,14 @@ def record_long(path: Path, exposures: int, name: str = "section-vi-lively") -> 
 def reestimation_rate(effort: Effort) -> list[Row]:
     """o3 over recordings of one axis, of 32, and of 200 outputs of one plant, against reading the same file and
     decoding its frames, no more."""
-    one = _reestimated("re-estimation with o3", "section-vi-lively", effort.of(1500), effort)
-    many = _reestimated("re-estimation with o3 of 32 axes", "sh-4x4", effort.of(500), effort)
-    coupled = _reestimated(
-        "re-estimation with o3 of 200 outputs of one plant", "membrane-12x12", effort.of(50), effort, 0
-    )
-    return [one, many, coupled]
+    return [
+        _reestimated("", "section-vi-lively", effort.of(1500), effort, 0.5),
+        _reestimated(" of 32 axes", "sh-4x4", effort.of(500), effort, 0.5),
+        _reestimated(" of 200 outputs of one plant", "membrane-12x12", effort.of(50), effort, 0),
+    ]
 
 
-def _reestimated(figure: str, name: str, count: int, effort: Effort, target: float = 0.5) -> Row:
-    from aolink.recording import convert
-    from aolink.recording.reestimate import reestimate
-
+def _reestimated(what: str, name: str, count: int, effort: Effort, target: float) -> Row:
     with tempfile.TemporaryDirectory() as folder:
         record_long(Path(folder) / "a.mcap", count, name)
         recording = Recording(Path(folder) / "a.mcap")
@@ -245,20 +224,13 @@ def _reestimated(figure: str, name: str, count: int, effort: Effort, target: flo
 
         estimating, reading = median_s(lambda: reestimate(recording, ["o3"]), effort.of(15), read)
         skipping = median_s(lambda: sum(1 for _ in recording.messages(topics.IMAGE, topics.EXPOSURE)), effort.of(5))[0]
-    return Row(
-        figure,
-        f"{count / estimating:.0f} frames/s",
-        f"reading {count / reading:.0f}; past the mirror's reports {count / skipping:.0f}",
-        reading / estimating,
-        target,
-    )
+    theirs = f"reading {count / reading:.0f}; past the mirror's reports {count / skipping:.0f}"
+    ours = f"{count / estimating:.0f} frames/s"
+    return Row(f"re-estimation with o3{what}", ours, theirs, reading / estimating, target)
 
 
 def memory_of_an_hour(effort: Effort) -> Row:
     """Growth while an hour at 5 Hz is estimated with o3, against the file's size."""
-    from aolink.estimation import Driver
-    from aolink.recording.reader import Recording
-
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "a.mcap"
         record_long(path, effort.of(18_000))
@@ -269,15 +241,12 @@ def memory_of_an_hour(effort: Effort) -> Row:
             if number % effort.of(4000) == effort.of(1000):
                 marks.append(resident_mb())
     growth = max(marks) - marks[0]
-    return Row(
-        "memory over an hour's recording, o3", f"+{growth:.1f} MB", f"file {size:.0f} MB", size / max(growth, 0.1), 10
-    )
+    figure = "memory over an hour's recording, o3"
+    return Row(figure, f"+{growth:.1f} MB", f"file {size:.0f} MB", size / max(growth, 0.1), 10)
 
 
 def batch_workers(effort: Effort) -> Row:
     """Two dozen recordings estimated again with moments on two processes, whose start counts, against one."""
-    from aolink.jobs import batch
-
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         sources = [folder / f"{k}.mcap" for k in range(effort.of(24, 2))]
@@ -302,7 +271,6 @@ def rrd_of_ten_minutes(effort: Effort) -> Row:
     import rerun as rr
     from rerun.chunk import RrdReader
 
-    from aolink.recording.reestimate import write_reestimated
     from aolink.viewing import save_rrd
 
     def logged_row_by_row(path: Path) -> float:
@@ -325,16 +293,13 @@ def rrd_of_ten_minutes(effort: Effort) -> Row:
         row = logged_row_by_row(folder / "b.rrd")
         rows = sum(chunk.num_rows for chunk in RrdReader(folder / "a.rrd").stream())
     theirs = rows * row
-    return Row(
-        f".rrd of ten minutes, {rows / 1e3:.0f}k rows", f"{ours:.1f} s", f"rr.log {theirs:.0f} s", theirs / ours, 20
-    )
+    figure = f".rrd of ten minutes, {rows / 1e3:.0f}k rows"
+    return Row(figure, f"{ours:.1f} s", f"rr.log {theirs:.0f} s", theirs / ours, 20)
 
 
 @cache
 def hour(effort: Effort) -> Path:
     """A recording of an hour at 5 exposures a second, with o3; made once for all rows."""
-    from aolink.recording.reestimate import write_reestimated
-
     folder = Path(tempfile.mkdtemp(prefix="aolink-bench-"))
     atexit.register(shutil.rmtree, folder)
     record_long(folder / "bare.mcap", effort.of(18_000, 64))
@@ -366,10 +331,7 @@ def view_first(effort: Effort) -> Row:
     times, path = [], hour(effort)
     for _ in range(effort.of(5)):
         start, port = time.perf_counter(), free_port()
-        with (
-            tempfile.TemporaryFile() as said,
-            running_rerun(["--serve-grpc", "--port", str(port)], said) as process,
-        ):
+        with tempfile.TemporaryFile() as said, running_rerun(["--serve-grpc", "--port", str(port)], said) as process:
             wait_for_server(port, process, said)
             stream = rr.RecordingStream("aolink")
             stream.connect_grpc(f"rerun+http://127.0.0.1:{port}/proxy")

@@ -11,18 +11,7 @@ from aolink.restoration.deblur import psnr
 from aolink.restoration.markov import line_solver, make_solver
 from aolink.restoration.tv import total_variation
 from bench_rows import peers
-from bench_rows.pictures import (
-    FRESH,
-    KERNEL,
-    NOISE_SD,
-    PICTURES,
-    blurred,
-    cases,
-    paths,
-    picture_size,
-    psfs,
-    quality,
-)
+from bench_rows.pictures import FRESH, KERNEL, NOISE_SD, PICTURES, blurred, cases, paths, picture_size, psfs, quality
 from bench_rows.row import Effort, Row, median_s
 
 # Mean PSNR that each method has to reach on the seven pictures, dB.

@@ -16,6 +16,17 @@ from pathlib import Path
 
 import numpy as np
 
+from aolink.assembly import Assembler, FrameReassembly
+from aolink.estimation import Driver
+from aolink.jobs.demo import simulated_rig
+from aolink.numerics.workers import end_with_parent
+from aolink.rig import load_rig, parse_rig
+from aolink.session import record
+from aolink.simulation.devices import SimulatedDevices
+from aolink.wire import messages_pb2 as pb
+from aolink.wire.link import Link
+from aolink.wire.packet import encode_message
+from aolink.wire.port import SerialPort, wait_readable
 from bench_rows.row import Effort, Row
 
 _MINUTE_EXPOSURES = 300
@@ -25,12 +36,6 @@ _SLOW_EXPOSURES = 400
 
 def link_throughput(effort: Effort) -> Row:
     """Frames over a pseudo terminal, from bytes to messages, against plain reads of the same bytes."""
-    from aolink.numerics.workers import end_with_parent
-    from aolink.wire import messages_pb2 as pb
-    from aolink.wire.link import Link
-    from aolink.wire.packet import encode_message
-    from aolink.wire.port import SerialPort, wait_readable
-
     data = np.random.default_rng(1).integers(0, 256, 4096, dtype=np.uint8).tobytes()
     count = effort.of(4000)
     packets = [encode_message(pb.FrameChunk(frame_id=k, total=4096, data=data), k & 0xFFFF) for k in range(count)]
@@ -79,30 +84,18 @@ def link_throughput(effort: Effort) -> Row:
 
 def commands_at_1_khz(effort: Effort) -> Row:
     """A minute in real time with a simulated rig as a process of its own: steps that came late or not at all."""
-    from aolink.jobs.demo import simulated_rig
-    from aolink.rig import load_rig
-    from aolink.session import record
-
     rig = load_rig("single-lenslet")
     with tempfile.TemporaryDirectory() as folder, simulated_rig(rig.name, "--real-time") as ports:
         report = record(rig, *ports, Path(folder) / "a.mcap", estimators=["o3"], exposures=effort.of(_MINUTE_EXPOSURES))
     lost = report.steps_commanded - report.steps_applied
-    return Row(
-        f"commands at 1 kHz, {report.steps_commanded / 1000:.0f} s, in blocks of {rig.mirror.block_steps}",
-        f"{report.steps_late} steps late, {lost} lost",
-        "limit 0",
-        1.0 if not (report.steps_late or lost or report.frames_lost) else 0.0,
-        1.0,
-    )
+    figure = f"commands at 1 kHz, {report.steps_commanded / 1000:.0f} s, in blocks of {rig.mirror.block_steps}"
+    good = not (report.steps_late or lost or report.frames_lost)
+    return Row(figure, f"{report.steps_late} steps late, {lost} lost", "limit 0", float(good), 1.0)
 
 
 def slow_estimator(effort: Effort) -> Row:
     """A session in real time with an estimator that is slower than the camera, and one without: what it costs
     besides."""
-    from aolink.jobs.demo import simulated_rig
-    from aolink.rig import load_rig, parse_rig
-    from aolink.session import record
-
     # 20 exposures a second, of which each takes `sampled` some tenths of a second.
     text = load_rig("section-vi-lively").toml.replace("exposure_steps = 200", "exposure_steps = 50")
     reports, count = [], effort.of(_SLOW_EXPOSURES, 20)
@@ -119,20 +112,14 @@ def slow_estimator(effort: Effort) -> Row:
     return Row(
         f"live session, an estimate takes {statistics.median(counted.took_ms):.0f} ms of a frame period of 50 ms:"
         f" {counted.estimated} estimated, {counted.skipped} skipped",
-        f"{with_slow} frames and steps lost or late",
-        f"{lost} without estimator",
-        1.0 if with_slow <= lost else lost / with_slow,
-        1.0,
-    )
+        f"{with_slow} frames and steps lost or late", f"{lost} without estimator",
+        1.0 if with_slow <= lost else lost / with_slow, 1.0,
+    )  # fmt: skip
 
 
 def live_membrane(effort: Effort) -> Row:
     """A session in real time of 288 states with three estimators, the simulator on the same cores: how far estimates
     are behind, and whose processor time it is."""
-    from aolink.jobs.demo import simulated_rig
-    from aolink.rig import load_rig, parse_rig
-    from aolink.session import record
-
     # A machine that is held up for a second or two does not end the session.
     text = load_rig("membrane-12x12").toml.replace("queue_steps = 300", "queue_steps = 300\nwatchdog_s = 10.0")
     rig, names = parse_rig(text), ("o3", "moments", "profile") if effort.share == 1 else ("o3",)
@@ -173,15 +160,6 @@ def _processor_s() -> dict[str, float]:
 
 def frame_to_command(effort: Effort) -> Row:
     """One lenslet: from the last byte of a frame on one pseudo terminal to the command that follows on another."""
-    from aolink.assembly import Assembler, FrameReassembly
-    from aolink.estimation import Driver
-    from aolink.rig import load_rig
-    from aolink.simulation.devices import SimulatedDevices
-    from aolink.wire import messages_pb2 as pb
-    from aolink.wire.link import Link
-    from aolink.wire.packet import encode_message
-    from aolink.wire.port import SerialPort, wait_readable
-
     rig = load_rig("single-lenslet")
     devices = SimulatedDevices(rig, virtual_time=True, step_zero_ns=0)
     count = effort.of(_LENSLET_FRAMES)

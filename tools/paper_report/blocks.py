@@ -101,5 +101,12 @@ def _html(block: Block, folder: Path) -> str:
     )
 
 
+def write_page(blocks: Sequence[Block], page: Path) -> Path:
+    """Write a page as Markdown, and beside it as HTML, with the figures of its folder; the path of the first."""
+    page.write_text(as_markdown(blocks), encoding="utf-8")
+    page.with_suffix(".html").write_text(as_html(blocks, page.parent), encoding="utf-8")
+    return page
+
+
 def _row(cells: Sequence[str], tag: str) -> str:
     return "<tr>" + "".join(f"<{tag}>{html.escape(cell)}</{tag}>" for cell in cells) + "</tr>"

@@ -34,13 +34,9 @@ class SensorRows(Sensor):
 
 
 def variant(
-    rig: Rig,
-    *,
-    process_noise: float | None = None,
-    noise_density: float | None = None,
-    offset: float | None = None,
+    rig: Rig, *, process_noise: float | None = None, noise_density: float | None = None, offset: float | None = None,
     output: Sequence[float] | None = None,
-) -> Rig:
+) -> Rig:  # fmt: skip
     """A rig with other noise, another output, or held off centre from the start instead of driven.
 
     Parameters
@@ -58,9 +54,7 @@ def variant(
     if process_noise is not None:
         factor = process_noise / plant.process_noise[0, 0]
         plant = dataclasses.replace(
-            plant,
-            process_noise=plant.process_noise * factor,
-            initial_covariance=plant.initial_covariance * factor,
+            plant, process_noise=plant.process_noise * factor, initial_covariance=plant.initial_covariance * factor
         )
     if noise_density is not None:
         sensor = dataclasses.replace(sensor, noise_density=noise_density)
@@ -78,22 +72,16 @@ def side_by_side(rig: Rig, runs: int) -> Rig:
     """A rig whose axes are ``runs`` independent copies of one that has a single axis."""
     values = {f.name: getattr(rig.sensor, f.name) for f in dataclasses.fields(Sensor)}
     return dataclasses.replace(
-        rig,
-        plant=dataclasses.replace(rig.plant, axes=runs),
-        sensor=SensorRows(**values, rows=runs),
+        rig, plant=dataclasses.replace(rig.plant, axes=runs), sensor=SensorRows(**values, rows=runs)
     )
 
 
-def drive_inputs(rig: Rig, n_steps: int, runs: int = 1) -> FloatArray:
-    """The rig's slow input, the same for all runs, (n_steps, runs)."""
-    return np.tile(rig.drive.inputs(0, n_steps, rig.timing.fast_step_s), (1, runs))
-
-
 def clean_exposures(rig: Rig, exposures: int, seed: int) -> list[Exposure]:
-    """Exposures of a rig from `side_by_side` with process noise and without pixel noise."""
+    """Exposures of a rig from `side_by_side` with process noise and without pixel noise; its slow input is the same for
+    all runs."""
     silent = dataclasses.replace(rig, sensor=dataclasses.replace(rig.sensor, noise_density=0.0))
-    inputs = drive_inputs(rig, exposures * rig.timing.exposure_steps, rig.plant.axes)
-    return simulate(silent, exposures, seed, inputs=inputs)
+    inputs = rig.drive.inputs(0, exposures * rig.timing.exposure_steps, rig.timing.fast_step_s)
+    return simulate(silent, exposures, seed, inputs=np.tile(inputs, (1, rig.plant.axes)))
 
 
 def with_pixel_noise(rig: Rig, clean: Sequence[Exposure], seed: int) -> list[Exposure]:
@@ -136,6 +124,11 @@ def errors(exposures: Sequence[Exposure], estimates: Sequence[Estimate], skip: i
     return Errors(path=np.array(path).T, start=np.array(start).T, end=np.array(end).T)
 
 
+def normalised(estimate: Estimate, error: FloatArray) -> FloatArray:
+    """Normalised square of an error of the end state (axes, n_states), (axes,)."""
+    return np.asarray(np.einsum("ai,ai->a", error, np.linalg.solve(estimate.end_covariance, error[..., None])[..., 0]))
+
+
 def measure_errors(rig: Rig, exposures: Sequence[Exposure], names: Sequence[str], skip: int) -> dict[str, Errors]:
     """Errors of several estimators on the same exposures, by their names."""
     return {name: errors(exposures, each, skip) for name, each in run(rig, exposures, names).items()}
@@ -171,7 +164,8 @@ def _resampled(count: int) -> NDArray[np.intp]:
     return np.random.default_rng(count).integers(0, count, size=(_RESAMPLES, count))
 
 
-def _measured(value: float, samples: FloatArray) -> IntervalEstimate:
+def measured(value: float, samples: FloatArray) -> IntervalEstimate:
+    """A number with the error and the interval of its bootstrap samples."""
     low, high = np.quantile(samples, [0.025, 0.975])
     return IntervalEstimate(float(value), float(samples.std()), float(low), float(high))
 
@@ -179,13 +173,13 @@ def _measured(value: float, samples: FloatArray) -> IntervalEstimate:
 def rms(squares: FloatArray) -> IntervalEstimate:
     """Root of the mean of squared errors, (runs, exposures); NaN where one does not count."""
     each = np.nanmean(squares, axis=1)
-    return _measured(np.sqrt(each.mean()), np.sqrt(each[_resampled(len(each))].mean(axis=1)))
+    return measured(np.sqrt(each.mean()), np.sqrt(each[_resampled(len(each))].mean(axis=1)))
 
 
 def mean(values: FloatArray) -> IntervalEstimate:
     """Mean of (runs, exposures)."""
     each = values.mean(axis=1)
-    return _measured(each.mean(), each[_resampled(len(each))].mean(axis=1))
+    return measured(each.mean(), each[_resampled(len(each))].mean(axis=1))
 
 
 def ratio(squares: FloatArray, reference: FloatArray) -> IntervalEstimate:
@@ -193,7 +187,7 @@ def ratio(squares: FloatArray, reference: FloatArray) -> IntervalEstimate:
     above, below = np.nanmean(squares, axis=1), np.nanmean(reference, axis=1)
     chosen = _resampled(len(above))
     samples = np.sqrt(above[chosen].mean(axis=1) / below[chosen].mean(axis=1))
-    return _measured(np.sqrt(above.mean() / below.mean()), samples)
+    return measured(np.sqrt(above.mean() / below.mean()), samples)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -214,15 +208,9 @@ class Cell:
 
 
 def map_cells(
-    rig: Rig,
-    offsets: Sequence[float],
-    densities: Sequence[float],
-    process_noises: Sequence[float],
-    *,
-    runs: int,
-    exposures: int,
-    skip: int,
-) -> list[Cell]:
+    rig: Rig, offsets: Sequence[float], densities: Sequence[float], process_noises: Sequence[float], *, runs: int,
+    exposures: int, skip: int,
+) -> list[Cell]:  # fmt: skip
     """The map o3/o1 over (offset, V, W_f): paired runs, and the same random numbers at every point."""
     cells = []
     for noise in process_noises:

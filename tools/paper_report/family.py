@@ -15,14 +15,8 @@ from typing import Literal
 import numpy as np
 from scipy import linalg
 
-from aolink.estimation.assumptions import (
-    LEAST_KERNEL_PIXELS,
-    LEAST_PEAK_SNR,
-    MOST_MODES,
-    MOST_PATH_WIDTHS,
-    MOST_SWINGS,
-    STEPS_IN_SWING,
-)
+from aolink.estimation import assumptions
+from aolink.estimation.assumptions import LEAST_KERNEL_PIXELS, LEAST_PEAK_SNR, MOST_MODES, MOST_PATH_WIDTHS
 from aolink.estimation.driver import SkippedInputs
 from aolink.exposure import Exposure
 from aolink.numerics.arrays import FloatArray
@@ -36,7 +30,7 @@ SEEDS = {"tuning": range(100_000), "reporting": range(100_000, 200_000)}
 """Ranges of seeds by name; each judgement takes the first ones of its range."""
 
 MODES = (1, MOST_MODES)
-SWINGS = (0.05, MOST_SWINGS)
+SWINGS = (0.05, assumptions.MOST_SWINGS)
 """Swings of a resonance in an exposure."""
 DAMPING = (0.002, 1.0)
 MEMORY = (0.1, 20.0)
@@ -163,7 +157,7 @@ def _mode(rng: np.random.Generator, steps: int, period: int, share: float, path_
     if kind == "Ornstein-Uhlenbeck":
         swings = 1 / (2 * math.pi * _between(rng, MEMORY))
         return PlantProcess(kind=kind, swings=swings, damping=1.0, sd=sd, direction=direction)
-    fastest = min(SWINGS[1], steps / STEPS_IN_SWING)
+    fastest = min(SWINGS[1], steps / assumptions.STEPS_IN_SWING)
     swings = _between(rng, (SWINGS[0], fastest))
     if rng.random() < 0.25:  # an alias of the frame rate: its phase at each frame's start is the same, or the opposite
         half_turns = max(1, round(2 * swings * period / steps))

@@ -112,12 +112,12 @@ def _times(exposures: Sequence[Exposure], rig: Rig) -> FloatArray:
     return np.asarray((first + np.arange(sum(e.n_steps for e in exposures))) * rig.timing.fast_step_s)
 
 
-def figure_4(path: Path, chosen: Sequence[Scene], dpi: int, exposures: int = 60) -> None:
+def figure_4(path: Path, chosen: Sequence[Scene], dpi: int) -> None:
     """Theta and its estimates by o1 and o2 from a wrong start."""
     with _figure(path, dpi, (7.2, 5.4), len(chosen), 1, sharex=True) as (_, axes):
         for ax, scene in zip(axes[:, 0], chosen, strict=True):
             there, believed = displaced(scene.rig)
-            series = list(aolink.simulate(there, exposures, seed=4))
+            series = list(aolink.simulate(there, 60, seed=4))
             found, t = run(believed, series, ["o1", "o2"]), _times(series, scene.rig)
             _draw_centroids(ax, scene.rig, series)
             ax.plot(t, _truth(series), color=_TRUTH, label="truth", linewidth=1.1)
@@ -243,12 +243,8 @@ def figure_remarks(path: Path, first: Remark1, second: Remark2, dpi: int) -> Non
     with _figure(path, dpi, (7.2, 3.1), 1, 2) as (_, axes):
         left, right = axes[0]
         left.plot(first.frequency_hz, np.maximum(first.gain, 1e-9), color="0.6", label=r"$|\bar{C}|$")
-        left.plot(
-            first.frequency_hz,
-            np.maximum(first.smallest, 1e-9),
-            color="black",
-            label=r"smallest s.v. of $[\bar{C}; \bar{C}A^N]$",
-        )
+        smallest = r"smallest s.v. of $[\bar{C}; \bar{C}A^N]$"
+        left.plot(first.frequency_hz, np.maximum(first.smallest, 1e-9), color="black", label=smallest)
         left.set(xlabel="frequency of an undamped mode (Hz)", ylabel="what 200 ms leave of it", yscale="log",
                  ylim=(1e-4, 60), title="Remark 1: an undamped mode", xlim=(0, 20.5))  # fmt: skip
         left.legend(loc="upper right")

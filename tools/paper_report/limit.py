@@ -18,8 +18,9 @@ from aolink.numerics.arrays import FloatArray
 from aolink.optics.sensor import SpotSensor
 from aolink.rig import Rig, load_rig
 from aolink.simulation.model import simulate
+from paper_report import ensemble as runs_of
 from paper_report.blocks import Block, Heading, PageFigure, Table, Text
-from paper_report.ensemble import IntervalEstimate, measure_errors, ratio, side_by_side, variant, with_pixel_noise
+from paper_report.ensemble import IntervalEstimate, measure_errors, normalised, ratio, side_by_side, variant
 from paper_report.numbers import Effort
 from paper_report.shake import shaken
 
@@ -76,11 +77,8 @@ def scenes(runs: int, count: int) -> Iterator[tuple[str, Rig, list[Exposure]]]:
     plane = load_rig("single-lenslet")
     assert isinstance(plane.sensor, SpotSensor)
     u = plane.drive.inputs(0, count * plane.timing.exposure_steps, plane.timing.fast_step_s)
-    many = dataclasses.replace(
-        plane,
-        plant=dataclasses.replace(plane.plant, axes=2 * runs),
-        sensor=dataclasses.replace(plane.sensor, grid=(1, runs)),
-    )
+    plant, sensor = dataclasses.replace(plane.plant, axes=2 * runs), dataclasses.replace(plane.sensor, grid=(1, runs))
+    many = dataclasses.replace(plane, plant=plant, sensor=sensor)
     yield "2-D spots", many, simulate(many, count, 730, inputs=np.tile(u, (1, runs)))
 
 
@@ -88,7 +86,7 @@ def _side_by_side(rig: Rig, runs: int, count: int, u: FloatArray, seed: int) -> 
     many = side_by_side(rig, runs)
     silent = dataclasses.replace(many, sensor=dataclasses.replace(many.sensor, noise_density=0.0))
     inputs = np.tile(u[:, None], (1, runs))
-    return many, with_pixel_noise(many, simulate(silent, count, seed, inputs=inputs), seed + 1)
+    return many, runs_of.with_pixel_noise(many, simulate(silent, count, seed, inputs=inputs), seed + 1)
 
 
 def limit_table(effort: Effort) -> list[Scene]:
@@ -156,7 +154,7 @@ def _found(
         inside.append(np.mean(np.abs(error) < 1.96 * e.path_sd))
         away = e.end_state - truth.end_state
         end.append(np.mean(np.sum(away**2, axis=1)))
-        nees.append(np.einsum("ai,ai->a", away, np.linalg.solve(e.end_covariance, away[..., None])[..., 0]))
+        nees.append(normalised(e, away))
         # Two independent runs of the sampler: their own noise has no part in the product.
         product.append(_of_axes((e.path - one.path) * (e.path - two.path), len(away)))
         variance.append(_of_axes(one.path_sd**2, len(away)))
@@ -190,6 +188,10 @@ def limit_section(table: Sequence[Scene], effort: Effort, picture: PageFigure) -
     def rows(text: str, names: Sequence[str] = NAMES) -> list[list[str]]:
         return [[scene.name, *(format(getattr(scene.found[n], text), "#.3g") for n in names)] for scene in table]
 
+    singles = [
+        [scene.name, *(format(x, ".2f") if math.isfinite(x) else "-" for x in scene.found["profile"].single)]
+        for scene in table
+    ]
     first = table[0].found["o1"]
     below = NAMES[1:-1]
     times = [[n, f"{np.median([s.found[n].time_ms for s in table]):#.3g}"] for n in NAMES]
@@ -211,13 +213,7 @@ def limit_section(table: Sequence[Scene], effort: Effort, picture: PageFigure) -
             "Exposures in which profile saw one reading of the blur, no second mode of 5 %: their share, its distance"
             " and its NEES there:"
         ),
-        Table(
-            ["scene", "share", "distance", "NEES"],
-            [
-                [scene.name, *(format(x, ".2f") if math.isfinite(x) else "-" for x in scene.found["profile"].single)]
-                for scene in table
-            ],
-        ),
+        Table(["scene", "share", "distance", "NEES"], singles),
         Text("RMSE of the end state's norm:"),
         Table(["scene", *NAMES], rows("end")),
         Text(

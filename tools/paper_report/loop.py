@@ -4,36 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from bench_rows.loop_worth import (
-    FACTORS,
-    FROM_PATH,
-    HEADLINE,
-    TURBULENCE,
-    TURBULENCE_AND_VIBRATION,
-    VIBRATION,
-    Measured,
-    all_measured,
-)
+from bench_rows import loop_worth as worth
+from bench_rows.loop_worth import FROM_PATH, Measured
 
 from paper_report.blocks import Block, Heading, Table, Text
 
-_GROUPS = (HEADLINE, TURBULENCE_AND_VIBRATION, TURBULENCE, VIBRATION, FACTORS)
+_GROUPS = (worth.HEADLINE, worth.TURBULENCE_AND_VIBRATION, worth.TURBULENCE, worth.VIBRATION, worth.FACTORS)
 _COLUMNS = (
-    "ar_kalman",
-    "least_squares",
-    "o1",
-    "moments",
-    "profile",
-    "identified o1",
-    "identified profile",
-    FROM_PATH,
+    "ar_kalman", "least_squares", "o1", "moments", "profile", "identified o1", "identified profile", FROM_PATH,
     "true state",
-)
+)  # fmt: skip
 
 
 def loop_cells(quick: bool) -> list[Measured]:
     """All cells, or one of each group and little of it."""
-    return [each for group in _GROUPS for each in all_measured(group, quick)]
+    return [each for group in _GROUPS for each in worth.all_measured(group, quick)]
 
 
 def loop_section(cells: Sequence[Measured]) -> list[Block]:

@@ -204,15 +204,14 @@ def fitted_section(found: Sequence[MadeFilm], effort: Effort) -> list[Block]:
         ),
         Table(
             ["film", "over held", "smoothed, over interpolated", "inside"],
-            [
-                [
-                    str(each.kind),
-                    *(of["profile"].interval for of in (each.over_held, each.over_interpolated, each.coverage)),
-                ]
-                for each in found
-            ],
+            [_made_row(each, "profile") for each in found],
         ),
     ]
+
+
+def _made_row(film: MadeFilm, name: str, *more: str) -> list[str]:
+    found = (film.over_held, film.over_interpolated, film.coverage)
+    return [str(film.kind), *more, *(each[name].interval for each in found)]
 
 
 def made_section(found: Sequence[MadeFilm], effort: Effort) -> list[Block]:
@@ -230,13 +229,6 @@ def made_section(found: Sequence[MadeFilm], effort: Effort) -> list[Block]:
         ),
         Table(
             ["film", "estimator", "over held", "smoothed, over interpolated", "inside"],
-            [
-                [
-                    str(each.kind), name, each.over_held[name].interval, each.over_interpolated[name].interval,
-                    each.coverage[name].interval,
-                ]
-                for each in found
-                for name in each.over_held
-            ],
+            [_made_row(each, name, name) for each in found for name in each.over_held],
         ),
-    ]  # fmt: skip
+    ]

@@ -14,7 +14,7 @@ import matplotlib as mpl
 from aolink.rig import load_rig
 from paper_report import figures, shahin
 from paper_report import numbers as n
-from paper_report.blocks import as_html, as_markdown
+from paper_report.blocks import write_page
 from paper_report.ensemble import Cell, map_cells
 from paper_report.judge import RECORDED, judge_plan, read_rows
 from paper_report.limit import against_o1, limit_table
@@ -41,10 +41,7 @@ def make(out: Path, effort: n.Effort) -> list[Path]:
     with _timed("figures"):
         draw(out, results)
     write_map(out / "map.csv", results.cells)
-    blocks = build(results)
-    page = out / "paper.md"
-    page.write_text(as_markdown(blocks), encoding="utf-8")
-    (out / "paper.html").write_text(as_html(blocks, out), encoding="utf-8")
+    page = write_page(build(results), out / "paper.md")
     with _timed("Shahin"):
         restored = shahin.make(out, effort is n.QUICK)
     return [page, restored]

@@ -239,21 +239,15 @@ def norm_readings(rig: Rig, lively: Rig, effort: Effort) -> list[Norms]:
     W = float(rig.plant.process_noise[0, 0])
     _, Q = lift(rig.plant, rig.timing.exposure_steps)
     small = W * float((rig.plant.B_w @ rig.plant.process_noise @ rig.plant.B_w.T)[1, 1]) / Q[1, 1]
-    D = rig.sensor.pixel_width
+    pixel, cycle = 0.1 * rig.sensor.pixel_width, effort.cycle_exposures
     readings = {
-        "as printed, C = [1 0], slow input": (rig, effort.cycle_exposures),
+        "as printed, C = [1 0], slow input": (rig, cycle),
         "the same without input": (variant(rig, offset=0.0), effort.exposures),
         "the same, held at 0.5": (variant(rig, offset=0.5), effort.exposures),
         "C = [0.001 0] as printed, no input": (variant(rig, offset=0.0, output=[0.001, 0.0]), effort.exposures),
-        f"V the variance of a pixel (density {0.1 * D:.3g}), slow input": (
-            variant(rig, noise_density=0.1 * D),
-            effort.cycle_exposures,
-        ),
-        f"W = 0.1 per exposure (W_f = {small:.2g}), slow input": (
-            variant(rig, process_noise=small),
-            effort.cycle_exposures,
-        ),
-        "lively: W_f = 10, V = 0.01, slow input": (lively, effort.cycle_exposures),
+        f"V the variance of a pixel (density {pixel:.3g}), slow input": (variant(rig, noise_density=pixel), cycle),
+        f"W = 0.1 per exposure (W_f = {small:.2g}), slow input": (variant(rig, process_noise=small), cycle),
+        "lively: W_f = 10, V = 0.01, slow input": (lively, cycle),
     }
     return [
         norms(name, each, effort.runs, exposures, effort.skip, seed=410 + 2 * i)
@@ -402,14 +396,13 @@ class Remark2:
 
 def remark_2(lively: Rig, effort: Effort) -> Remark2:
     """o2 and o1 against open loop on the lively plant, centred and off centre."""
-    o2: list[IntervalEstimate] = []
-    o1: list[IntervalEstimate] = []
+    over: dict[str, list[IntervalEstimate]] = {"o2": [], "o1": []}
     for offset in effort.offsets:
         many, series = ensemble(variant(lively, offset=offset), effort.runs, effort.exposures, seed=71)
         found = measure_errors(many, series, ("open-loop", "o1", "o2"), effort.skip)
-        for chosen, name in ((o2, "o2"), (o1, "o1")):
+        for name, chosen in over.items():
             chosen.append(ratio(found[name].path, found["open-loop"].path))
-    return Remark2(effort.offsets, o2, o1)
+    return Remark2(effort.offsets, over["o2"], over["o1"])
 
 
 @dataclass(frozen=True)
@@ -431,9 +424,8 @@ def mechanism(lively: Rig, effort: Effort, offset: float = 0.5, noise_density: f
     equivalent = noise_density / (1 + 4 * offset**2 * (2 / 3) / (2 / 5))
 
     def path_rmse(at: float, density: float, name: str) -> IntervalEstimate:
-        many, series = ensemble(
-            variant(lively, offset=at, noise_density=density), effort.runs, effort.exposures, seed=81
-        )
+        rig = variant(lively, offset=at, noise_density=density)
+        many, series = ensemble(rig, effort.runs, effort.exposures, seed=81)
         return rms(measure_errors(many, series, (name,), effort.skip)[name].path)
 
     return Mechanism(

@@ -12,26 +12,14 @@ from bench_rows.loop_worth import Measured as ClosedLoops
 from aolink.plant.lifting import lift
 from aolink.plant.observability import observability
 from aolink.rig import Rig
-from paper_report import figures
+from paper_report import figures, numbers
 from paper_report.blocks import Block, Heading, PageFigure, Points, Table, Text
 from paper_report.ensemble import Cell, IntervalEstimate
 from paper_report.judge import Row as JudgedRow
 from paper_report.limit import Scene, against_o1_section, limit_section
 from paper_report.loop import loop_section
 from paper_report.made_films import MadeFilm, fitted_section, made_section
-from paper_report.numbers import (
-    Effort,
-    ErrorRow,
-    FormRow,
-    Mechanism,
-    Norms,
-    Remark1,
-    Remark2,
-    Row,
-    input_inside,
-    late_input_error,
-    number,
-)
+from paper_report.numbers import Effort, ErrorRow, FormRow, Mechanism, Norms, Remark1, Row, late_input_error, number
 from paper_report.shake import ShakeRow, shake_section
 from paper_report.spheres import Film, film_section
 from paper_report.verdict import family_section
@@ -51,7 +39,7 @@ class Results:
     forms: dict[str, tuple[list[FormRow], IntervalEstimate]]
     """Errors by the rig's name: o3 under each printed form, and open loop."""
     remark_1: Remark1
-    remark_2: Remark2
+    remark_2: numbers.Remark2
     mechanism: Mechanism
     shake: list[ShakeRow]
     limit: list[Scene]
@@ -89,23 +77,13 @@ FIGURES = {
 def build(results: Results) -> list[Block]:
     """The whole page."""
     return [
-        *_introduction(results),
-        *_printed_numbers(results),
-        *_figures(),
-        *_steady_levels(results),
-        *_errors(results),
-        *_misprints(results),
-        *_remarks(results),
-        *_map(results),
-        *shake_section(results.shake, results.effort),
+        *_introduction(results), *_printed_numbers(results), *_figures(), *_steady_levels(results), *_errors(results),
+        *_misprints(results), *_remarks(results), *_map(results), *shake_section(results.shake, results.effort),
         *limit_section(results.limit, results.effort, _picture("limit.png")),
-        *against_o1_section(results.over_o1, results.effort),
-        *family_section(results.family, _picture("family.png")),
-        *film_section(results.film),
-        *made_section(results.made, results.effort),
-        *fitted_section(results.fitted, results.effort),
-        *loop_section(results.loops),
-    ]
+        *against_o1_section(results.over_o1, results.effort), *family_section(results.family, _picture("family.png")),
+        *film_section(results.film), *made_section(results.made, results.effort),
+        *fitted_section(results.fitted, results.effort), *loop_section(results.loops),
+    ]  # fmt: skip
 
 
 def _picture(file: str) -> PageFigure:
@@ -240,8 +218,8 @@ def _misprints(results: Results) -> list[Block]:
         f"The predictor's u(jN − i) is one step late, it should be u(jN − 1 − i): theta is off by"
         f" {late_input_error(lively, False):.1e} (rms) with the slow input and by {late_input_error(lively, True):.1e}"
         " with one that is drawn anew at each step; below what these runs can show.",
-        f"(12) to (15) leave out that the input moves the spot inside the exposure, by up to {input_inside(lively):.3f}"
-        f" in its mean; {cost['no input']}.",
+        "(12) to (15) leave out that the input moves the spot inside the exposure, by up to"
+        f" {numbers.input_inside(lively):.3f} in its mean; {cost['no input']}.",
         f"(14) gives an exposure's moments as a function of the state at its start, (18) to (20) use them as if of the"
         f" state at its end; {cost['delay']}, the input inside left out as well.",
         f"(17) adds the noise of one fast step for a whole exposure: x_2 gets {factor:.1f} times as much, and x_1 gets"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ from matplotlib.figure import Figure
 
 from aolink.numerics.arrays import FloatArray
 from aolink.restoration import Psf, Scanner, first_order, largest_zero, restore
-from paper_report.blocks import Block, Heading, PageFigure, Points, Table, Text, as_html, as_markdown
+from paper_report.blocks import Block, Heading, PageFigure, Points, Table, Text, write_page
 
 # Values that he does not print: the blur and the noise's variances.
 BLUR = 5
@@ -80,9 +81,8 @@ def restored(
 ) -> FloatArray:
     """The picture restored by rows, or as one line of 1024 pixels, which the fifth-order model describes."""
     lines = image.reshape(1, -1) if raster else image
-    done = restore(
-        lines, psf(), method=method, noise_sd=math.sqrt(noise_variance), scanner=scanner, boundary=-1.0
-    )  # fmt: skip
+    sd = math.sqrt(noise_variance)
+    done = restore(lines, psf(), method=method, noise_sd=sd, scanner=scanner, boundary=-1.0)
     return np.asarray(done.image).reshape(image.shape)
 
 
@@ -175,12 +175,8 @@ def build(runs: int, captions: dict[str, str]) -> list[Block]:
     variance = float(scene().var())
     eigenvalues = np.linalg.eigvals(ALPHA)
     periods = sorted({round(2 * math.pi / abs(np.angle(v)), 1) for v in eigenvalues if v.imag > 0}, reverse=True)
-    table = [
-        gain(model, method, noise, (1.0, 1.0), runs)
-        for model in models()
-        for noise in NOISE_VARIANCES
-        for method in METHODS
-    ]
+    settings = product(models(), NOISE_VARIANCES, METHODS)
+    table = [gain(model, method, noise, (1.0, 1.0), runs) for model, noise, method in settings]
     shown = [
         gain("first order, α = 0.873", method, SHOWN, (a, b), runs)
         for method in ("predictor", "smoother") for a in FACTORS for b in FACTORS
@@ -230,8 +226,4 @@ def build(runs: int, captions: dict[str, str]) -> list[Block]:
 
 def make(out: Path, quick: bool) -> Path:
     """Figures and page in ``out``; the page's path."""
-    blocks = build(2 if quick else RUNS, draw(out))
-    page = out / "shahin.md"
-    page.write_text(as_markdown(blocks), encoding="utf-8")
-    (out / "shahin.html").write_text(as_html(blocks, out), encoding="utf-8")
-    return page
+    return write_page(build(2 if quick else RUNS, draw(out)), out / "shahin.md")

@@ -16,7 +16,7 @@ from aolink.exposure import Exposure
 from aolink.numerics.arrays import FloatArray
 from aolink.rig import Rig
 from paper_report.blocks import Block, Heading, Table, Text
-from paper_report.ensemble import IntervalEstimate, ensemble, errors, mean, ratio, rms, variant
+from paper_report.ensemble import IntervalEstimate, ensemble, errors, mean, normalised, ratio, rms, variant
 from paper_report.numbers import Effort
 
 DAMPING, SD = 0.005, 0.2
@@ -62,8 +62,7 @@ def end_nees(exposures: Sequence[Exposure], estimates: Sequence[Estimate], skip:
     found = []
     for exposure, estimate in list(zip(exposures, estimates, strict=True))[skip:]:
         assert exposure.truth is not None
-        error = estimate.end_state - exposure.truth.end_state
-        found.append(np.einsum("ai,ai->a", error, np.linalg.solve(estimate.end_covariance, error[..., None])[..., 0]))
+        found.append(normalised(estimate, estimate.end_state - exposure.truth.end_state))
     return np.array(found).T
 
 

@@ -7,7 +7,7 @@ next. Exposures of a sphere that has other light beside it, as `aolink import` r
 """
 
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -155,23 +155,22 @@ def _film_of(frames: int, effort: Effort) -> Film:
 
     everywhere = np.ones_like(counts)
     return Film(
-        frames,
-        {name: rms(of(each, counts)) for name, each in path.items()},
-        over(path, held, counts),
-        {name: rms(of(each, counts)) for name, each in smoothed.items()},
-        over(smoothed, interpolated, counts),
-        coverage,
-        int((~counts).sum()) // 2,
-        counts.size // 2,
-        over(path, held, everywhere),
+        frames, {name: rms(of(each, counts)) for name, each in path.items()}, over(path, held, counts),
+        {name: rms(of(each, counts)) for name, each in smoothed.items()}, over(smoothed, interpolated, counts),
+        coverage, int((~counts).sum()) // 2, counts.size // 2, over(path, held, everywhere),
         over(smoothed, interpolated, everywhere),
-    )
+    )  # fmt: skip
 
 
 def film_section(found: Sequence[Film]) -> list[Block]:
     """A row for each estimator, exposures of more and more frames across."""
     filtered, smoothed = list(found[0].path), list(found[0].smoothed)
+    over_all = [*(each.all_over_held for each in found), *(each.all_over_interpolated for each in found)]
     across = [f"{each.frames} frames" for each in found]
+
+    def table(kind: str, names: Sequence[str], of: Callable[[Film, str], str]) -> Table:
+        return Table([kind, *across], [[name, *(of(each, name) for each in found)] for name in names])
+
     return [
         Heading("Blur that nobody here made"),
         Text(
@@ -183,33 +182,18 @@ def film_section(found: Sequence[Film]) -> list[Block]:
             + ", ".join(f"{each.crowded} of {each.scored} at {each.frames} frames" for each in found)
             + ". RMSE of the path, pixels, with the standard error over the twelve axes:"
         ),
-        Table(["estimator", *across], [[name, *(str(each.path[name]) for each in found)] for name in filtered]),
+        table("estimator", filtered, lambda each, name: str(each.path[name])),
         Text("Over that of the held centroid, with the 95 % interval of a bootstrap over the axes:"),
-        Table(
-            ["estimator", *across], [[name, *(each.over_held[name].interval for each in found)] for name in filtered]
-        ),
+        table("estimator", filtered, lambda each, name: each.over_held[name].interval),
         Text("Smoothed, beside the centroid interpolated to the next picture; both use the future:"),
-        Table(["smoother", *across], [[name, *(str(each.smoothed[name]) for each in found)] for name in smoothed]),
+        table("smoother", smoothed, lambda each, name: str(each.smoothed[name])),
         Text("Over that of the interpolated centroid:"),
-        Table(
-            ["smoother", *across],
-            [[name, *(each.over_interpolated[name].interval for each in found)] for name in smoothed],
-        ),
+        table("smoother", smoothed, lambda each, name: each.over_interpolated[name].interval),
         Text("With the exposures that do not count, filtered over held and smoothed over interpolated:"),
         Table(
             ["estimator", *across, *(f"{each}, smoothed" for each in across)],
-            [
-                [
-                    name,
-                    *(each.all_over_held[name].interval for each in found),
-                    *(each.all_over_interpolated[name].interval for each in found),
-                ]
-                for name in ESTIMATOR_NAMES
-            ],
+            [[name, *(of[name].interval for of in over_all)] for name in ESTIMATOR_NAMES],
         ),
         Text("Share of the path inside the estimate's 95 % intervals, with the tracker's own error added:"),
-        Table(
-            ["estimator", *across],
-            [[name, *(f"{each.coverage[name]:.3f}" for each in found)] for name in ESTIMATOR_NAMES],
-        ),
+        table("estimator", ESTIMATOR_NAMES, lambda each, name: f"{each.coverage[name]:.3f}"),
     ]

@@ -13,6 +13,7 @@ from scipy import stats
 
 from aolink.numerics.arrays import FloatArray
 from paper_report.blocks import Block, Heading, PageFigure, Points, Table, Text
+from paper_report.ensemble import IntervalEstimate, measured
 from paper_report.family import SEEDS
 from paper_report.judge import LIMIT, NAMES, Row
 
@@ -67,20 +68,9 @@ def ratios(rows: Rows, name: str, reference: str) -> dict[int, float]:
     return {seed: math.sqrt(a.mean() / b.mean()) for seed, (a, b) in pairs.items()}
 
 
-@dataclass(frozen=True)
-class Bound:
-    """The ratio over the family, the root of the scenes' mean squared ratio, with a 95 % interval."""
-
-    value: float
-    low: float
-    high: float
-
-    def __str__(self) -> str:
-        return f"{self.value:.3f} [{self.low:.3f}, {self.high:.3f}]"
-
-
-def family_ratio(rows: Rows, name: str, reference: str) -> Bound | None:
-    """The ratio over the family, by bootstrap over scenes and over the runs of each; None without scenes."""
+def family_ratio(rows: Rows, name: str, reference: str) -> IntervalEstimate | None:
+    """The ratio over the family, the root of the scenes' mean squared ratio, by bootstrap over scenes and over the runs
+    of each; None without scenes."""
     pairs = list(squares(rows, name, reference).values())
     if not pairs:
         return None
@@ -91,8 +81,7 @@ def family_ratio(rows: Rows, name: str, reference: str) -> Bound | None:
         each[k] = a[chosen].mean(axis=1) / b[chosen].mean(axis=1)
     scenes = rng.integers(0, len(pairs), (_RESAMPLES, len(pairs)))
     samples = np.sqrt(each[scenes, np.arange(_RESAMPLES)[:, None]].mean(axis=1))
-    value = math.sqrt(np.mean([a.mean() / b.mean() for a, b in pairs]))
-    return Bound(value, *np.quantile(samples, [0.025, 0.975]).tolist())
+    return measured(math.sqrt(np.mean([a.mean() / b.mean() for a, b in pairs])), samples)
 
 
 def significantly_worse(rows: Rows, name: str, reference: str, level: float = 0.05) -> list[int]:
@@ -160,28 +149,16 @@ def goals(rows: Rows) -> list[Goal]:
     to_limit = list(ratios(rows, "mixture", "sampled").values())
     if to_limit:
         median, high = np.quantile(to_limit, [0.5, 0.95])
-        found.append(
-            Goal(
-                f"mixture's path RMSE over sampled's at most {NEAR_LIMIT[0]:g} in the median and {NEAR_LIMIT[1]:g} at"
-                " the 95th percentile",
-                f"{median:.3f} and {high:.3f}",
-                bool(median <= NEAR_LIMIT[0] and high <= NEAR_LIMIT[1]),
-                len(to_limit),
-            )
-        )
+        text = f"mixture's path RMSE over sampled's at most {NEAR_LIMIT[0]:g} in the median and {NEAR_LIMIT[1]:g} at"
+        within = bool(median <= NEAR_LIMIT[0] and high <= NEAR_LIMIT[1])
+        found.append(Goal(f"{text} the 95th percentile", f"{median:.3f} and {high:.3f}", within, len(to_limit)))
     for name in (each for each in JUDGED if rows[each]):
         judged = list(rows[name].values())
         inside = np.array([np.mean(row.inside) for row in judged])
         median, share = float(np.median(inside)), float(np.mean(_within(inside, SCENE_INSIDE)))
-        found.append(
-            Goal(
-                f"{name}: coverage of 95 % intervals {_span(MEDIAN_INSIDE)} in the median, {_span(SCENE_INSIDE)} in"
-                f" {SHARE_INSIDE:.0%} of scenes",
-                f"{median:.3f}, {share:.0%}",
-                bool(_within(median, MEDIAN_INSIDE) and share >= SHARE_INSIDE),
-                len(judged),
-            )
-        )
+        text = f"{name}: coverage of 95 % intervals {_span(MEDIAN_INSIDE)} in the median, {_span(SCENE_INSIDE)} in"
+        within = bool(_within(median, MEDIAN_INSIDE) and share >= SHARE_INSIDE)
+        found.append(Goal(f"{text} {SHARE_INSIDE:.0%} of scenes", f"{median:.3f}, {share:.0%}", within, len(judged)))
         share = share_of_nees(judged)
         if math.isfinite(share):
             text = f"{name}: end NEES inside its bounds in {SHARE_NEES:.0%} of scenes"
@@ -189,15 +166,11 @@ def goals(rows: Rows) -> list[Goal]:
         for reference in REFERENCES:
             bound = family_ratio(rows, name, reference)
             if bound is not None:
-                worse = significantly_worse(rows, name, reference)
-                found.append(
-                    Goal(
-                        f"{name} over {reference}: upper bound at most {MOST_RATIO:g}, no scene significantly worse",
-                        f"{bound}, {len(worse)} scenes" + (f" ({', '.join(map(str, worse[:8]))})" if worse else ""),
-                        bound.high <= MOST_RATIO and not worse,
-                        len(squares(rows, name, reference)),
-                    )
-                )
+                worse, pairs = significantly_worse(rows, name, reference), squares(rows, name, reference)
+                text = f"{name} over {reference}: upper bound at most {MOST_RATIO:g}, no scene significantly worse"
+                which = f" ({', '.join(map(str, worse[:8]))})" if worse else ""
+                within = bound.high <= MOST_RATIO and not worse
+                found.append(Goal(text, f"{bound.interval}, {len(worse)} scenes{which}", within, len(pairs)))
     return found
 
 
@@ -215,9 +188,6 @@ def family_section(given: Sequence[Row], picture: PageFigure | None = None) -> l
     reporting = [row.seed in SEEDS["reporting"] for row in given]
     seeds = "reporting" if all(reporting) else "tuning" if not any(reporting) else "both tuning and reporting"
     table = [_quantiles(rows, name) for name in NAMES if rows[name]]
-    measured = [
-        f"{goal.text}: {goal.measured}: {goal.verdict}" for goal in goals(rows)
-    ]  # fmt: skip
     return [
         Heading("A family of plants that nobody tuned for"),
         Text(
@@ -241,7 +211,7 @@ def family_section(given: Sequence[Row], picture: PageFigure | None = None) -> l
             table,
         ),
         *([picture] if picture else []),
-        Points(measured),
+        Points([f"{goal.text}: {goal.measured}: {goal.verdict}" for goal in goals(rows)]),
     ]  # fmt: skip
 
 
@@ -260,7 +230,7 @@ def _quantiles(rows: Rows, name: str) -> list[str]:
     over, nees = [], share_of_nees(judged)
     for reference in REFERENCES:
         bound = family_ratio(rows, name, reference) if name != reference else None
-        over.append("-" if bound is None else f"{bound} ({len(significantly_worse(rows, name, reference))})")
+        over.append("-" if bound is None else f"{bound.interval} ({len(significantly_worse(rows, name, reference))})")
     return [
         name, str(len(judged)), f"{np.median([row.scored for row in judged]):.0f}", *to_limit,
         *(f"{x:.3f}" for x in np.quantile(inside, [0.05, 0.5, 0.95])),

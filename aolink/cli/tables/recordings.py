@@ -86,14 +86,10 @@ def comparison(found: Mapping[str, TopicComparison]) -> Table:
             table.add_row(topic, "", str(each.compared), "0", "", "", "")
         for name, field in each.fields.items():
             frame = f"frame {field.first.frame_id}: " if field.first.frame_id is not None else ""
-            sizes = (f"{field.largest:.2g}", f"{field.largest_relative:.2g}")
-            table.add_row(
-                topic, name, str(each.compared), str(field.messages), *sizes, escape(frame + field.first.text)
-            )
-        for count, what, first in (
-            (each.missing, "missing", each.first_missing),
-            (each.added, "added", each.first_added),
-        ):
+            numbers = str(each.compared), str(field.messages), f"{field.largest:.2g}", f"{field.largest_relative:.2g}"
+            table.add_row(topic, name, *numbers, escape(frame + field.first.text))
+        ends = ((each.missing, "missing", each.first_missing), (each.added, "added", each.first_added))
+        for count, what, first in ends:
             if count:
                 table.add_row(topic, what, str(each.compared), str(count), "", "", escape(first))
     return table

@@ -69,13 +69,8 @@ def calibration_as_json(result: Calibrated) -> dict[str, Any]:
     from aolink.calibration.rig_text import written  # with scipy.stats, half of what `aolink info` took to start
 
     found, sensor = result.calibration, result.rig.sensor
-    before = {
-        "sensor.black_level": sensor.black_level,
-        "sensor.noise_density": sensor.noise_density,
-        "sensor.counts_per_density": sensor.counts_per_density,
-        "sensor.photoelectrons": sensor.photoelectrons,
-        "sensor.kernel.sigma": sensor.kernel.sigma,
-    }
+    names = ("black_level", "noise_density", "counts_per_density", "photoelectrons")
+    before = {f"sensor.{name}": getattr(sensor, name) for name in names} | {"sensor.kernel.sigma": sensor.kernel.sigma}
     values = {}
     for key, value in before.items():
         measured = found.values.get(key)
@@ -87,19 +82,13 @@ def calibration_as_json(result: Calibrated) -> dict[str, Any]:
             "pull": measured and (value - measured.value) / (measured.sd or math.nan),
         }
     spot = found.spot
-    return dict(
-        without_nan(
-            {
-                "values": values,
-                "read_noise_counts": asdict(found.read_noise),
-                "counts_per_photoelectron": found.gain and asdict(found.gain),
-                "spot": spot and {**asdict(spot), "gaussian": spot.gaussian},
-                "frames": found.frames,
-                "hot_pixels": found.hot_pixels,
-                "notes": found.notes,
-            }
-        )
-    )
+    facts = {
+        "values": values, "read_noise_counts": asdict(found.read_noise),
+        "counts_per_photoelectron": found.gain and asdict(found.gain),
+        "spot": spot and {**asdict(spot), "gaussian": spot.gaussian}, "frames": found.frames,
+        "hot_pixels": found.hot_pixels, "notes": found.notes,
+    }  # fmt: skip
+    return dict(without_nan(facts))
 
 
 def slopes_as_json(result: FrameSlopes) -> dict[str, Any]:

@@ -30,13 +30,11 @@ def scores(by_name: Mapping[str, Score]) -> Table:
     columns: dict[str, Callable[[Score], str]] = {"NIS": lambda each: _consistency(each.nis)}
     if counted:
         columns = {
-            "RMSE start": lambda each: _rmse(each.start_rmse),
-            "RMSE end": lambda each: _rmse(each.end_rmse),
-            "RMSE path": lambda each: _rmse(each.path_rmse),
-            **columns,
+            "RMSE start": lambda each: _rmse(each.start_rmse), "RMSE end": lambda each: _rmse(each.end_rmse),
+            "RMSE path": lambda each: _rmse(each.path_rmse), **columns,
             "NEES start": lambda each: _consistency(each.start_nees),
             "NEES end": lambda each: _consistency(each.end_nees),
-        }
+        }  # fmt: skip
     if any(each.gated for each in by_name.values()):
         columns["gated"] = lambda each: f"{each.gated}  "
     for name in columns:

@@ -74,9 +74,8 @@ def session(report: Report) -> Table:
         f" {report.reports_asked} times",
     )
     if report.ports_vanished:
-        table.add_row(
-            "ports", f"vanished {report.ports_vanished} times, and {report.away_s:.2f} s until all had returned"
-        )
+        gone = f"vanished {report.ports_vanished} times, and {report.away_s:.2f} s until all had returned"
+        table.add_row("ports", gone)
     table.add_row(
         "clock",
         f"device minus host {report.clock_offset_ns / 1e9:.6f} s, {report.clock_frequency_ppm:+.2f} ppm,"
@@ -100,10 +99,10 @@ def _control(report: ControlReport) -> str:
     text = f"{report.controller}{served}: {report.exposures} exposures taken, slopes {report.slope_rms:.4g} rms"
     if counts := report.counts().get("delay_ms"):
         text += f"; delay p50 {counts:.3g} ms, longest {report.counts()['longest_delay_ms']:.3g} ms"
-    text += f", {report.late_exposures} later than control.delay_s"
-    return text + (
-        f"; loop open for {report.open_exposures} exposures, model off for {report.misfit_exposures}, fallen back for"
-        f" {report.fall_back_exposures}; limits changed {report.clipped_steps} steps"
+    return (
+        f"{text}, {report.late_exposures} later than control.delay_s; loop open for {report.open_exposures} exposures,"
+        f" model off for {report.misfit_exposures}, fallen back for {report.fall_back_exposures}; limits changed"
+        f" {report.clipped_steps} steps"
     )
 
 
@@ -182,13 +181,12 @@ def demo_summary(result: DemoResult, command: str) -> list[str]:
     if result.deblurred_recording is not None:
         lines.append(f"deblurred {result.deblurred_recording}")
     lines.append(f"rerun     {result.rrd}")
-    if not result.not_of_viewer:
-        lines.append(f"picture   {result.picture}")
-    elif result.picture is not None:
-        lines.append(f"picture   {result.picture}, drawn with matplotlib: {result.not_of_viewer}")
-    else:
-        lines.append(f"picture   none: {result.not_of_viewer}")
-    lines.append(f"next      {command} view {result.deblurred_recording or result.recording}")
-    lines.append(f"          {command} info {result.recording}")
-    lines.append(f"          {command} estimate {result.recording} --estimator o3")
-    return lines
+    picture = "none" if result.picture is None else str(result.picture)
+    if result.not_of_viewer:
+        picture += f"{'' if result.picture is None else ', drawn with matplotlib'}: {result.not_of_viewer}"
+    return [
+        *lines, f"picture   {picture}",
+        f"next      {command} view {result.deblurred_recording or result.recording}",
+        f"          {command} info {result.recording}",
+        f"          {command} estimate {result.recording} --estimator o3",
+    ]  # fmt: skip

@@ -15,10 +15,7 @@ from aolink.errors import DeviceError
 from aolink.extensions import needs_extra
 from aolink.rig import Rig
 
-_CLOCKS = (
-    ("TimestampLatch", "TimestampLatchValue"),
-    ("GevTimestampControlLatch", "GevTimestampValue"),
-)
+_CLOCKS = (("TimestampLatch", "TimestampLatchValue"), ("GevTimestampControlLatch", "GevTimestampValue"))
 """Pairs of features that latch the camera's clock and give its value: those of newer cameras, then those of GigE
 cameras."""
 _RATES = ("ResultingFrameRate", "BslResultingAcquisitionFrameRate", "ResultingFrameRateAbs")
@@ -53,13 +50,9 @@ class BaslerCamera:
     lacks: tuple[Lacks, ...] = (Lacks.TRIGGER,)
 
     def __init__(
-        self,
-        rig: Rig,
-        *,
-        serial: str = "",
-        corner: Sequence[int] = (0, 0),
+        self, rig: Rig, *, serial: str = "", corner: Sequence[int] = (0, 0),
         features: Mapping[str, bool | int | float | str] | None = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         with needs_extra("basler", DeviceError):
             from pypylon import genicam, pylon
         self._rig, self._pylon, self._genicam = rig, pylon, genicam
@@ -92,9 +85,7 @@ class BaslerCamera:
 
     def start(self, start_ns: int, exposures: int) -> None:
         """Take frames until stopped; those that begin before ``start_ns`` do not belong to the session."""
-        self._camera.StartGrabbing(
-            self._pylon.GrabStrategy_OneByOne, self._pylon.GrabLoop_ProvidedByInstantCamera
-        )  # fmt: skip
+        self._camera.StartGrabbing(self._pylon.GrabStrategy_OneByOne, self._pylon.GrabLoop_ProvidedByInstantCamera)
 
     def frames(self) -> list[SimpleFrame]:
         """The frames since the last call; one that was not grabbed whole is left out, and its number with it."""
@@ -147,15 +138,11 @@ class BaslerCamera:
         frequency = self._first(("GevTimestampTickFrequency",))
         self._tick_ns = 1e9 / float(self._value(frequency)) if frequency else 1.0
         self._tells_time = self.time_ns() is not None
-        self.lacks = (
-            *(() if self._tells_time else (Lacks.TIME,)),
-            *(() if triggered else (Lacks.TRIGGER,)),
-        )
+        self.lacks = (*(() if self._tells_time else (Lacks.TIME,)), *(() if triggered else (Lacks.TRIGGER,)))
         self._camera.MaxNumBuffer.Value = _BUFFERS
         self._listener = _listener(self._pylon, self._arrived, self._frame)
-        self._camera.RegisterImageEventHandler(
-            self._listener, self._pylon.RegistrationMode_Append, self._pylon.Cleanup_None
-        )  # fmt: skip
+        mode, cleanup = self._pylon.RegistrationMode_Append, self._pylon.Cleanup_None
+        self._camera.RegisterImageEventHandler(self._listener, mode, cleanup)
 
     def _frame(self, result: Any, arrived_ns: int) -> None:
         """Take a result of pylon's thread; a grab that failed leaves a gap in the numbers."""
@@ -166,15 +153,12 @@ class BaslerCamera:
         stamp_ns = self._ns(int(result.TimeStamp))
         if self._tells_time and not stamp_ns:
             raise DeviceError(f"{self._name} has a clock and gives a frame without a time: switch its time stamps on")
-        self._arrived.give(
-            SimpleFrame(
-                pixels=np.asarray(result.Array),
-                exposure_ns=self._exposure_ns,
-                start_ns=stamp_ns if self._tells_time else None,
-                arrived_ns=arrived_ns,
-                number=self._number,
-            )
-        )
+        start_ns = stamp_ns if self._tells_time else None
+        frame = SimpleFrame(
+            pixels=np.asarray(result.Array), exposure_ns=self._exposure_ns, start_ns=start_ns, arrived_ns=arrived_ns,
+            number=self._number,
+        )  # fmt: skip
+        self._arrived.give(frame)
 
     def _ns(self, ticks: int) -> int:
         return round(ticks * self._tick_ns) if self._tick_ns != 1.0 else ticks
@@ -229,7 +213,6 @@ def discover() -> list[tuple[str, str]]:
 
 
 def _choose(found: Sequence[Any], serial: str) -> Any:
-    """The camera with this serial number, or the only one. Raises DeviceError."""
     numbers = sorted(info.GetSerialNumber() for info in found)
     if not numbers:
         raise DeviceError("pylon finds no Basler camera: is it connected and powered, and on this network?")

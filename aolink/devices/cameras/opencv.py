@@ -9,14 +9,8 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, ClassVar
 
-from aolink.devices.cameras.pictures import (
-    FrameThread,
-    ThreadCamera,
-    as_counts,
-    check_within,
-    checked_corner,
-    sensor_part,
-)
+from aolink.devices.cameras import pictures
+from aolink.devices.cameras.pictures import FrameThread, ThreadCamera, check_within, checked_corner
 from aolink.devices.simple import Lacks, SimpleFrame
 from aolink.errors import DeviceError
 from aolink.extensions import needs_extra
@@ -107,7 +101,6 @@ class OpenCVCamera(ThreadCamera):
         return True
 
     def _check(self, cv2: Any) -> None:
-        """Compare size and rate with the rig file's. Raises DeviceError."""
         size = tuple(int(self._capture.get(p)) for p in (cv2.CAP_PROP_FRAME_HEIGHT, cv2.CAP_PROP_FRAME_WIDTH))
         check_within((size[0], size[1]), self._rig.sensor.shape, self._corner, self._name)
         if not (self._is_file or self._capture.getBackendName() == "V4L2"):
@@ -139,8 +132,8 @@ class OpenCVCamera(ThreadCamera):
                         if self._is_file
                         else f"{self._name} gives no more frames: is it still connected?"
                     )
-                part = sensor_part(picture, self._rig.sensor.shape, self._corner, self._name)
-                counts = as_counts(grey(part, self._name), self._name)
+                part = pictures.sensor_part(picture, self._rig.sensor.shape, self._corner, self._name)
+                counts = pictures.as_counts(grey(part, self._name), self._name)
                 yield SimpleFrame(pixels=counts, exposure_ns=self._exposure_ns, arrived_ns=arrived_ns)
         finally:
             self._capture.release()

@@ -1,4 +1,5 @@
-"""The drivers' own keys in ``[devices.mirror]``, checked as the rig file's other keys are."""
+"""Checks of the rig file: the drivers' own keys in ``[devices.mirror]``, and that its converter is as coarse as the
+device's own."""
 
 from __future__ import annotations
 
@@ -8,7 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from aolink.errors import RigError
+from aolink.devices.gate import converter_margin
+from aolink.errors import DeviceError, RigError
+from aolink.rig import MirrorDriver
 
 
 def per_input(name: str, value: Any, n_inputs: int) -> NDArray[np.float64]:
@@ -51,3 +54,24 @@ def speed(name: str, value: Any) -> int:
     if isinstance(value, bool) or not isinstance(value, int) or not 50 <= value <= 10_000_000:
         raise RigError(f"devices.mirror.{name}: expected a whole number of bits per second, found {value!r}")
     return value
+
+
+def check_resolution(mirror: MirrorDriver, step: float | NDArray[np.float64], device: str) -> None:
+    """Refuse a rig file with finer steps of the inputs than a device takes.
+
+    Parameters
+    ----------
+    step:
+        The device's steps, in units of the inputs: a number, or (n_inputs,).
+
+    Raises
+    ------
+    DeviceError
+        It is finer: the input that the device holds would count as another input than the one commanded.
+    """
+    if (converter_margin(mirror) < step).any():
+        bits = int(np.log2(((mirror.input_max - mirror.input_min) / step).min() * (1 + 1e-9) + 1))
+        raise DeviceError(
+            f"mirror.dac_bits = {mirror.dac_bits} is finer than {device}, which goes in steps of"
+            f" {np.max(step):.3g} of an input: set it to {bits}"
+        )

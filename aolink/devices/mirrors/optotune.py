@@ -121,7 +121,6 @@ class OptotuneMirror:
             )
 
     def _start(self) -> None:
-        """Bring the driver to its Simple mode. Raises DeviceError."""
         with suppress(DeviceError):
             if self._ask("START", _FIRST_ANSWER_S) == "OK":
                 return

@@ -69,16 +69,9 @@ class PiMirror:
     lacks: ClassVar[tuple[Lacks, ...]] = (Lacks.READ_BACK, Lacks.WATCHDOG)
 
     def __init__(
-        self,
-        rig: Rig,
-        *,
-        port: str,
-        axes: list[str | int],
-        scale: float | list[float] = 1.0,
-        offset: float | list[float] = 0.0,
-        baud_rate: int = 115_200,
-        settling_s: float = 5.0,
-    ) -> None:
+        self, rig: Rig, *, port: str, axes: list[str | int], scale: float | list[float] = 1.0,
+        offset: float | list[float] = 0.0, baud_rate: int = 115_200, settling_s: float = 5.0,
+    ) -> None:  # fmt: skip
         self._axes = _checked_axes(axes, rig.n_inputs)
         self._scale = scale_per_input("scale", scale, rig.n_inputs)
         self._offset = per_input("offset", offset, rig.n_inputs)
@@ -126,7 +119,6 @@ class PiMirror:
             self._check(command, self._error_number(command, self._next_line()))
 
     def _command(self, command: str) -> None:
-        """Send a command and wait until it is accepted. Raises DeviceError where it is not."""
         self._send(command)
         self._take_answer()
 
@@ -135,7 +127,6 @@ class PiMirror:
         self._line.tell(f"{command}\nERR?\n".encode())
 
     def _identify(self) -> str:
-        """Check the identity. Raises DeviceError for a device that is not a controller of PI with GCS 2."""
         self._line.drain(_QUIET_S)
         identity = self._answer("*IDN?")
         if "physik instrumente" not in identity.lower():
@@ -183,7 +174,6 @@ class PiMirror:
                 )
 
     def _switch_on(self) -> None:
-        """Close the controller's own loop. Raises DeviceError where it stays open."""
         if (servos := self._numbers("SVO?")) is None or not servos.all():
             self._command(" ".join(["SVO", *(f"{axis} 1" for axis in self._axes)]))
             if (servos := self._numbers("SVO?")) is not None and not servos.all():
@@ -193,7 +183,6 @@ class PiMirror:
                 )
 
     def _settle(self) -> None:
-        """Wait until the safe position is reached. Raises DeviceError where it is not."""
         deadline = time.monotonic() + self._settling_s
         while (there := self._numbers("ONT?")) is not None and not there.all():
             if time.monotonic() > deadline:
@@ -269,7 +258,6 @@ def discover() -> list[tuple[str, str]]:
 
 
 def _checked_axes(axes: Any, n_inputs: int) -> list[str]:
-    """Names of the axes. Raises RigError."""
     names = [str(axis) for axis in axes] if isinstance(axes, list) else []
     if len(names) != n_inputs or len({*names}) != n_inputs or not all(name.isalnum() for name in names):
         raise RigError(

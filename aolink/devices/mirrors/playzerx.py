@@ -17,9 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aolink.devices.drivers import Failure
-from aolink.devices.mirrors.keys import text
+from aolink.devices.mirrors.keys import check_resolution, text
 from aolink.devices.mirrors.line import SerialLine, shown
-from aolink.devices.mirrors.resolution import check_resolution
 from aolink.devices.mirrors.sample_clock import SampleClock
 from aolink.devices.simple import Held, Lacks
 from aolink.errors import AolinkError, DeviceError
@@ -230,7 +229,6 @@ class PlayzerX:
         self._count()
 
     def _identify(self) -> tuple[str, str]:
-        """Ask for the device's description and data format. Raises DeviceError."""
         # The first command ends a command that another program may have left half sent; the second one stops what that
         # program started.
         self._line.tell(NO_UPDATES + NO_UPDATES)
@@ -340,7 +338,6 @@ class PlayzerX:
 
 
 def _checked_rate(rig: Rig) -> int:
-    """The sample rate, samples a second. Raises DeviceError."""
     rate = round(1e9 / rig.timing.fast_step_ns)
     if rate not in RATES or rate * rig.timing.fast_step_ns != 1_000_000_000:
         raise DeviceError(
@@ -351,7 +348,6 @@ def _checked_rate(rig: Rig) -> int:
 
 
 def _check(rig: Rig, laser: int, ahead: int) -> None:
-    """Check the rig file and the keys. Raises DeviceError where they ask for something that the device cannot do."""
     mirror = rig.mirror
     if rig.n_inputs > 2 or (mirror.input_min < -1).any() or (mirror.input_max > 1).any():
         raise DeviceError(

@@ -13,9 +13,8 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from aolink.devices.mirrors.keys import per_input, scale_per_input, text
+from aolink.devices.mirrors.keys import check_resolution, per_input, scale_per_input, text
 from aolink.devices.mirrors.line import TIMEOUT_S, SerialLine, shown, usb_ports
-from aolink.devices.mirrors.resolution import check_resolution
 from aolink.devices.simple import Lacks
 from aolink.errors import AolinkError, DeviceError, RigError
 from aolink.extensions import needs_extra
