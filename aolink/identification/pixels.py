@@ -164,7 +164,8 @@ def _scan(
             near = np.array([math.exp(each.x[k]) for each in peaks])
             at = np.unique(np.round(near / spacing)[:, None] + [-1, 0, 1])
         else:
-            at = np.arange(math.ceil(_LEAST_CYCLES / exposure_s / spacing), math.floor(math.exp(high[k]) / spacing) + 1)
+            first, last = np.round(np.array([_LEAST_CYCLES / exposure_s, math.exp(high[k])]) / spacing)
+            at = np.arange(first, last + 1)
         found = []
         for hz in at * spacing:
             x = min((each.x for each in peaks), key=lambda x: abs(math.exp(x[k]) - hz), default=start).copy()
@@ -174,7 +175,7 @@ def _scan(
         left = by_pixels(found, rig_of, exposures, partial(_tell_of_round, tell, number, rounds))
         for each in found:
             if each not in left:
-                possible &= np.abs(every - math.exp(each.x[k])) > spacing / 2
+                possible &= np.abs(every - math.exp(each.x[k])) > (spacing + apart) / 2
         peaks = [
             each for rank, each in enumerate(left)
             if all(abs(math.exp(each.x[k]) - math.exp(better.x[k])) > 1.5 * spacing for better in left[:rank])

@@ -143,8 +143,8 @@ def coverage(effort: Effort) -> list[Row]:
 def coverage_with_pixels(effort: Effort) -> list[Row]:
     """The same for `aolink identify` as a whole, on recordings of one vibration: of others the pixels decide nothing,
     and of a sum they take minutes."""
-    seeds = range(_FIRST_SEED_WITH_PIXELS, _FIRST_SEED_WITH_PIXELS + 120)
-    seeds = [seed for seed in seeds if _KINDS[seed % len(_KINDS)] == "resonance"]
+    drawn_seeds = range(_FIRST_SEED_WITH_PIXELS, _FIRST_SEED_WITH_PIXELS + 120)
+    seeds = [seed for seed in drawn_seeds if _KINDS[seed % len(_KINDS)] == "resonance"]
     return _coverage("a vibration alone, with its pixels: 95 % sets of", held_by_job, seeds[: effort.of(40)])
 
 
