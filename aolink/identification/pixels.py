@@ -51,8 +51,6 @@ _LASTING, _LEAST_CYCLES = 3.0, 0.25
 below that, centroids show the frequency."""
 _SPACING = 0.15
 """Distance of a scan's frequencies, in cycles in the time that its vibrations last: half of a resonance's width."""
-_PARTS = 4
-"""Frequencies that are told apart in the least distance of a scan."""
 _PEAKS = 4
 """Most frequencies of a round of a scan, each better than its neighbours, about which the next one looks."""
 _NEAR_ENOUGH = 0.1
@@ -90,7 +88,7 @@ class Scan:
     candidates: list[Candidate]
     """A candidate at each frequency that they prefer."""
     left: dict[int, list[tuple[float, float]]]
-    """Intervals of frequencies that they do not rule out, Hz, from low to high, by the number of the parameter."""
+    """Intervals of frequencies that they do not rule out, Hz, by the number of the parameter; they may overlap."""
 
 
 def candidates(space: Space, found: Sequence[Maximum], seen: Sequence[Readings]) -> list[Candidate]:
@@ -153,9 +151,7 @@ def _scan(
     longest = max(_LASTING, _DECAY * len(exposures))
     rounds = 1 + math.ceil(math.log2(longest / _LASTING))
     low, high = np.array(space.bounds).T
-    apart = _SPACING / (longest * period_s) / _PARTS
-    every = np.arange(math.exp(low[k]), math.exp(high[k]) + apart, apart)
-    possible = np.ones(len(every), bool)
+    intervals: list[tuple[float, float]] = []
     peaks: list[Candidate] = []
     for number in range(rounds):
         lasting = min(_LASTING * 2**number, longest) * period_s
@@ -173,9 +169,11 @@ def _scan(
             top = climb(space, np.clip(x, low, high), of, _NEAR_ENOUGH, fixed=(k, k + 1))
             found.append(Candidate(top.x, top))
         left = by_pixels(found, rig_of, exposures, partial(_tell_of_round, tell, number, rounds))
-        for each in found:
-            if each not in left:
-                possible &= np.abs(every - math.exp(each.x[k])) > (spacing + apart) / 2
+        if not number:
+            # The first round has them all: each stands for half the distance on either side, and a little more.
+            half = 0.51 * spacing
+            intervals = [(hz - half, hz + half) for hz in (math.exp(each.x[k]) for each in left)]
+            intervals.append((0.0, float(at[0]) * spacing - half))
         peaks = [
             each for rank, each in enumerate(left)
             if all(abs(math.exp(each.x[k]) - math.exp(better.x[k])) > 1.5 * spacing for better in left[:rank])
@@ -185,8 +183,7 @@ def _scan(
         Candidate(each.x, top if abs(top.x[k] - each.x[k]) < _STAYED else each.maximum)
         for each, top in zip(peaks, tops, strict=True)
     ]
-    first, after = np.flatnonzero(np.diff(np.pad(possible, 1).astype(int))).reshape(-1, 2).T
-    return best, list(zip(every[first] - apart / 2, every[after - 1] + apart / 2, strict=True))
+    return best, intervals
 
 
 def _tell_of_round(tell: Tell, number: int, rounds: int, done: int, of: int) -> None:

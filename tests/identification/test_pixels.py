@@ -91,7 +91,7 @@ def test_a_scan_finds_a_vibration_far_from_every_maximum():
     scan = scanned(of, highest, seen, shaken, exposures, lambda *done: told.append(done))
     found, left = scan.candidates, np.array(scan.left[2]) * EXPOSURE_S
     assert any(low < 2.4 < high for low, high in left)
-    assert np.diff(left[left[:, 0] > 0.25]).sum() < 0.3  # of the 3.75 cycles an exposure that are scanned
+    assert np.diff(left[left[:, 0] > 0.2]).sum() < 0.3  # of the 3.75 cycles an exposure that are scanned
     best = found[0]
     assert math.exp(best.x[2]) * EXPOSURE_S == pytest.approx(2.4, abs=0.02)
     assert 1 / (2 * math.pi * math.exp(best.x[2]) * math.exp(best.x[3]) * EXPOSURE_S) == pytest.approx(64 / 8)
