@@ -2,7 +2,7 @@
 
 from aolink.identification.choose import CANDIDATES, Tried, chosen, tried
 from aolink.identification.models import PARAMETERS, PLANTS, UNITS, IdentifiedPlant, Process, ProcessSum, kinds_of
-from aolink.identification.pixels import Candidate, by_pixels, candidates, refined, scanned
+from aolink.identification.pixels import Candidate, Scan, by_pixels, candidates, refined, scanned
 from aolink.identification.readings import FEWEST, Readings, readings
 from aolink.identification.rig_model import RigModel, rig_model
 from aolink.identification.rig_text import identified_text
@@ -11,7 +11,7 @@ from aolink.identification.sets import Identified, Piece, identified
 
 __all__ = [
     "CANDIDATES", "FEWEST", "PARAMETERS", "PLANTS", "UNITS", "Candidate", "Identified", "IdentifiedPlant", "Maximum",
-    "Piece", "Process", "ProcessSum", "Readings", "RigModel", "Space", "Tried", "by_pixels", "candidates", "chosen",
+    "Piece", "Process", "ProcessSum", "Readings", "RigModel", "Scan", "Space", "Tried", "by_pixels", "candidates", "chosen",
     "identified", "identified_text", "kinds_of", "maxima", "readings", "refined", "rig_model", "scanned", "space_of",
     "tried",
 ]  # fmt: skip
