@@ -11,7 +11,7 @@ from aolink.identification.sets import Identified, Piece, identified
 
 __all__ = [
     "CANDIDATES", "FEWEST", "PARAMETERS", "PLANTS", "UNITS", "Candidate", "Identified", "IdentifiedPlant", "Maximum",
-    "Piece", "Process", "ProcessSum", "Readings", "RigModel", "Scan", "Space", "Tried", "by_pixels", "candidates", "chosen",
-    "identified", "identified_text", "kinds_of", "maxima", "readings", "refined", "rig_model", "scanned", "space_of",
-    "tried",
+    "Piece", "Process", "ProcessSum", "Readings", "RigModel", "Scan", "Space", "Tried", "by_pixels", "candidates",
+    "chosen", "identified", "identified_text", "kinds_of", "maxima", "readings", "refined", "rig_model", "scanned",
+    "space_of", "tried",
 ]  # fmt: skip
