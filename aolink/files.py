@@ -49,8 +49,8 @@ _KINDS = {
 
 
 def check_target(
-    target: Path, *, overwrite: bool = False, sources: Iterable[Path] = (), suffix: str = "", error: type[AolinkError] =
-    AolinkError,
+    target: Path, *, overwrite: bool = False, sources: Iterable[Path] = (), suffix: str = "",
+    error: type[AolinkError] = AolinkError,
 ) -> None:  # fmt: skip
     """Refuse a target that must not be written or cannot be, before any work is done for it.
 
@@ -87,8 +87,8 @@ def check_target(
 
 @contextmanager
 def writing(
-    target: Path, *, overwrite: bool = False, sources: Iterable[Path] = (), suffix: str = "", error: type[AolinkError] =
-    AolinkError,
+    target: Path, *, overwrite: bool = False, sources: Iterable[Path] = (), suffix: str = "",
+    error: type[AolinkError] = AolinkError,
 ) -> Iterator[Path]:  # fmt: skip
     """A new, empty file beside ``target``, to be written in the block; parameters as for `check_target`.
 

@@ -118,7 +118,7 @@ def calibrate(
 
 
 def _write_calibrated(
-    loaded: "Rig", rig: str, paths: Sequence[Path], output: Path, *, overwrite: bool, as_json: bool
+    loaded: "Rig", rig: str, paths: Sequence[Path], output: Path, *, overwrite: bool, as_json: bool,
 ) -> None:  # fmt: skip
     from aolink.cli.tables import rigs as tables
     from aolink.jobs.calibrate import calibrate_recordings, rig_text
@@ -135,7 +135,7 @@ def _write_calibrated(
 
 
 def _write_interaction(
-    loaded: "Rig", paths: Sequence[Path], output: Path, *, hold_s: float, overwrite: bool, as_json: bool
+    loaded: "Rig", paths: Sequence[Path], output: Path, *, hold_s: float, overwrite: bool, as_json: bool,
 ) -> None:  # fmt: skip
     import numpy as np
 

@@ -95,7 +95,7 @@ def load_checked(path_or_name: str) -> "Rig":
 
 
 def with_key(
-    rig: "Rig", camera: str | None, mirror: str | None, key: Path | None
+    rig: "Rig", camera: str | None, mirror: str | None, key: Path | None,
 ) -> "tuple[Rig, str | None, str | None]":  # fmt: skip
     """The rig and the ports of a session whose packets --key signs: the ports are in the rig's table then."""
     if key is None:

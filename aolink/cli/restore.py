@@ -90,7 +90,7 @@ def deblur(
 
 
 def _deblur_recording(
-    file: Path, out: Path, estimator: str, method: str, *, overwrite: bool, as_json: bool
+    file: Path, out: Path, estimator: str, method: str, *, overwrite: bool, as_json: bool,
 ) -> None:  # fmt: skip
     from aolink.cli.tables import sessions as tables
     from aolink.recording.deblur import write_deblurred

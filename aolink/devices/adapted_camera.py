@@ -48,8 +48,8 @@ class AdaptedCamera(Adapted):
     chunks_refused = 0
 
     def __init__(
-        self, rig: Rig, driver: SimpleCamera, mirror: Mirror, delay: Delay, now_ns: Callable[[], int], monotonic_ns:
-        Callable[[], int] = time.monotonic_ns,
+        self, rig: Rig, driver: SimpleCamera, mirror: Mirror, delay: Delay, now_ns: Callable[[], int],
+        monotonic_ns: Callable[[], int] = time.monotonic_ns,
     ) -> None:  # fmt: skip
         super().__init__("camera", driver, delay, now_ns)
         if rig.scene is not None:

@@ -104,7 +104,7 @@ def identify(recordings: Sequence[Recording], rig: Rig | None, wanted: Wanted, t
 
 
 def from_readings(
-    rig: Rig, seen: Sequence[Readings], exposures: Sequence[Exposure], wanted: Wanted, tell: Tell | None = None
+    rig: Rig, seen: Sequence[Readings], exposures: Sequence[Exposure], wanted: Wanted, tell: Tell | None = None,
 ) -> Result:  # fmt: skip
     """Identify models as `identify` does, from the readings of each recording, and the exposures of one."""
     found = [_of_output(rig, label, each, exposures, wanted, tell) for label, each in _by_output(rig, seen)]
@@ -141,7 +141,7 @@ def outputs_of(seen: Readings, which: Sequence[int]) -> list[int]:
 
 
 def _of_output(
-    rig: Rig, output: str, seen: Sequence[Readings], exposures: Sequence[Exposure], wanted: Wanted, tell: Tell | None
+    rig: Rig, output: str, seen: Sequence[Readings], exposures: Sequence[Exposure], wanted: Wanted, tell: Tell | None,
 ) -> IdentifiedModel:  # fmt: skip
     def space(kinds: Sequence[str]) -> Space:
         return identification.space_of(

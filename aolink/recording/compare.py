@@ -79,8 +79,8 @@ class TopicComparison:
 
 
 def compare(
-    first: Recording, second: Recording, *, relative: float = RELATIVE, absolute: float = ABSOLUTE, only: Sequence[str]
-    = (), relative_to_start: bool = False, progress: Progress = no_progress,
+    first: Recording, second: Recording, *, relative: float = RELATIVE, absolute: float = ABSOLUTE,
+    only: Sequence[str] = (), relative_to_start: bool = False, progress: Progress = no_progress,
 ) -> dict[str, TopicComparison]:  # fmt: skip
     """Compare two recordings by topic.
 

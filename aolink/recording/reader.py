@@ -67,8 +67,8 @@ class Recording(RecordedMessages, NumberedSeries):
     """
 
     def __init__(
-        self, path: str | Path | Url, *, rig: Rig | None = None, check: bool = False, side: Sequence[str | Path | Url] =
-        (),
+        self, path: str | Path | Url, *, rig: Rig | None = None, check: bool = False,
+        side: Sequence[str | Path | Url] = (),
     ) -> None:  # fmt: skip
         super().__init__(path, check=check)
         rig_text = self.rig_text

@@ -104,8 +104,8 @@ class RecordingWriter:
 
     def __init__(
         self, path: str | Path, rig: Rig, metadata: dict[str, str], start_ns: int, *, overwrite: bool = False,
-        deterministic: bool = False, attachments: Mapping[str, bytes] | None = None, options: WriteOptions | None =
-        None,
+        deterministic: bool = False, attachments: Mapping[str, bytes] | None = None,
+        options: WriteOptions | None = None,
     ) -> None:  # fmt: skip
         self.path = Path(path)
         self.paths: list[Path] = []

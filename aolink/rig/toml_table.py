@@ -140,8 +140,8 @@ class Table:
         return value
 
     def number(
-        self, name: str, default: float | None = None, *, low: float = -math.inf, above: float = -math.inf, high: float
-        = math.inf,
+        self, name: str, default: float | None = None, *, low: float = -math.inf, above: float = -math.inf,
+        high: float = math.inf,
     ) -> float:  # fmt: skip
         value = self.get(name, default)
         is_number = isinstance(value, int | float) and not isinstance(value, bool)

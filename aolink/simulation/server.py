@@ -177,8 +177,8 @@ class RigServer:
     """Runs the simulated devices behind two serial lines until it is stopped."""
 
     def __init__(
-        self, rig: Rig, streams: dict[LineName, Stream], *, seed: int | None = None, real_time: bool = False, clock_ns:
-        Callable[[], int] = time.monotonic_ns,
+        self, rig: Rig, streams: dict[LineName, Stream], *, seed: int | None = None, real_time: bool = False,
+        clock_ns: Callable[[], int] = time.monotonic_ns,
     ) -> None:  # fmt: skip
         simulation = rig.simulation
         if simulation.faults.vanish_rate and not real_time:

@@ -297,7 +297,7 @@ def _texts(contents: Contents) -> rrb.Container:
 
 
 def _lines(
-    contents: Contents, name: str, shown: list[str], *, window: bool = False, legend: bool = False
+    contents: Contents, name: str, shown: list[str], *, window: bool = False, legend: bool = False,
 ) -> rrb.TimeSeriesView:  # fmt: skip
     """A plot over time: of the whole session, or of `PATH_WINDOW` exposures about the time cursor.
 

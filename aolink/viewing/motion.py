@@ -111,7 +111,7 @@ def log_errors(
 
 
 def log_residual(
-    drawing: Drawing, timebase: Timebase, name: str, exposures: Iterable[Exposure], colour: Colour
+    drawing: Drawing, timebase: Timebase, name: str, exposures: Iterable[Exposure], colour: Colour,
 ) -> None:  # fmt: skip
     """The slopes left by a loop in each exposure, true root mean square over its fast steps and all outputs, slope
     units: ``/residual/NAME``.
@@ -193,7 +193,7 @@ def _send_path(
 
 
 def _line(
-    every: FloatArray, half: FloatArray, outputs: list[int], points: int
+    every: FloatArray, half: FloatArray, outputs: list[int], points: int,
 ) -> tuple[NDArray[np.int64], FloatArray, FloatArray]:  # fmt: skip
     """Some steps of a path, evenly spread: their numbers, the values, and the lines above and below them for each
     output."""
@@ -204,7 +204,7 @@ def _line(
 
 
 def _range(
-    every: FloatArray, half: FloatArray, outputs: list[int], points: int
+    every: FloatArray, half: FloatArray, outputs: list[int], points: int,
 ) -> tuple[NDArray[np.int64], FloatArray, FloatArray]:  # fmt: skip
     """The range of a path in each part of it: the parts' middles, the outputs' extremes, and those of the band."""
     parts = max(1, points // 2)

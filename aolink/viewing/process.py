@@ -67,7 +67,7 @@ def open_viewer(rrd_path: str | Path) -> None:
 
 
 def serve_web(
-    rrd_path: str | Path, port: int | None = None, *, on_ready: Callable[[str], None] | None = None
+    rrd_path: str | Path, port: int | None = None, *, on_ready: Callable[[str], None] | None = None,
 ) -> None:  # fmt: skip
     """Serve a file with the web viewer on this machine's loopback until interrupted.
 

@@ -80,7 +80,7 @@ def save_rrd(
 
 
 def sent_parts(
-    stream: rr.RecordingStream, recording: Recording, look: Look, *, at_once: bool = False
+    stream: rr.RecordingStream, recording: Recording, look: Look, *, at_once: bool = False,
 ) -> Iterator[int]:  # fmt: skip
     """Send a recording to a stream part by part, and its layout at the end; gives how many exposures have been sent.
 

@@ -84,7 +84,7 @@ def test_a_session_with_devices_of_another_package(aolink: Run, installed: dict[
 
 @pytest.mark.long
 def test_a_camera_of_another_package_beside_a_native_mirror(
-    aolink: Run, installed: dict[str, str], tmp_path: Path
+    aolink: Run, installed: dict[str, str], tmp_path: Path,
 ) -> None:  # fmt: skip
     """In real time the mirror's clock and count of fast steps are known; on virtual time no other camera follows."""
     rig = rig_file(tmp_path, mirror="")
@@ -256,7 +256,7 @@ def test_the_drivers_that_there_are_are_listed(aolink: Run, installed: dict[str,
 
 
 def test_the_drivers_of_a_rig_file_are_checked_before_anything_is_opened(
-    aolink: Run, installed: dict[str, str], tmp_path: Path
+    aolink: Run, installed: dict[str, str], tmp_path: Path,
 ) -> None:  # fmt: skip
     rig = rig_file(tmp_path, 'driver = "exmaple"', 'driver = "optotune"\nunit_rd = 3')
     checked = aolink("rig", rig, "--check", "--json", env=installed)

@@ -160,7 +160,7 @@ def test_what_a_driver_raises_refuses_the_command_in_words() -> None:
     st.integers(0, 60),
 )
 def test_each_commanded_step_ends_once(
-    blocks: list[tuple[int, int, bool]], gaps: list[int], parked: int
+    blocks: list[tuple[int, int, bool]], gaps: list[int], parked: int,
 ) -> None:  # fmt: skip
     """Late and refused commands, gaps between reports, parking in the middle."""
     mirror = mirror_of(bench := Bench())

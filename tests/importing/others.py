@@ -55,7 +55,7 @@ def encoded(picture: NDArray[Any], kind: str) -> bytes:
 
 
 def foxglove_raw(
-    picture: NDArray[Any], encoding: str, time_ns: int = 0, padding: int = 0
+    picture: NDArray[Any], encoding: str, time_ns: int = 0, padding: int = 0,
 ) -> RawImage:  # fmt: skip
     """A picture as foxglove.RawImage, whose rows end with ``padding`` bytes that are no pixels."""
     rows = picture.reshape(len(picture), -1)
@@ -148,7 +148,7 @@ def write_ros1_mcap(path: Path, messages: Sequence[Any], topic: str = "/camera")
 
 
 def _plain_mcap(
-    path: Path, name: str, schema_encoding: str, definition: str, encoding: str, messages: Sequence[Any], topic: str
+    path: Path, name: str, schema_encoding: str, definition: str, encoding: str, messages: Sequence[Any], topic: str,
 ) -> Path:  # fmt: skip
     with path.open("wb") as file:
         writer = McapWriter(file)

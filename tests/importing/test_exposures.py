@@ -27,7 +27,7 @@ PLAIN = FilmSettings()
 
 
 def made(
-    tmp_path: Path, frames: NDArray[Any], rig: Rig | None = None, settings: FilmSettings = PLAIN, **known: Any
+    tmp_path: Path, frames: NDArray[Any], rig: Rig | None = None, settings: FilmSettings = PLAIN, **known: Any,
 ) -> tuple[Recording, FilmAccount]:  # fmt: skip
     """The recording of a film in memory, and the account of how it was read."""
     rig = rig or small_rig()

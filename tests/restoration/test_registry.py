@@ -33,7 +33,7 @@ def with_packages(with_example: dict[str, str], tmp_path_factory: pytest.TempPat
 
 
 def test_a_method_of_another_package_restores_a_picture(
-    aolink: Run, with_packages: dict[str, str], tmp_path: Path
+    aolink: Run, with_packages: dict[str, str], tmp_path: Path,
 ) -> None:  # fmt: skip
     image, scene = blurred(0.1 + blocks(40, 66, seed=2), UNIFORM, (3,))
     np.save(tmp_path / "in.npy", image)
@@ -48,7 +48,7 @@ def test_a_method_of_another_package_restores_a_picture(
 
 
 def test_the_help_names_the_methods_of_other_packages_and_what_is_wrong_with_one(
-    aolink: Run, with_packages: dict[str, str]
+    aolink: Run, with_packages: dict[str, str],
 ) -> None:  # fmt: skip
     help_page = aolink("deblur", "--help", env=with_packages)
     assert help_page.returncode == 0
@@ -60,7 +60,7 @@ def test_the_help_names_the_methods_of_other_packages_and_what_is_wrong_with_one
 
 
 def test_a_method_that_cannot_be_loaded_is_one_line(
-    aolink: Run, with_packages: dict[str, str], tmp_path: Path
+    aolink: Run, with_packages: dict[str, str], tmp_path: Path,
 ) -> None:  # fmt: skip
     np.save(tmp_path / "in.npy", np.ones((9, 9)))
     (tmp_path / "psf.csv").write_text("1,1\n")

@@ -161,7 +161,7 @@ def test_the_demo_works(aolink: Callable[..., subprocess.CompletedProcess[str]],
 
 
 def test_calibrating_it_is_refused(
-    aolink: Callable[..., subprocess.CompletedProcess[str]], tmp_path: Path
+    aolink: Callable[..., subprocess.CompletedProcess[str]], tmp_path: Path,
 ) -> None:  # fmt: skip
     with simulated_rig("single-lenslet") as (camera, mirror):
         dark = aolink(

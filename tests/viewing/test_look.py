@@ -93,7 +93,7 @@ def test_two_estimates_and_two_recordings_are_drawn_in_the_same_plots(tmp_path: 
     ],
 )
 def test_what_is_not_there_is_one_clear_error(
-    aolink: Aolink, tmp_path: Path, options: tuple[str, ...], why: str
+    aolink: Aolink, tmp_path: Path, options: tuple[str, ...], why: str,
 ) -> None:  # fmt: skip
     done = aolink("view", LIVELY, *options, "--save", "x.rrd")
     assert done.returncode in (2, 7)

@@ -29,7 +29,7 @@ def random_walk(rng: np.random.Generator, frames: int, spots: int, step: float, 
 
 
 def ornstein_uhlenbeck(
-    rng: np.random.Generator, frames: int, spots: int, step: float, forgets: float, fine: int = 8
+    rng: np.random.Generator, frames: int, spots: int, step: float, forgets: float, fine: int = 8,
 ) -> FloatArray:  # fmt: skip
     """Places that return to zero: their covariance decays to 1/e in ``forgets`` frames; as `random_walk` otherwise."""
     a = np.exp(-1 / (forgets * fine))

@@ -266,7 +266,7 @@ class ThorlabsAligner:
     lacks: ClassVar[tuple[Lacks, ...]] = (Lacks.WATCHDOG,)
 
     def __init__(
-        self, rig: Rig, *, port: str, unit: float | list[float] = 1.0, zero: float | list[float] = 0.0
+        self, rig: Rig, *, port: str, unit: float | list[float] = 1.0, zero: float | list[float] = 0.0,
     ) -> None:  # fmt: skip
         if rig.n_inputs != 2:
             raise DeviceError(f"the Thorlabs aligner has 2 outputs, x and y; the rig file has {rig.n_inputs} input(s)")
