@@ -8,8 +8,8 @@ prior and widen the kernel by their variance. If the pixels could resolve them, 
 instead. Start states are kept whole.
 
 Pixels see the mean of a path best. Noise that is left out and moves it is taken for another start state, and the end
-state, which it moves too, seems less certain than it is. So where the first singular vectors leave too much of that
-out for a spot on a plane, the directions that move the mean of the path come before them.
+state, which it moves too, seems less certain than it is. So the direction in which the rest moves the mean is kept as
+well, where there are fewer than twelve coefficients.
 
 A direction that moves the path far may hardly change the frame, as a vibration with many swings in an exposure does,
 and one that moves it less may change the frame much. So where twelve coefficients leave much of the noise visible, the
@@ -51,9 +51,8 @@ _LEFT_OUT = 0.1
 # are no more coefficients than this, since the cost of an estimate grows with the square of their number.
 _SEEN = 2.0
 _MOST_SEEN = 12
-# Standard deviation of the mean of the noise path that may be left out, in standard deviations of that position. These
-# directions are sought for a spot on a plane. A plant that moves many spots has as many of them; on a line NEES holds
-# without them, and a mixture that is sure of a wrong mode is longer in finding the right one with them.
+# Standard deviation of the mean of the noise path that may be left out, in standard deviations of that position, where
+# there are fewer coefficients than that. A plant that moves many spots has as many such directions: they are not sought.
 _MEAN_LEFT_OUT = 0.25
 _ONE_SPOT = 2
 # Variance that the noise left out may add to the pixels together, in variances of a pixel's noise, where there are as
@@ -133,22 +132,17 @@ def _kept(model: ExposureModel, sensor: BaseSensor, coarse: float, resting_sd: f
         return np.zeros((0, 0)), 0.0
     paths, means = noise.reshape(-1, size) / math.sqrt(model.n_steps), noise.mean(axis=1)
 
-    def after(first: FloatArray) -> tuple[FloatArray, float]:
-        _, values, vectors = np.linalg.svd(
-            paths - paths @ first @ first.T if first.size else paths, full_matrices=False
-        )
-        # Each output by itself: a remainder that is spread over many of them is as small on each.
-        rest = np.append(np.cumsum(values[::-1] ** 2)[::-1], 0.0) / outputs
-        most = _MOST_SEEN - model.plant.n_states - first.shape[1]
-        count = int(np.argmax(rest <= coarse**2))
-        count = max(count, min(int(np.argmax(rest <= (_SEEN * resting_sd) ** 2)), most))
-        return np.concatenate([first, vectors[:count].T], axis=1), float(rest[count])
-
-    V, rest = after(np.zeros((size, 0)))
-    least = _MEAN_LEFT_OUT * resting_sd
-    if outputs == _ONE_SPOT and np.linalg.norm(means - means @ V @ V.T, 2) > least:
-        _, values, vectors = np.linalg.svd(means, full_matrices=False)
-        V, rest = after(vectors[values > least].T)
+    _, values, vectors = np.linalg.svd(paths, full_matrices=False)
+    # Each output by itself: a remainder that is spread over many of them is as small on each.
+    left = np.append(np.cumsum(values[::-1] ** 2)[::-1], 0.0) / outputs
+    most = _MOST_SEEN - model.plant.n_states
+    count = int(np.argmax(left <= coarse**2))
+    count = max(count, min(int(np.argmax(left <= (_SEEN * resting_sd) ** 2)), most))
+    V, rest = vectors[:count].T, float(left[count])
+    if outputs <= _ONE_SPOT and count < most:
+        _, values, vectors = np.linalg.svd(means - means @ V @ V.T, full_matrices=False)
+        V = np.concatenate([V, vectors[values > _MEAN_LEFT_OUT * resting_sd][: most - count].T], axis=1)
+        rest = float(np.sum((paths - paths @ V @ V.T) ** 2)) / outputs
     if outputs <= _ONE_SPOT and rest > (_SEEN * resting_sd) ** 2:
         S = _visibility(model, sensor, noise)
         if np.trace(S) - np.trace(V.T @ S @ V) > _MOST_VISIBLE:
@@ -156,7 +150,7 @@ def _kept(model: ExposureModel, sensor: BaseSensor, coarse: float, resting_sd: f
             vectors = vectors[:, ::-1]
             visible = np.append(np.cumsum(values)[::-1], 0.0)
             left = np.append(np.cumsum(((paths @ vectors) ** 2).sum(axis=0)[::-1])[::-1], 0.0) / outputs
-            count = min(int(np.argmax(visible <= _HARDLY_VISIBLE)), _MOST_SEEN - model.plant.n_states)
+            count = min(int(np.argmax(visible <= _HARDLY_VISIBLE)), most)
             count = max(count, int(np.argmax(left <= coarse**2)))
             V, rest = vectors[:, :count], float(left[count])
     return V, rest
