@@ -194,9 +194,28 @@ def slow_and_fast():
     return dataclasses.replace(PLANE, plant=plant, sensor=sensor, timing=timing)
 
 
-def test_noise_that_moves_the_mean_of_a_path_visibly_is_kept():
+def slow_on_a_line():
+    """A spot that swings slowly, with little noise inside an exposure."""
+    kernel, steps, swings, damping = np.sqrt(LINE.sensor.kernel.variance), 100, 0.31, 0.007
+    rate = 2 * np.pi * swings / steps
+    A = linalg.expm(np.array([[0, rate], [-rate, -2 * damping * rate]]))
+    P = linalg.solve_discrete_lyapunov(A, np.diag([0.0, 1.0]))
+    gain = 0.8 * kernel / np.sqrt(P[0, 0])
+    plant = dataclasses.replace(
+        LINE.plant, A=A, B=np.zeros((2, LINE.plant.n_inputs)), B_w=gain * np.array([[0.0], [1.0]]), C=np.eye(2)[:1],
+        process_noise=np.eye(1), initial_mean=np.zeros(2), initial_covariance=gain**2 * P,
+    )  # fmt: skip
+    line = LINE.sensor.profile
+    peak = line.pixel_size / (np.sqrt(2 * np.pi) * kernel)
+    sensor = dataclasses.replace(LINE.sensor, noise_density=(peak / 30) ** 2 / line.pixel_size)
+    timing = dataclasses.replace(LINE.timing, exposure_steps=steps, frame_period_steps=steps)
+    return dataclasses.replace(LINE, plant=plant, sensor=sensor, timing=timing)
+
+
+@pytest.mark.parametrize("make", [slow_and_fast, slow_on_a_line])
+def test_noise_that_moves_the_mean_of_a_path_visibly_is_kept(make):
     """Position's information is that of all pixels, by finite differences along one axis."""
-    rig = slow_and_fast()
+    rig = make()
     model = exposure_model(rig.plant, 100)
     reduced = likelihood.reduction(model, rig.sensor)
     mean = model.basis.mean(axis=1)
@@ -223,6 +242,17 @@ def test_both_ends_of_an_exposure_are_as_sure_as_they_are_right_where_a_slow_pro
                 found.append(away @ np.linalg.solve(P[0], away) / 4)
     assert 0.85 < np.mean(start) < 1.15
     assert 0.85 < np.mean(end) < 1.15
+
+
+@pytest.mark.parametrize("name", ["profile", "mixture"])
+def test_the_end_of_an_exposure_is_as_sure_as_it_is_right_on_a_line(name):
+    rig, nees = slow_on_a_line(), list[float]()
+    for seed in range(40):
+        exposures = simulate(rig, 20, seed=seed)
+        for exposure, estimate in list(zip(exposures, run(rig, exposures, [name])[name], strict=True))[4:]:
+            away = (estimate.end_state - truth_of(exposure).end_state)[0]
+            nees.append(away @ np.linalg.solve(estimate.end_covariance[0], away) / 2)
+    assert 0.9 < np.mean(nees) < 1.1
 
 
 def fast_and_bright():
