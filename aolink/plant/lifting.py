@@ -28,7 +28,7 @@ def output_rows(plant: Plant, n_steps: int) -> FloatArray:
     return np.ascontiguousarray(rows[:n_steps].transpose(1, 0, 2))
 
 
-@lru_cache(maxsize=64)
+@lru_cache(maxsize=256)
 def lift(plant: Plant, n_steps: int) -> tuple[FloatArray, FloatArray]:
     """The plant over ``n_steps`` fast steps: A^N and Q_N = sum_i A^i B_w W B_w' A^i', both (n_states, n_states).
 

@@ -15,13 +15,16 @@ from aolink.rig import Plant
 
 def exposure_model(plant: Plant, n_steps: int, offset: float = 0.0) -> ExposureModel:
     """The model of exposures of ``n_steps`` fast steps that start ``offset`` of a step into their first, made once."""
-    return _made_once(plant, n_steps, float(offset))
+    return _starting(plant, n_steps, float(offset)) if offset else _on_a_step(plant, n_steps)
 
 
 @lru_cache(maxsize=64)
-def _made_once(plant: Plant, n_steps: int, offset: float) -> ExposureModel:
-    if offset:
-        return exposure_model(plant, n_steps).starting(offset)
+def _starting(plant: Plant, n_steps: int, offset: float) -> ExposureModel:
+    return _on_a_step(plant, n_steps).starting(offset)
+
+
+@lru_cache(maxsize=256)  # more than the estimators that a scan of frequencies runs side by side
+def _on_a_step(plant: Plant, n_steps: int) -> ExposureModel:
     systems = alike_systems(plant)
     return DenseModel(plant, n_steps) if systems is None else FactoredModel(plant, n_steps, systems)
 

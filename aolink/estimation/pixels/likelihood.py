@@ -64,6 +64,8 @@ _PATHS, _FEW_PATHS = 64, 16
 # The table of a pixel's light over the spot's position: points in one standard deviation of the kernel, and its end.
 _POINTS = 16
 _REACH = 5.0
+# Reductions and tables that are kept: more than the estimators that a scan of frequencies runs side by side.
+_SIDE_BY_SIDE = 256
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,7 +98,7 @@ class Reduction:
         return t.mapped(self.expand, self.left_out)
 
 
-@lru_cache(maxsize=64)
+@lru_cache(maxsize=_SIDE_BY_SIDE)
 def reduction(model: ExposureModel, sensor: BaseSensor, *, left_out: float = _LEFT_OUT) -> Reduction:
     """The reduction for a sensor, made once.
 
@@ -347,7 +349,7 @@ class PixelView:
         return self.read_noise + self.gain * np.maximum(f, 0.0)
 
 
-@lru_cache(maxsize=64)
+@lru_cache(maxsize=_SIDE_BY_SIDE)
 def _light_table(variance: float, pixel: float, order: int = 0) -> FloatArray:
     """Taylor coefficients of the densities of pixels about a spot, for points in its own pixel, (points, 4, pixels).
 
