@@ -116,7 +116,7 @@ def candidates(space: Space, found: Sequence[Maximum], seen: Sequence[Readings])
 
 
 def scanned(
-    space: Space, highest: Maximum, seen: Sequence[Readings], rig_of: RigOf, exposures: Sequence[Exposure],
+    space: Space, found: Sequence[Maximum], seen: Sequence[Readings], rig_of: RigOf, exposures: Sequence[Exposure],
     tell: Tell = lambda done, of: None,
 ) -> Scan:  # fmt: skip
     """Candidates for each vibration of a sum at the frequencies that the pixels prefer, wherever the maxima are.
@@ -126,24 +126,24 @@ def scanned(
     twice as long, up to an eighth of the recording, at half the distance, beside the frequencies that are left.
 
     There is no candidate for a vibration that is alone, which `maxima` finds, and where `profile` cannot work on the
-    rig. The parameters are those of `candidates`, and ``highest`` is the maximum from which the others are climbed to.
+    rig. The parameters are those of `candidates`; the highest maximum of ``found`` comes first.
     """
     out = Scan([], {})
     if len(space.kinds) < 2 or not exposures:
         return out
     try:
-        make_estimator(rig_of(highest.x), _QUICK)
+        make_estimator(rig_of(found[0].x), _QUICK)
     except EstimatorError:
         return out
     for k in _frequencies(space):
-        found, out.left[k] = _scan(space, k, highest.x, seen, rig_of, exposures, tell)
-        out.candidates.extend(found)
+        best, out.left[k] = _scan(space, k, found, seen, rig_of, exposures, tell)
+        out.candidates.extend(best)
     return out
 
 
 def _scan(
-    space: Space, k: int, start: FloatArray, seen: Sequence[Readings], rig_of: RigOf, exposures: Sequence[Exposure],
-    tell: Tell,
+    space: Space, k: int, maxima: Sequence[Maximum], seen: Sequence[Readings], rig_of: RigOf,
+    exposures: Sequence[Exposure], tell: Tell,
 ) -> tuple[list[Candidate], list[tuple[float, float]]]:  # fmt: skip
     """The candidates of the vibration whose frequency is parameter k, and the frequencies that are left."""
     of = [Likelihood(each, SHORT_RUN) for each in seen]
@@ -162,11 +162,16 @@ def _scan(
         else:
             first, last = np.round(np.array([_LEAST_CYCLES / exposure_s, math.exp(high[k])]) / spacing)
             at = np.arange(first, last + 1)
-        found = []
+        found: list[Candidate] = []
         for hz in at * spacing:
-            x = min((each.x for each in peaks), key=lambda x: abs(math.exp(x[k]) - hz), default=start).copy()
-            x[k], x[k + 1] = math.log(hz), -math.log(2 * math.pi * hz * lasting)
-            top = climb(space, np.clip(x, low, high), of, _NEAR_ENOUGH, fixed=(k, k + 1))
+            nearest = min(peaks or maxima, key=lambda each: abs(math.exp(each.x[k]) - hz))
+            # The highest maximum may be another one, in which the vibration takes the place of the other process.
+            starts = [nearest] if peaks else [maxima[0], nearest, *found[-1:]]
+            tops = []
+            for x in (each.x.copy() for each in starts):
+                x[k], x[k + 1] = math.log(hz), -math.log(2 * math.pi * hz * lasting)
+                tops.append(climb(space, np.clip(x, low, high), of, _NEAR_ENOUGH, fixed=(k, k + 1)))
+            top = max(tops, key=lambda each: each.log_likelihood)
             found.append(Candidate(top.x, top))
         left = by_pixels(found, rig_of, exposures, partial(_tell_of_round, tell, number, rounds))
         if not number:

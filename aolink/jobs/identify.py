@@ -173,7 +173,7 @@ def _of_output(
             if tell:
                 tell(f"pixels, {output}", done, of)
 
-        scan = identification.scanned(of, tops[0], seen, rig_of, exposures, on_pixels)
+        scan = identification.scanned(of, tops, seen, rig_of, exposures, on_pixels)
         left = identification.by_pixels(
             [*identification.candidates(of, everything, seen), *scan.candidates], rig_of, exposures, on_pixels
         )

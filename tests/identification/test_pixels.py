@@ -88,7 +88,7 @@ def test_a_scan_finds_a_vibration_far_from_every_maximum():
     exposures = frames(2.4, 64)
     of, seen = space(exposures)
     highest, told = candidate(1.13, 0.0, 1e-4).maximum, []
-    scan = scanned(of, highest, seen, shaken, exposures, lambda *done: told.append(done))
+    scan = scanned(of, [highest], seen, shaken, exposures, lambda *done: told.append(done))
     found, left = scan.candidates, np.array(scan.left[2]) * EXPOSURE_S
     assert any(low < 2.4 < high for low, high in left)
     assert np.diff(left[left[:, 0] > 0.2]).sum() < 0.3  # of the 3.75 cycles an exposure that are scanned
@@ -117,11 +117,11 @@ def test_nothing_is_scanned_where_one_vibration_is_alone_or_there_are_no_pixels(
 
     exposures, highest = frames(2.4, 32), candidate(2.6, 0.0).maximum
     of, seen = space(exposures)
-    assert nothing(scanned(of, highest, seen, unasked, []))
-    assert nothing(scanned(of, highest, seen, refused, exposures))
+    assert nothing(scanned(of, [highest], seen, unasked, []))
+    assert nothing(scanned(of, [highest], seen, refused, exposures))
     variance = load_rig("loop").sensor.kernel.variance
     alone = space_of(("resonance",), seen, variance, with_noise=False, with_kernel=False)
-    assert nothing(scanned(alone, Maximum(highest.x[2:], 0.0, 12), seen, unasked, exposures))
+    assert nothing(scanned(alone, [Maximum(highest.x[2:], 0.0, 12)], seen, unasked, exposures))
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,27 @@
+"""The job of `aolink identify`, from exposures to a model and its sets."""
+
+import numpy as np
+import pytest
+
+import aolink
+from aolink.identification import Process, ProcessSum, identified_text, readings
+from aolink.jobs.identify import Wanted, from_readings
+from aolink.rig import load_rig, parse_rig
+
+RIG = load_rig("loop")
+DRIFT_SD, HZ = 0.16, 48.0  # 2.4 cycles an exposure
+
+
+@pytest.mark.long
+def test_the_set_of_a_vibration_beside_a_drift_is_without_the_frequencies_that_the_pixels_rule_out():
+    """The drift moves the centroid so much more that centroid and width alone leave all frequencies."""
+    drift = Process("ornstein-uhlenbeck", (0.5, 2 * DRIFT_SD**2 / 0.5))
+    vibration = Process("resonance", (HZ, 0.002, 0.08))
+    rig = parse_rig(identified_text(RIG.toml, RIG, [ProcessSum((drift, vibration))]))
+    exposures = list(aolink.simulate(rig, 32, seed=3))
+    wanted = Wanted(models=("ornstein-uhlenbeck+resonance",), highest_hz=60.0)
+    (found,) = from_readings(RIG, [readings(RIG, exposures)], exposures, wanted).found
+    frequency = next(each for each in found.parameters if each.name.endswith("frequency_hz"))
+    assert frequency.best == pytest.approx(HZ, rel=0.01)
+    assert frequency.holds(HZ)
+    assert not any(frequency.holds(hz) for hz in np.arange(6.0, 18.0))
