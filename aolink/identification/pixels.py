@@ -157,18 +157,18 @@ def _scan(
         lasting = min(_LASTING * 2**number, longest) * period_s
         spacing = _SPACING / lasting
         if peaks:
-            near = np.array([math.exp(each.x[k]) for each in peaks])
-            at = np.unique(np.round(near / spacing)[:, None] + [-1, 0, 1])
+            best_hz = np.array([math.exp(each.x[k]) for each in peaks])
+            at = np.unique(np.round(best_hz / spacing)[:, None] + [-1, 0, 1])
         else:
             first, last = np.round(np.array([_LEAST_CYCLES / exposure_s, math.exp(high[k])]) / spacing)
             at = np.arange(first, last + 1)
         found: list[Candidate] = []
         for hz in at * spacing:
-            nearest = min(peaks or maxima, key=lambda each: abs(math.exp(each.x[k]) - hz))
-            # The highest maximum may be another one, in which the vibration takes the place of the other process.
-            starts = [nearest] if peaks else [maxima[0], nearest, *found[-1:]]
+            near = min((each.x for each in peaks or maxima), key=lambda x: abs(math.exp(x[k]) - hz))
+            # The vibration of the highest maximum may have taken the place of the other process.
+            starts = [near] if peaks else [maxima[0].x, near, *(each.x for each in found[-1:])]
             tops = []
-            for x in (each.x.copy() for each in starts):
+            for x in map(np.copy, starts):
                 x[k], x[k + 1] = math.log(hz), -math.log(2 * math.pi * hz * lasting)
                 tops.append(climb(space, np.clip(x, low, high), of, _NEAR_ENOUGH, fixed=(k, k + 1)))
             top = max(tops, key=lambda each: each.log_likelihood)

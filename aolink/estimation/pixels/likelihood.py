@@ -52,7 +52,7 @@ _LEFT_OUT = 0.1
 _SEEN = 2.0
 _MOST_SEEN = 12
 # Standard deviation of the mean of the noise path that may be left out, in standard deviations of that position, where
-# there are fewer coefficients than that. A plant that moves many spots has as many such directions: they are not sought.
+# there are fewer coefficients than that. A plant that moves many spots has many such directions: they are not sought.
 _MEAN_LEFT_OUT = 0.25
 _ONE_SPOT = 2
 # Variance that the noise left out may add to the pixels together, in variances of a pixel's noise, where there are as
