@@ -264,7 +264,7 @@ def _identified(cell: Cell, rig: Rig, exposures: list[Exposure]) -> ProcessSum:
     tops = maxima(space, seen)
     found = [
         *candidates(space, tops, seen),
-        *identification.scanned(space, tops[0], seen, rig_of, exposures).candidates,
+        *identification.scanned(space, tops, seen, rig_of, exposures).candidates,
     ]
     left = by_pixels(found, rig_of, exposures)
     return space.model(identification.refined(space, left[0].x, rig_of, exposures))
