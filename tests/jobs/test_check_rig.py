@@ -59,6 +59,7 @@ def test_what_cannot_work_is_an_error(values: dict[str, str], key: str, message:
         ({"sigma": "0.8"}, "sensor.kernel.sigma", "every frame cuts the spot off"),
         ({"sigma": "0.02"}, "sensor.kernel.sigma", r"sigma is 0\.4 pixels, .* from 0\.8 on"),
         ({"noise_density": "7"}, "sensor.noise_density", r"is 0\.88 in the brightest pixel .* from 1 on"),
+        ({"noise_density": "2e-5"}, "sensor.noise_density", r"is 520 in the brightest pixel .* up to 300"),
         ({"process_noise": "100"}, "plant.process_noise", "by 13.1 sds of the kernel .* up to 8"),
         ({"A": swinging(0.4)}, "timing.exposure_steps", r"swings 12\.7 times in an exposure, .* up to 8"),
         ({"A": swinging(1.2), "exposure_steps": "20"}, "timing.fast_step_s", r"5\.2 fast steps in one swing"),
@@ -123,6 +124,7 @@ def test_the_numbers_that_a_rig_comes_to_are_stated() -> None:
 def test_the_rigs_that_come_along_have_no_error(name: str) -> None:
     findings = check_rig(load_rig(name))
     assert not [f for f in findings if f.severity == "error"]
-    # Its actuators at rest in one place are alike, and the lenslets do not see all of them.
-    expected = ["plant.C"] if name == "membrane-12x12" else []
-    assert [f.key for f in findings if f.severity == "warning"] == expected
+    # Actuators of the membrane at rest in one place are alike, and the lenslets do not see all of them; the spot of the
+    # loop is bright, and a drift and a vibration move it.
+    expected = {"membrane-12x12": ["plant.C"], "loop": ["sensor.noise_density"] * 2}
+    assert [f.key for f in findings if f.severity == "warning"] == expected.get(name, [])

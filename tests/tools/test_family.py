@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from aolink.estimation import make_estimator
-from aolink.estimation.assumptions import broken_assumptions
+from aolink.estimation.assumptions import broken_assumptions, narrow_intervals
 
 if TYPE_CHECKING:
     from paper_report.judge import Row
@@ -137,6 +137,28 @@ def test_its_scenes_are_what_the_check_of_a_rig_file_says_nothing_of() -> None:
 
     for seed in SEEDS["tuning"][:60]:
         assert list(broken_assumptions(rig_of(draw(seed), 1, 24))) == []
+
+
+@pytest.mark.parametrize(
+    ("seed", "warned"),
+    [
+        (100_053, True),
+        (100_070, True),
+        (100_015, True),
+        (100_022, False),
+        (100_100, False),
+        (100_079, False),
+        (100_112, False),
+    ],
+)
+def test_the_check_says_where_intervals_of_mixtures_are_often_too_narrow(seed: int, warned: bool) -> None:
+    """The last four: one process alone; a faint spot; one that is less bright; no vibration that lasts."""
+    from paper_report.family import draw, rig_of
+
+    said = [
+        (key, "compare them with those of moments" in text) for key, text in narrow_intervals(rig_of(draw(seed), 1, 24))
+    ]
+    assert said == [("sensor.noise_density", True)] * warned
 
 
 def rows_of(estimator: str, path: Sequence[Sequence[float]], nees: float = 2.0) -> list[Row]:

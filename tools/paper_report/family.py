@@ -16,7 +16,7 @@ import numpy as np
 from scipy import linalg
 
 from aolink.estimation import assumptions
-from aolink.estimation.assumptions import LEAST_KERNEL_PIXELS, LEAST_PEAK_SNR, MOST_MODES, MOST_PATH_WIDTHS
+from aolink.estimation.assumptions import LEAST_KERNEL_PIXELS, MOST_MODES, MOST_PATH_WIDTHS
 from aolink.estimation.driver import SkippedInputs
 from aolink.exposure import Exposure
 from aolink.numerics.arrays import FloatArray
@@ -37,7 +37,7 @@ MEMORY = (0.1, 20.0)
 """Exposures in which an Ornstein-Uhlenbeck process forgets all but 1/e."""
 PATH_WIDTHS = (0.3, MOST_PATH_WIDTHS)
 """Sd of the path, in sds of the kernel."""
-PEAK_SNR = (LEAST_PEAK_SNR, 300.0)
+PEAK_SNR = (assumptions.LEAST_PEAK_SNR, assumptions.MOST_PEAK_SNR)
 """Signal to noise in the brightest pixel of a resting spot."""
 STEPS = (20, 400)
 KERNEL_PIXELS = (LEAST_KERNEL_PIXELS, 4.0)
