@@ -76,7 +76,8 @@ def check_rig(rig: Rig) -> list[Finding]:
             findings = [
                 *_check_timing(rig), *_check_sensor(rig), *_check_signal(rig, path), *_check_motion(rig, path),
                 *_check_field(rig, path, sd), *_check_mirror(rig), *_check_simulation(rig), *_check_observability(rig),
-                *(_warning(*each) for each in (*broken_assumptions(rig), *narrow_intervals(rig))),
+                *(_warning(*each) for each in broken_assumptions(rig)),
+                *(_info(*each) for each in narrow_intervals(rig)),
             ]  # fmt: skip
     except (ArithmeticError, ValueError) as error:  # a LinAlgError is a ValueError
         return [_error("rig", f"it has numbers that are too large or too small to compute with ({error})")]

@@ -125,6 +125,8 @@ def test_the_rigs_that_come_along_have_no_error(name: str) -> None:
     findings = check_rig(load_rig(name))
     assert not [f for f in findings if f.severity == "error"]
     # Actuators of the membrane at rest in one place are alike, and the lenslets do not see all of them; the spot of the
-    # loop is bright, and a drift and a vibration move it.
-    expected = {"membrane-12x12": ["plant.C"], "loop": ["sensor.noise_density"] * 2}
+    # loop is brighter than those on which estimators were judged.
+    expected = {"membrane-12x12": ["plant.C"], "loop": ["sensor.noise_density"]}
     assert [f.key for f in findings if f.severity == "warning"] == expected.get(name, [])
+    # A drift and a vibration move it.
+    assert any("compare them with those of moments" in f.message for f in findings) == (name == "loop")
