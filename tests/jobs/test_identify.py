@@ -14,7 +14,7 @@ DRIFT_SD, HZ = 0.16, 48.0  # 2.4 cycles an exposure
 
 @pytest.mark.long
 def test_the_set_of_a_vibration_beside_a_drift_is_without_the_frequencies_that_the_pixels_rule_out():
-    """The drift moves the centroid so much more that centroid and width alone leave all frequencies."""
+    """The drift moves the centroid so much more that centroid and width alone rule out few frequencies."""
     drift = Process("ornstein-uhlenbeck", (0.5, 2 * DRIFT_SD**2 / 0.5))
     vibration = Process("resonance", (HZ, 0.002, 0.08))
     rig = parse_rig(identified_text(RIG.toml, RIG, [ProcessSum((drift, vibration))]))

@@ -143,8 +143,9 @@ def _kept(model: ExposureModel, sensor: BaseSensor, coarse: float, resting_sd: f
     V, rest = vectors[:count].T, float(left[count])
     if outputs <= _ONE_SPOT and count < most:
         _, values, vectors = np.linalg.svd(means - means @ V @ V.T, full_matrices=False)
-        V = np.concatenate([V, vectors[values > _MEAN_LEFT_OUT * resting_sd][: most - count].T], axis=1)
-        rest = float(np.sum((paths - paths @ V @ V.T) ** 2)) / outputs
+        if len(more := vectors[values > _MEAN_LEFT_OUT * resting_sd][: most - count]):
+            V = np.concatenate([V, more.T], axis=1)
+            rest = float(np.sum((paths - paths @ V @ V.T) ** 2)) / outputs
     if outputs <= _ONE_SPOT and rest > (_SEEN * resting_sd) ** 2:
         S = _visibility(model, sensor, noise)
         if np.trace(S) - np.trace(V.T @ S @ V) > _MOST_VISIBLE:

@@ -194,22 +194,28 @@ def slow_and_fast():
     return dataclasses.replace(PLANE, plant=plant, sensor=sensor, timing=timing)
 
 
-def slow_on_a_line():
-    """A spot that swings slowly, with little noise inside an exposure."""
-    kernel, steps, swings, damping = np.sqrt(LINE.sensor.kernel.variance), 100, 0.31, 0.007
+def vibrating_on_a_line(swings, damping, widths, peak_snr):
+    """A spot on a line that vibrates with so many swings in an exposure; ``widths`` is the path's sd in sds of the
+    kernel."""
+    kernel, steps = np.sqrt(LINE.sensor.kernel.variance), 100
     rate = 2 * np.pi * swings / steps
-    A = linalg.expm(np.array([[0, rate], [-rate, -2 * damping * rate]]))
+    A = linalg.expm(np.array([[0, 1], [-(rate**2), -2 * damping * rate]]))
     P = linalg.solve_discrete_lyapunov(A, np.diag([0.0, 1.0]))
-    gain = 0.8 * kernel / np.sqrt(P[0, 0])
+    gain = widths * kernel / np.sqrt(P[0, 0])
     plant = dataclasses.replace(
         LINE.plant, A=A, B=np.zeros((2, LINE.plant.n_inputs)), B_w=gain * np.array([[0.0], [1.0]]), C=np.eye(2)[:1],
         process_noise=np.eye(1), initial_mean=np.zeros(2), initial_covariance=gain**2 * P,
     )  # fmt: skip
     line = LINE.sensor.profile
     peak = line.pixel_size / (np.sqrt(2 * np.pi) * kernel)
-    sensor = dataclasses.replace(LINE.sensor, noise_density=(peak / 30) ** 2 / line.pixel_size)
+    sensor = dataclasses.replace(LINE.sensor, noise_density=(peak / peak_snr) ** 2 / line.pixel_size)
     timing = dataclasses.replace(LINE.timing, exposure_steps=steps, frame_period_steps=steps)
     return dataclasses.replace(LINE, plant=plant, sensor=sensor, timing=timing)
+
+
+def slow_on_a_line():
+    """A spot that swings slowly, with little noise inside an exposure."""
+    return vibrating_on_a_line(0.31, 0.007, widths=0.8, peak_snr=30)
 
 
 @pytest.mark.parametrize("make", [slow_and_fast, slow_on_a_line])
@@ -257,20 +263,7 @@ def test_the_end_of_an_exposure_is_as_sure_as_it_is_right_on_a_line(name):
 
 def fast_and_bright():
     """A vibration of five swings in an exposure, seen much better than it moves the centroid."""
-    kernel, steps, swings, damping = np.sqrt(LINE.sensor.kernel.variance), 100, 4.9, 0.009
-    rate = 2 * np.pi * swings / steps
-    A = linalg.expm(np.array([[0, 1], [-(rate**2), -2 * damping * rate]]))
-    P = linalg.solve_discrete_lyapunov(A, np.diag([0.0, 1.0]))
-    gain = 0.35 * kernel / np.sqrt(P[0, 0])
-    plant = dataclasses.replace(
-        LINE.plant, A=A, B=np.zeros((2, LINE.plant.n_inputs)), B_w=gain * np.array([[0.0], [1.0]]), C=np.eye(2)[:1],
-        process_noise=np.eye(1), initial_mean=np.zeros(2), initial_covariance=gain**2 * P,
-    )  # fmt: skip
-    line = LINE.sensor.profile
-    peak = line.pixel_size / (np.sqrt(2 * np.pi) * kernel)
-    sensor = dataclasses.replace(LINE.sensor, noise_density=(peak / 400) ** 2 / line.pixel_size)
-    timing = dataclasses.replace(LINE.timing, exposure_steps=steps, frame_period_steps=steps)
-    return dataclasses.replace(LINE, plant=plant, sensor=sensor, timing=timing)
+    return vibrating_on_a_line(4.9, 0.009, widths=0.35, peak_snr=400)
 
 
 def test_noise_that_is_left_out_hardly_changes_the_pixels():
