@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import lru_cache
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from aolink.errors import EstimatorError
+from aolink.estimation.assumptions import has_hidden_modes
 from aolink.estimation.compiled import make_ready
 from aolink.estimation.frames.centroid_noise import centroid_covariance
 from aolink.estimation.frames.frame_data import Profile, SpotWindows
@@ -26,6 +27,9 @@ from aolink.numerics.arrays import FloatArray
 from aolink.optics.sensor import SpotSensor
 from aolink.plant.alike import alike_systems
 from aolink.rig import Rig
+
+if TYPE_CHECKING:
+    from aolink.estimation.pixels.updates import ImportanceUpdater
 
 
 def _blur_filter(rig: Rig, options: Options, observation: Observation[Any] | None, **more: Any) -> BlurFilter:
@@ -123,7 +127,7 @@ def profile(rig: Rig, options: Options) -> Filter:
     if alike_systems(rig.plant) is None:
         from aolink.estimation.pixels.updates import PROFILE
 
-        return _of_pixels(rig, options, PROFILE.within(options.tempered, options.draws / 100))
+        return _of_pixels(rig, options, _budgeted(rig, options, PROFILE))
     _warm_up(rig)
     return _blur_filter(rig, options, JointProfile(_spots(rig), rig.plant.n_outputs))
 
@@ -131,7 +135,11 @@ def profile(rig: Rig, options: Options) -> Filter:
 def mixture(rig: Rig, options: Options) -> Filter:
     from aolink.estimation.pixels.updates import MIXTURE
 
-    return _of_pixels(rig, options, MIXTURE.within(options.tempered, options.draws / 100))
+    return _of_pixels(rig, options, _budgeted(rig, options, MIXTURE))
+
+
+def _budgeted(rig: Rig, options: Options, updates: ImportanceUpdater) -> ImportanceUpdater:
+    return updates.within(options.tempered, options.draws / 100, hidden=has_hidden_modes(rig))
 
 
 def sampled(rig: Rig, options: Options) -> Filter:

@@ -7,7 +7,7 @@ leaves the prediction, and after several of them the filter starts again from th
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple, Protocol
 
@@ -72,8 +72,8 @@ class MixtureUpdate:
 class MixtureUpdater(Protocol):
     """A way to update a mixture with the pixels of an exposure."""
 
-    def when_poor(self, reduced: Reduction) -> str:
-        """Its action on axes with `MixtureUpdate.poor`, in words, for the estimate's reason."""
+    def remarks(self, several: BoolArray, poor: BoolArray, reduced: Reduction) -> Iterable[tuple[BoolArray, str]]:
+        """Which axes, (axes,), the estimate's reason says what about: given `MixtureUpdate.several` and `poor`."""
 
     def reduction(self, model: ExposureModel, sensor: BaseSensor) -> Reduction:
         """The coefficients that it works with."""
@@ -200,15 +200,18 @@ class MixtureFilter(Filter):
         self._number += 1
         return Posterior(
             coefficients=coefficients, end=end.gaussian, status=status, innovation=new.value,
-            innovation_covariance=new.covariance, nis=new.nis, several=several, remark=self._remark(poor, reduced),
-            log_evidence=log_evidence,
+            innovation_covariance=new.covariance, nis=new.nis, several=several,
+            remark=self._remark(several, poor, reduced), log_evidence=log_evidence,
             components=Components(components, reduced.expand, reduced.left_out, (unseen.mean, unseen.covariance)),
         )  # fmt: skip
 
-    def _remark(self, poor: BoolArray, reduced: Reduction) -> str:
-        if not poor.any():
-            return ""
-        return ("" if len(poor) == 1 else f"{int(poor.sum())} of {len(poor)} axes: ") + self._updater.when_poor(reduced)
+    def _remark(self, several: BoolArray, poor: BoolArray, reduced: Reduction) -> str:
+        axes = len(poor)
+        return "; ".join(
+            text if axes == 1 else f"{int(which.sum())} of {axes} axes: {text}"
+            for which, text in self._updater.remarks(several, poor, reduced)
+            if which.any()
+        )
 
 
 def _arrays(done: MixtureUpdate, components: int) -> tuple[NDArray[Any], ...]:

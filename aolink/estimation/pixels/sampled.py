@@ -19,7 +19,7 @@ from aolink.estimation.pixels.modes import innovation
 from aolink.estimation.pixels.tempering import fitted, tempered_points
 from aolink.estimation.pixels.updates import explored, has_several
 from aolink.numerics import batched
-from aolink.numerics.arrays import FloatArray
+from aolink.numerics.arrays import BoolArray, FloatArray
 from aolink.optics.sensor import BaseSensor
 
 # Rms of the path that is left out, in standard deviations of the kernel.
@@ -35,9 +35,9 @@ class TemperedUpdater:
     particles: int = 2000
     seed: int = 0
 
-    def when_poor(self, reduced: Reduction) -> str:
-        """An empty text: its updates are never poor."""
-        return ""
+    def remarks(self, several: BoolArray, poor: BoolArray, reduced: Reduction) -> tuple[()]:
+        """None: its updates are never poor."""
+        return ()
 
     def reduction(self, model: ExposureModel, sensor: BaseSensor) -> Reduction:
         return reduction(model, sensor, left_out=_LEFT_OUT)

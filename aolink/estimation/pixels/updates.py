@@ -6,10 +6,12 @@ curved. So the modes, and the wide Gaussians of windowed moments about them, onl
 posterior comes from importance weights (`aolink.estimation.pixels.importance`).
 
 Where that is not enough (`aolink.estimation.pixels.importance`), points are tempered, as many for an axis as ``points``
-says. If that is none, the fit stays as wide as its few effective points make it. Some hundred points miss modes as
-well, and more of them the more coefficients there are. So a share of the posterior remains the Gaussians of the
-windowed moments, whose covariance is wide enough. With as many points as pairs of coefficients, or fewer, this share is
-one, and no point is tempered.
+says. So they are, by an updater that ``tempers_several``, wherever a posterior has several modes and the rig is one
+where others often stay hidden (`aolink.estimation.assumptions.has_hidden_modes`): the modes that were found explain the
+frame, and their points agree with each other. If ``points`` is none, the fit stays as wide as its few effective points
+make it. Some hundred points miss modes as well, and more of them the more coefficients there are. So a share of the
+posterior remains the Gaussians of the windowed moments, whose covariance is wide enough. With as many points as pairs
+of coefficients, or fewer, this share is one, and no point is tempered.
 
 A mode that was lost is found again: a thousandth of the prior is the prediction without any measurement. Its modes are
 searched for where the NIS is larger than chance explains.
@@ -18,6 +20,7 @@ searched for where the NIS is larger than chance explains.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -72,14 +75,29 @@ class ImportanceUpdater:
     would add up from exposure to exposure."""
     enough: float = 100.0
     """The usual effective sample size: with less than half of it, points are tempered."""
+    tempers_several: bool = False
+    """Whether points are tempered wherever there are several modes, on a rig where others often stay hidden."""
+    hidden: bool = False
+    """Whether the rig is such a one."""
 
-    def within(self, points: int | None, share: float) -> ImportanceUpdater:
-        """The same with another number of tempered points, if not None, and a share of the others."""
+    def within(self, points: int | None, share: float, *, hidden: bool) -> ImportanceUpdater:
+        """The same with another number of tempered points, if not None, and a share of the others, on a rig where modes
+        often stay hidden or on another one."""
         points = self.points if points is None else points
-        return replace(self, points=points, share=share * self.share, several=share * self.several)
+        return replace(self, points=points, share=share * self.share, several=share * self.several, hidden=hidden)
 
-    def when_poor(self, reduced: Reduction) -> str:
-        """Its action where importance sampling is not enough, in words, for the estimate's reason."""
+    @property
+    def _hands_over(self) -> bool:
+        """Whether all posteriors with several modes are tempered."""
+        return self.hidden and self.tempers_several and self.points > 0
+
+    def remarks(self, several: BoolArray, poor: BoolArray, reduced: Reduction) -> Iterator[tuple[BoolArray, str]]:
+        yield poor, self._when_poor(reduced)
+        if self.hidden:
+            yield several & ~poor, "modes often stay hidden on this rig: intervals may be too narrow"
+
+    def _when_poor(self, reduced: Reduction) -> str:
+        """Its action where importance sampling is not enough."""
         missed = self._missed(reduced)
         if not self.points:
             what = "the estimate is wide"
@@ -87,7 +105,8 @@ class ImportanceUpdater:
             what = f"{self.points} points tempered, and {missed:.0%} of windowed moments"
         else:
             what = "windowed moments"
-        return f"too few importance weights count: {what}"
+        why = "modes may be hidden, or " if self._hands_over else ""
+        return f"{why}too few importance weights count: {what}"
 
     def _missed(self, reduced: Reduction) -> float:
         """The share of a posterior that tempered points may have missed: the number of pairs of coefficients for each
@@ -104,6 +123,8 @@ class ImportanceUpdater:
         new = innovation(view, own, modes)
         wide = _wide_part(proposal, prior)
         lost = scattered(view, wide)
+        if self._hands_over:
+            lost |= has_several(modes, _LEAST_DOUBTED_SHARE)
         doubted = np.flatnonzero(new.nis > 2 * special.gammainccinv(new.value.shape[1] / 2, _DOUBTED))
         if len(doubted):
             anew = single(unseen.part(doubted))
@@ -125,8 +146,9 @@ class ImportanceUpdater:
             some, fit, missed = view.part(few), wide.part(few), self._missed(reduced)
             if missed < 1:
                 points, best = tempered(some, before.part(few), self.points, number)
-                in_doubt = np.flatnonzero(np.isin(few, doubted))
-                fit = fit.replaced(in_doubt, _by_share_of(points.part(in_doubt), fit.part(in_doubt)))
+                # Of an axis whose modes may be hidden, wide Gaussians that the frame rules out are most of all far off.
+                by_share = np.flatnonzero(self._hands_over | np.isin(few, doubted))
+                fit = fit.replaced(by_share, _by_share_of(points.part(by_share), fit.part(by_share)))
                 fit = joined(points.weighted(1 - missed), fit.weighted(missed))
                 # The search may have missed the mode that fits.
                 starts = whitened(own.part(few), best)
@@ -140,7 +162,7 @@ class ImportanceUpdater:
 
 
 PROFILE = ImportanceUpdater(carried=12, free=0.01, share=0.25, points=600)
-MIXTURE = ImportanceUpdater(carried=12, free=1e-3, share=1.0, points=1200)
+MIXTURE = ImportanceUpdater(carried=12, free=1e-3, share=1.0, points=1200, tempers_several=True)
 
 
 def has_several(modes: Modes, least: float = _LEAST_SHARE) -> BoolArray:
@@ -197,8 +219,7 @@ def _remembering(view: PixelView, prior: GaussianMixture, wide: GaussianMixture)
 def _by_share_of(points: GaussianMixture, wide: GaussianMixture) -> GaussianMixture:
     """The wide Gaussians, each weighted by the share of the points' mixture that lies nearest to it.
 
-    This is for axes whose prior is in doubt: some of the wide Gaussians are about that prior, which the frame may rule
-    out.
+    This is for axes whose prior is in doubt, or wide: the frame may rule some of the wide Gaussians out.
     """
     there = np.isfinite(wide.log_weight)
     covariance = np.where(there[..., None, None], wide.covariance, np.eye(wide.mean.shape[2]))
