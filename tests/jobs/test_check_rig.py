@@ -129,4 +129,4 @@ def test_the_rigs_that_come_along_have_no_error(name: str) -> None:
     expected = {"membrane-12x12": ["plant.C"], "loop": ["sensor.noise_density"]}
     assert [f.key for f in findings if f.severity == "warning"] == expected.get(name, [])
     # A drift and a vibration move it.
-    assert any("compare them with those of moments" in f.message for f in findings) == (name == "loop")
+    assert any("compare both with moments" in f.message for f in findings) == (name == "loop")
