@@ -122,8 +122,8 @@ def has_hidden_modes(rig: Rig) -> bool:
     if peak_snr(rig) < _BRIGHT or rig.plant.n_outputs > _MOST_OUTPUTS:
         return False
     count, values = _eigenmodes(rig)
-    lasting = np.abs(values[values.imag > 0]) ** rig.timing.frame_period_steps
-    return count > 1 and bool((lasting > math.exp(-1)).any())
+    outlasts = np.abs(values[values.imag > 0]) > math.exp(-1 / rig.timing.frame_period_steps)
+    return count > 1 and bool(outlasts.any())
 
 
 def narrow_intervals(rig: Rig) -> Iterator[tuple[str, str]]:
