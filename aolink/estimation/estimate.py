@@ -106,7 +106,8 @@ class Estimate:
     n_steps: int
     status: Status
     reason: str
-    """The reason why the status is not OK, or the data that the estimate lacked; otherwise empty."""
+    """The reason why the status is not OK, the data that the estimate lacked, and what to know of the posterior (it has
+    several modes, or was made in another than the usual way); otherwise empty."""
     start_state: FloatArray
     """State at the exposure's first fast step, (axes, n_states)."""
     start_covariance: FloatArray

@@ -159,6 +159,12 @@ def _is_line(rig: Rig) -> bool:
     return rig.sensor.directions == 1
 
 
+def _is_quick_for_mixture(rig: Rig) -> bool:
+    from aolink.estimation.assumptions import importance_is_too_sure
+
+    return _is_line(rig) and not importance_is_too_sure(rig)
+
+
 def _built(maker: str, *orders: int) -> Callable[[Rig, Options], Filter]:
     """The function of that name in `aolink.estimation.filters`, which is loaded when it is called."""
 
@@ -189,7 +195,7 @@ _OURS = {
         ),
         EstimatorRow(
             name="mixture", rank=60, colour=(240, 80, 140), build=_built("mixture"),
-            refusal=_pixels_refusal("mixture"), wanders=True, in_demo=_is_line,
+            refusal=_pixels_refusal("mixture"), wanders=True, in_demo=_is_quick_for_mixture,
         ),
         EstimatorRow(
             name="sampled", rank=70, colour=(190, 130, 80), build=_built("sampled"),

@@ -66,14 +66,15 @@ class MixtureUpdate:
     several: BoolArray
     """Whether the posterior has several modes (more than one path explains the blur), (axes,)."""
     poor: BoolArray
-    """Whether importance sampling was not enough for it, (axes,)."""
+    """Whether importance sampling was not enough for it, or was not tried, (axes,)."""
 
 
 class MixtureUpdater(Protocol):
     """A way to update a mixture with the pixels of an exposure."""
 
     def remarks(self, several: BoolArray, poor: BoolArray, reduced: Reduction) -> Iterable[tuple[BoolArray, str]]:
-        """Which axes, (axes,), the estimate's reason says what about: given `MixtureUpdate.several` and `poor`."""
+        """Masks of axes, (axes,), each with what the estimate's reason says of them; ``several`` and ``poor`` are those
+        of `MixtureUpdate`."""
 
     def reduction(self, model: ExposureModel, sensor: BaseSensor) -> Reduction:
         """The coefficients that it works with."""

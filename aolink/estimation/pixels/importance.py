@@ -10,7 +10,8 @@ Some posteriors cannot be approximated by such a mixture. Where a spot hardly mo
 fixes the sum of many squares, and the posterior is a shell. Where several vibrations are free in phase, one search
 finds few of the modes, and the effective sample size of points about those does not show the others: the uncertainty
 that the windowed moments leave decides (`scattered`). In both cases tempered sequential Monte Carlo draws the points
-(`aolink.estimation.pixels.tempering`).
+(`aolink.estimation.pixels.tempering`). On some rigs neither shows that the fit is too narrow
+(`aolink.estimation.assumptions.importance_is_too_sure`).
 """
 
 from __future__ import annotations

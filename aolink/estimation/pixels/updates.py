@@ -7,11 +7,11 @@ posterior comes from importance weights (`aolink.estimation.pixels.importance`).
 
 Where that is not enough (`aolink.estimation.pixels.importance`), points are tempered, as many for an axis as ``points``
 says. So they are, by an updater that ``tempers_several``, wherever a posterior has several modes and the rig is one
-where others often stay hidden (`aolink.estimation.assumptions.has_hidden_modes`): the modes that were found explain the
-frame, and their points agree with each other. If ``points`` is none, the fit stays as wide as its few effective points
-make it. Some hundred points miss modes as well, and more of them the more coefficients there are. So a share of the
-posterior remains the Gaussians of the windowed moments, whose covariance is wide enough. With as many points as pairs
-of coefficients, or fewer, this share is one, and no point is tempered.
+where importance sampling is too sure without showing it (`aolink.estimation.assumptions.importance_is_too_sure`). If
+``points`` is none, the fit stays as wide as its few effective points make it. Some hundred points miss modes as well,
+and more of them the more coefficients there are. So a share of the posterior remains the Gaussians of the windowed
+moments, whose covariance is wide enough. With as many points as pairs of coefficients, or fewer, this share is one, and
+no point is tempered.
 
 A mode that was lost is found again: a thousandth of the prior is the prediction without any measurement. Its modes are
 searched for where the NIS is larger than chance explains.
@@ -55,6 +55,8 @@ _DOUBTED = 1e-3
 # the evidence of modes is rough.
 _LEAST_SHARE = 0.05
 _LEAST_DOUBTED_SHARE = 0.005
+# Posteriors are not tempered for having several modes if the windowed moments would have this share of them.
+_MOST_MISSED = 0.5
 
 
 @dataclass(frozen=True)
@@ -76,25 +78,25 @@ class ImportanceUpdater:
     enough: float = 100.0
     """The usual effective sample size: with less than half of it, points are tempered."""
     tempers_several: bool = False
-    """Whether points are tempered wherever there are several modes, on a rig where others often stay hidden."""
-    hidden: bool = False
+    """Whether points are tempered wherever there are several modes, on a rig where importance sampling is often too
+    sure."""
+    too_sure: bool = False
     """Whether the rig is such a one."""
 
-    def within(self, points: int | None, share: float, *, hidden: bool) -> ImportanceUpdater:
-        """The same with another number of tempered points, if not None, and a share of the others, on a rig where modes
-        often stay hidden or on another one."""
+    def within(self, points: int | None, share: float, *, too_sure: bool) -> ImportanceUpdater:
+        """The same with another number of tempered points, if not None, and a share of the others, for a rig where
+        importance sampling is often too sure, or another one."""
         points = self.points if points is None else points
-        return replace(self, points=points, share=share * self.share, several=share * self.several, hidden=hidden)
+        return replace(self, points=points, share=share * self.share, several=share * self.several, too_sure=too_sure)
 
-    @property
-    def _hands_over(self) -> bool:
-        """Whether all posteriors with several modes are tempered."""
-        return self.hidden and self.tempers_several and self.points > 0
+    def _hands_over(self, reduced: Reduction) -> bool:
+        """Whether all posteriors with several modes are tempered: where there are points enough for that."""
+        return self.too_sure and self.tempers_several and self._missed(reduced) < _MOST_MISSED
 
     def remarks(self, several: BoolArray, poor: BoolArray, reduced: Reduction) -> Iterator[tuple[BoolArray, str]]:
         yield poor, self._when_poor(reduced)
-        if self.hidden:
-            yield several & ~poor, "modes often stay hidden on this rig: intervals may be too narrow"
+        if self.too_sure:
+            yield several & ~poor, "importance sampling is often too sure on this rig: intervals may be too narrow"
 
     def _when_poor(self, reduced: Reduction) -> str:
         """Its action where importance sampling is not enough."""
@@ -105,8 +107,8 @@ class ImportanceUpdater:
             what = f"{self.points} points tempered, and {missed:.0%} of windowed moments"
         else:
             what = "windowed moments"
-        why = "modes may be hidden, or " if self._hands_over else ""
-        return f"{why}too few importance weights count: {what}"
+        enough = "importance sampling is not enough on this rig"
+        return f"{enough if self._hands_over(reduced) else 'too few importance weights count'}: {what}"
 
     def _missed(self, reduced: Reduction) -> float:
         """The share of a posterior that tempered points may have missed: the number of pairs of coefficients for each
@@ -123,7 +125,7 @@ class ImportanceUpdater:
         new = innovation(view, own, modes)
         wide = _wide_part(proposal, prior)
         lost = scattered(view, wide)
-        if self._hands_over:
+        if self._hands_over(reduced):
             lost |= has_several(modes, _LEAST_DOUBTED_SHARE)
         doubted = np.flatnonzero(new.nis > 2 * special.gammainccinv(new.value.shape[1] / 2, _DOUBTED))
         if len(doubted):
@@ -146,8 +148,8 @@ class ImportanceUpdater:
             some, fit, missed = view.part(few), wide.part(few), self._missed(reduced)
             if missed < 1:
                 points, best = tempered(some, before.part(few), self.points, number)
-                # Of an axis whose modes may be hidden, wide Gaussians that the frame rules out are most of all far off.
-                by_share = np.flatnonzero(self._hands_over | np.isin(few, doubted))
+                # Where the spot is bright, a frame rules most of the wide Gaussians out.
+                by_share = np.flatnonzero(self._hands_over(reduced) | np.isin(few, doubted))
                 fit = fit.replaced(by_share, _by_share_of(points.part(by_share), fit.part(by_share)))
                 fit = joined(points.weighted(1 - missed), fit.weighted(missed))
                 # The search may have missed the mode that fits.
@@ -219,7 +221,7 @@ def _remembering(view: PixelView, prior: GaussianMixture, wide: GaussianMixture)
 def _by_share_of(points: GaussianMixture, wide: GaussianMixture) -> GaussianMixture:
     """The wide Gaussians, each weighted by the share of the points' mixture that lies nearest to it.
 
-    This is for axes whose prior is in doubt, or wide: the frame may rule some of the wide Gaussians out.
+    This is for axes of which a frame may rule some of the wide Gaussians out, as where the prior is in doubt.
     """
     there = np.isfinite(wide.log_weight)
     covariance = np.where(there[..., None, None], wide.covariance, np.eye(wide.mean.shape[2]))
