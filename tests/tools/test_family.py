@@ -151,7 +151,7 @@ def test_its_scenes_are_what_the_check_of_a_rig_file_says_nothing_of() -> None:
         (100_112, False),
     ],
 )
-def test_the_check_says_where_modes_often_stay_hidden(seed: int, warned: bool) -> None:
+def test_the_check_says_where_importance_sampling_is_too_sure(seed: int, warned: bool) -> None:
     """The last four: one process alone; a faint spot; one that is less bright; no vibration that lasts."""
     from paper_report.family import draw, rig_of
 
