@@ -10,7 +10,9 @@ from scipy.linalg import block_diag, expm, solve_discrete_lyapunov
 from aolink.errors import EstimatorError
 from aolink.estimation import make_estimator
 from aolink.estimation.assumptions import importance_is_too_sure
+from aolink.estimation.registry import estimator_row
 from aolink.rig import load_rig
+from aolink.rig.parts import Wandering
 from aolink.simulation.model import simulate
 from tests.kinds import truth_of
 
@@ -154,9 +156,28 @@ def test_a_rig_on_which_importance_sampling_is_too_sure_is_known_by_one_axis_of_
         initial_covariance=block_diag(plant.initial_covariance, np.zeros((2, 2))),
     )  # fmt: skip
     assert not importance_is_too_sure(dataclasses.replace(BRIGHT, plant=with_late_step))
-    apart = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]])
-    two = dataclasses.replace(plant, C=apart)
+    drifts, vibration = np.diag([0.98, 0.999]), plant.A[:2, :2]
+    two = dataclasses.replace(
+        plant, A=block_diag(drifts, vibration), C=np.array([[1.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]]),
+        initial_covariance=block_diag(0.01 * np.eye(2), plant.initial_covariance[:2, :2]),
+    )  # fmt: skip
     assert not importance_is_too_sure(dataclasses.replace(BRIGHT, plant=two))
+    together = dataclasses.replace(two, C=np.array([[1.0, 1.0, 1.0, 0.0], [0.0, 0.0, 1.0, 0.0]]))
+    assert importance_is_too_sure(dataclasses.replace(BRIGHT, plant=together))
+
+
+def test_copies_of_a_rig_whose_parameter_wanders_work_alike():
+    wandering = Wandering(parameter="sensor_noise", rate_per_minute=0.1, largest=0.2)
+    rig = dataclasses.replace(BRIGHT, plant=dataclasses.replace(BRIGHT.plant, wandering=wandering))
+    _, reasons = errors_of(rig, "profile", [2], 4)
+    assert any("more than one path" in reason for reason in reasons)
+    assert not any("on this rig" in reason for reason in reasons)
+
+
+def test_a_demo_leaves_mixture_out_where_it_tempers_in_nearly_every_exposure():
+    in_demo = estimator_row("mixture").in_demo
+    assert in_demo(LIVELY)
+    assert not in_demo(BRIGHT)
 
 
 @pytest.mark.long
