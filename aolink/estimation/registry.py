@@ -160,6 +160,7 @@ def _is_line(rig: Rig) -> bool:
 
 
 def _is_quick_for_mixture(rig: Rig) -> bool:
+    """Whether the sensor is a line and `mixture` does not temper points in nearly every exposure."""
     from aolink.estimation.assumptions import importance_is_too_sure
 
     return _is_line(rig) and not importance_is_too_sure(rig)
