@@ -10,7 +10,9 @@ Some posteriors cannot be approximated by such a mixture. Where a spot hardly mo
 fixes the sum of many squares, and the posterior is a shell. Where several vibrations are free in phase, one search
 finds few of the modes, and the effective sample size of points about those does not show the others: the uncertainty
 that the windowed moments leave decides (`scattered`). In both cases tempered sequential Monte Carlo draws the points
-(`aolink.estimation.pixels.tempering`). On some rigs neither shows that the fit is too narrow
+(`aolink.estimation.pixels.tempering`), and their mixture is a part of the proposal density of another
+importance sampling, which weighs the modes more exactly than the number of points in each; where its effective sample
+size is not enough, the tempered points are the posterior. On some rigs neither shows that the fit is too narrow
 (`aolink.estimation.assumptions.importance_is_too_sure`).
 """
 
@@ -52,6 +54,8 @@ _WIDE = 0.3
 # their log-evidence by this: Laplace's evidence of a mode that is bent is rough.
 _INFLATION = 1.5
 _EVIDENCE = 0.5
+# Share of a proposal density that is the mixture of tempered points, where there are any.
+_BESIDE = 0.5
 # In a fit, a component's old covariance counts as this many points for each coefficient. Between rounds few, so that a
 # component soon finds its place; in the last fit more, with old covariances that a fit has made widened by the last
 # number: a covariance of few points is too narrow. (Twice as wide is too much: with twenty coefficients, where the old
@@ -73,6 +77,12 @@ def proposed(modes: GaussianMixture, wide: GaussianMixture) -> GaussianMixture:
     weight += math.log(1 - _WIDE) - log_sum(weight, axis=1)[:, None]
     narrow = GaussianMixture(weight, modes.mean, modes.covariance * _INFLATION)
     return joined(narrow, wide.weighted(_WIDE))
+
+
+def beside_points(proposal: GaussianMixture, points: GaussianMixture) -> GaussianMixture:
+    """A proposal density with the mixture of tempered points, flattened a little, beside it."""
+    flat = points._replace(covariance=points.covariance * _INFLATION)
+    return joined(proposal.weighted(1 - _BESIDE), flat.weighted(_BESIDE))
 
 
 def posterior(

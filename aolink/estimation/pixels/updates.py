@@ -31,7 +31,7 @@ from aolink.estimation.model.base import ExposureModel
 from aolink.estimation.moments.windowed import MOST_MEMORY, error_memory, slowest
 from aolink.estimation.pixels.filter import MixtureUpdate
 from aolink.estimation.pixels.gaussian_mixture import GaussianMixture, joined, log_sum, single
-from aolink.estimation.pixels.importance import posterior, proposed, scattered, tempered
+from aolink.estimation.pixels.importance import beside_points, posterior, proposed, scattered, tempered
 from aolink.estimation.pixels.likelihood import PixelView, Reduction, reduction
 from aolink.estimation.pixels.modes import (
     Modes,
@@ -44,7 +44,7 @@ from aolink.estimation.pixels.modes import (
     without_repeats,
 )
 from aolink.numerics import batched
-from aolink.numerics.arrays import BoolArray
+from aolink.numerics.arrays import BoolArray, FloatArray, Indices
 from aolink.optics.sensor import BaseSensor
 
 # Share of the prior that is the prediction without any measurement; and the probability by chance of searching its
@@ -57,6 +57,9 @@ _LEAST_SHARE = 0.05
 _LEAST_DOUBTED_SHARE = 0.005
 # Posteriors are not tempered for having several modes if the windowed moments would have this share of them.
 _MOST_MISSED = 0.5
+# Share of the posterior that importance sampling about tempered points may have missed, relative to what the points
+# alone may have.
+_LEFT = 0.5
 
 
 @dataclass(frozen=True)
@@ -145,22 +148,37 @@ class ImportanceUpdater:
                 poor[which] |= ~good & new.within_gate[which]
         few = np.flatnonzero(poor)
         if len(few) and self.points:
-            some, fit, missed = view.part(few), wide.part(few), self._missed(reduced)
-            if missed < 1:
-                points, best = tempered(some, before.part(few), self.points, number)
+            some = view.part(few)
+            if self._missed(reduced) < 1:
                 # Where the spot is bright, a frame rules most of the wide Gaussians out.
                 by_share = np.flatnonzero(self._hands_over(reduced) | np.isin(few, doubted))
-                fit = fit.replaced(by_share, _by_share_of(points.part(by_share), fit.part(by_share)))
-                fit = joined(points.weighted(1 - missed), fit.weighted(missed))
+                fit, best = self._tempered(some, before.part(few), proposal.part(few), wide.part(few), by_share, number)
                 # The search may have missed the mode that fits.
                 starts = whitened(own.part(few), best)
                 modes = without_repeats(with_more(modes, few, find_modes(some, own.part(few), starts)))
                 new = innovation(view, own, modes)
             else:
-                fit = _remembering(some, prior.part(few), fit)
+                fit = _remembering(some, prior.part(few), wide.part(few))
             after = after.replaced(few, fit)
         carried = after.mapped(reduced.end_rows, reduced.end_remainder).reduced(self.carried, self.free)
         return MixtureUpdate(after, after.gaussian, carried, new, modes.total_evidence, has_several(modes), poor)
+
+    def _tempered(
+        self, view: PixelView, prior: GaussianMixture, proposal: GaussianMixture, wide: GaussianMixture,
+        by_share: Indices, number: int,
+    ) -> tuple[GaussianMixture, FloatArray]:  # fmt: skip
+        """The posterior by tempered points, and a share of the wide Gaussians, which have weights of their own on the
+        axes ``by_share``; and the most likely point, (axes, 1, n)."""
+        points, best = tempered(view, prior, self.points, number)
+        wide = wide.replaced(by_share, _by_share_of(points.part(by_share), wide.part(by_share)))
+        missed = self._missed(view.reduced)
+        fit = joined(points.weighted(1 - missed), wide.weighted(missed))
+        if not self._hands_over(view.reduced):
+            weighed, good = posterior(view, prior, beside_points(proposal, points), self.several, self.enough)
+            missed *= _LEFT
+            better = joined(weighed.weighted(1 - missed), wide.weighted(missed))
+            fit = fit.replaced(np.flatnonzero(good), better.part(np.flatnonzero(good)))
+        return fit, best
 
 
 PROFILE = ImportanceUpdater(carried=12, free=0.01, share=0.25, points=600)
