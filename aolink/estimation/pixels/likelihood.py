@@ -51,9 +51,12 @@ _LEFT_OUT = 0.1
 # are no more coefficients than this, since the cost of an estimate grows with the square of their number.
 _SEEN = 2.0
 _MOST_SEEN = 12
-# Standard deviation of the mean of the noise path that may be left out, in standard deviations of that position, where
-# there are fewer coefficients than that. A plant that moves many spots has many such directions: they are not sought.
-_MEAN_LEFT_OUT = 0.25
+# Standard deviation of the mean of the noise path that may be left out, in standard deviations of that position; for
+# the sake of this there are no more coefficients than the second number. What is left out of the mean is unknown to the
+# end state: of a slow drift, whose position many exposures tell, a tenth already makes it too uncertain. A plant that
+# moves many spots has many such directions: they are not sought.
+_MEAN_LEFT_OUT = 0.1
+_MOST_WITH_MEAN = 16
 _ONE_SPOT = 2
 # Variance that the noise left out may add to the pixels together, in variances of a pixel's noise, where there are as
 # many coefficients as that. Where it adds more, directions are chosen by how much they change the pixels, until what is
@@ -141,11 +144,6 @@ def _kept(model: ExposureModel, sensor: BaseSensor, coarse: float, resting_sd: f
     count = int(np.argmax(left <= coarse**2))
     count = max(count, min(int(np.argmax(left <= (_SEEN * resting_sd) ** 2)), most))
     V, rest = vectors[:count].T, float(left[count])
-    if outputs <= _ONE_SPOT and count < most:
-        _, values, vectors = np.linalg.svd(means - means @ V @ V.T, full_matrices=False)
-        if len(more := vectors[values > _MEAN_LEFT_OUT * resting_sd][: most - count]):
-            V = np.concatenate([V, more.T], axis=1)
-            rest = float(np.sum((paths - paths @ V @ V.T) ** 2)) / outputs
     if outputs <= _ONE_SPOT and rest > (_SEEN * resting_sd) ** 2:
         S = _visibility(model, sensor, noise)
         if np.trace(S) - np.trace(V.T @ S @ V) > _MOST_VISIBLE:
@@ -156,6 +154,12 @@ def _kept(model: ExposureModel, sensor: BaseSensor, coarse: float, resting_sd: f
             count = min(int(np.argmax(visible <= _HARDLY_VISIBLE)), most)
             count = max(count, int(np.argmax(left <= coarse**2)))
             V, rest = vectors[:, :count], float(left[count])
+    if outputs <= _ONE_SPOT:
+        _, values, vectors = np.linalg.svd(means - means @ V @ V.T, full_matrices=False)
+        more = vectors[values > _MEAN_LEFT_OUT * resting_sd][: max(_MOST_WITH_MEAN - model.plant.n_states - count, 0)]
+        if len(more):
+            V = np.concatenate([V, more.T], axis=1)
+            rest = float(np.sum((paths - paths @ V @ V.T) ** 2)) / outputs
     return V, rest
 
 

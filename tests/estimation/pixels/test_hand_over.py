@@ -115,7 +115,7 @@ def errors_of(rig, name, seeds, exposures):
 
 def test_where_importance_sampling_is_too_sure_mixture_tempers_all_that_have_several_modes():
     _, reasons = errors_of(BRIGHT, "mixture", [1], 4)
-    said = "importance sampling is not enough on this rig: 1200 points tempered, and 12% of windowed moments"
+    said = "importance sampling is not enough on this rig: 1200 points tempered, and 14% of windowed moments"
     assert all(said in reason for reason in reasons if "more than one path" in reason)
     assert any("more than one path" in reason for reason in reasons)
 
@@ -129,7 +129,7 @@ def test_an_estimate_by_importance_sampling_says_there_that_its_intervals_may_be
 
 
 def test_there_mixture_does_not_temper_points_that_are_too_few_for_most_of_a_posterior():
-    """For twelve coefficients 200 points leave 72 % to the windowed moments, which are worse than importance
+    """For thirteen coefficients 200 points leave 84 % to the windowed moments, which are worse than importance
     sampling."""
     _, reasons = errors_of(BRIGHT, "mixture:tempered=200", [2], 5)
     assert not any("not enough on this rig" in reason for reason in reasons)

@@ -170,7 +170,7 @@ def test_no_more_of_the_path_is_left_out_than_the_pixels_can_hardly_see(noise_de
     information = (((above - below) / (2 * step)) ** 2).sum(axis=1).mean() * line.pixel_size / noise_density
     kernel_sd = np.sqrt(line.kernel.variance)
     assert rms <= 0.1 * kernel_sd
-    assert rms <= 2.01 / np.sqrt(information) or reduced.size == 12
+    assert rms <= 2.01 / np.sqrt(information) or reduced.size >= 12
 
 
 def slow_and_fast():
@@ -218,7 +218,21 @@ def slow_on_a_line():
     return vibrating_on_a_line(0.31, 0.007, widths=0.8, peak_snr=30)
 
 
-@pytest.mark.parametrize("make", [slow_and_fast, slow_on_a_line])
+def two_drifts():
+    """A spot on a plane that two drifts move in nearly the same direction: across it moves far less in an exposure than
+    the pixels can see, but in the end it moves."""
+    directions, kernel = np.array([0.41, 0.5]), np.sqrt(PLANE.sensor.kernel.variance)
+    plant = dataclasses.replace(
+        PLANE.plant, A=np.eye(2), B=np.eye(2), B_w=0.0134 * kernel * np.eye(2),
+        C=np.array([np.cos(directions), np.sin(directions)]), process_noise=np.eye(2), initial_mean=np.zeros(2),
+        initial_covariance=0.1 * kernel**2 * np.eye(2), axes=1,
+    )  # fmt: skip
+    sensor = dataclasses.replace(PLANE.sensor, noise_density=3e-4)
+    timing = dataclasses.replace(PLANE.timing, exposure_steps=100, frame_period_steps=100)
+    return dataclasses.replace(PLANE, plant=plant, sensor=sensor, timing=timing)
+
+
+@pytest.mark.parametrize("make", [slow_and_fast, slow_on_a_line, two_drifts])
 def test_noise_that_moves_the_mean_of_a_path_visibly_is_kept(make):
     """Position's information is that of all pixels, by finite differences along one axis."""
     rig = make()
@@ -230,7 +244,7 @@ def test_noise_that_moves_the_mean_of_a_path_visibly_is_kept(make):
     above, below = (exposure_density(line.kernel, line.edges, places + d) for d in (step, -step))
     information = (((above - below) / (2 * step)) ** 2).sum(axis=1).mean() * line.pixel_size / line.noise_density
     left_out = np.linalg.eigvalsh(mean @ reduced.left_out @ mean.T)
-    assert left_out.max() <= 0.26**2 / information  # rounding may leave even the largest a little below zero
+    assert left_out.max() <= 0.11**2 / information  # rounding may leave even the largest a little below zero
 
 
 def test_both_ends_of_an_exposure_are_as_sure_as_they_are_right_where_a_slow_process_is_the_weaker():
@@ -248,6 +262,16 @@ def test_both_ends_of_an_exposure_are_as_sure_as_they_are_right_where_a_slow_pro
                 found.append(away @ np.linalg.solve(P[0], away) / 4)
     assert 0.85 < np.mean(start) < 1.15
     assert 0.85 < np.mean(end) < 1.15
+
+
+def test_the_end_of_an_exposure_is_as_sure_as_it_is_right_where_one_direction_hardly_moves():
+    rig, nees = two_drifts(), list[float]()
+    for seed in range(16):
+        exposures = simulate(rig, 20, seed=seed, inputs=np.zeros((2000, 2)))
+        for exposure, estimate in list(zip(exposures, run(rig, exposures, ["profile"])["profile"], strict=True))[4:]:
+            away = (estimate.end_state - truth_of(exposure).end_state)[0]
+            nees.append(away @ np.linalg.solve(estimate.end_covariance[0], away) / 2)
+    assert 0.9 < np.mean(nees) < 1.1
 
 
 @pytest.mark.parametrize("name", ["profile", "mixture"])
