@@ -24,7 +24,7 @@ import numpy as np
 from scipy import linalg, special
 
 from aolink.estimation.model.quadrature import equal_parts, gauss
-from aolink.identification.models import DisturbanceProcesses
+from aolink.identification.models import AS_IN_FILE, DisturbanceProcesses, SensorFit
 from aolink.identification.readings import Readings
 from aolink.numerics.arrays import BoolArray, FloatArray, Indices
 from aolink.numerics.single_thread import by_one_thread
@@ -84,28 +84,25 @@ class Likelihood:
         """The same readings with another response to the inputs, (outputs, slots, N + 1)."""
         return Likelihood(replace(self.seen, response=response), self.length)
 
-    def __call__(
-        self, model: DisturbanceProcesses, noise: float = 1.0, wider: float = 0.0, nodes: int | None = None
-    ) -> float:
+    def __call__(self, model: DisturbanceProcesses, sensor: SensorFit = AS_IN_FILE, nodes: int | None = None) -> float:
         """Log-likelihood, -inf where the model gives no valid covariance.
 
-        ``noise`` is the factor of the pixels' noise variance, ``wider`` the kernel's variance less the rig file's,
-        slope units squared, ``nodes`` the number in an exposure; `nodes` of the model where None.
+        ``nodes`` is the number in an exposure; `nodes` of the model where None.
         """
-        return float(self.of_outputs(model, noise, wider, nodes).sum())
+        return float(self.of_outputs(model, sensor, nodes).sum())
 
     @by_one_thread
     def of_outputs(
-        self, model: DisturbanceProcesses, noise: float = 1.0, wider: float = 0.0, nodes: int | None = None
+        self, model: DisturbanceProcesses, sensor: SensorFit = AS_IN_FILE, nodes: int | None = None
     ) -> FloatArray:
         """The log-likelihood of each output, (outputs,)."""
         nodes = nodes or self.nodes(model)
         out = np.zeros(len(self.seen.mean))
         try:
-            constants = self._of_means(model, nodes, noise, out)
+            constants = self._of_means(model, nodes, sensor.noise, out)
             for each in self._in_short_runs(nodes):
-                given = self._given_means(model, nodes, each.usable, noise)
-                np.add.at(out, each.output, given.log_densities(each, constants[each.output], noise, wider))
+                given = self._given_means(model, nodes, each.usable, sensor.noise)
+                np.add.at(out, each.output, given.log_densities(each, constants[each.output], sensor))
         except linalg.LinAlgError:
             return np.full(len(out), -math.inf)
         return out if np.isfinite(out).all() else np.full(len(out), -math.inf)
@@ -250,7 +247,7 @@ class _GivenMeans:
         """S of each exposure, multiplied by the square roots of the nodes' weights on both sides, (good, nodes,
         nodes)."""
 
-    def log_densities(self, data: ShortRuns, constants: FloatArray, noise: float, wider: float) -> FloatArray:
+    def log_densities(self, data: ShortRuns, constants: FloatArray, sensor: SensorFit) -> FloatArray:
         """Log-density of each run's mean squares, (runs,); ``constants`` b of each run."""
         good, w, S = self.good, self.weights, self.S
         y = data.mean - data.response @ w + data.centre - constants[:, None]
@@ -258,13 +255,14 @@ class _GivenMeans:
         m = np.tensordot(white.T, self.gain, axes=1) + data.response[:, good]
         m = (m + (constants[:, None] - data.centre[:, good])[:, :, None]) * np.sqrt(w)
         pushed = np.matmul(S, m[..., None])[..., 0]
-        first = (m * m).sum(axis=2) + np.einsum("jaa->j", S) + wider
+        first = (m * m).sum(axis=2) + np.einsum("jaa->j", S) + sensor.wider
         second = 4 * (m * pushed).sum(axis=2) + 2 * (S * S).sum(axis=(1, 2))
         third = 24 * (pushed**2).sum(axis=2) + 8 * ((S @ S) * S).sum(axis=(1, 2))
         out = np.empty(len(first))
         for begin in range(0, len(out), _AT_ONCE):
             some = slice(begin, begin + _AT_ONCE)
-            e, read = data.square[some][:, good] - first[some], noise * data.square_noise[some][:, good]
+            e = data.square[some][:, good] - first[some]
+            read = sensor.noise * data.square_noise[some][:, good] + sensor.changes
             out[some] = _shifted_gamma(e, second[some], third[some], read).sum(axis=1)
         return out
 

@@ -14,7 +14,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -230,6 +230,20 @@ PLANTS: Mapping[str, tuple[str, ...]] = {
 ``gain`` is the slope for a resting input of one, slope units; the poles are given as in `PARAMETERS`; ``sd`` is the
 standard deviation of the slope by noise at the plant's input, slope units.
 """
+
+
+class SensorFit(NamedTuple):
+    """What is fitted of the sensor beside the disturbance; the rig file's sensor by default."""
+
+    noise: float = 1.0
+    """Factor of the pixels' noise variance."""
+    wider: float = 0.0
+    """The kernel's variance less the rig file's, slope units squared."""
+    changes: float = 0.0
+    """Variance of the kernel's variance from exposure to exposure, as focus changes it, slope units to the fourth."""
+
+
+AS_IN_FILE = SensorFit()
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from scipy import optimize
 
 from aolink.errors import IdentificationError
 from aolink.identification.likelihood import Likelihood
-from aolink.identification.models import PARAMETERS, PLANTS, IdentifiedPlant, Process, ProcessSum
+from aolink.identification.models import PARAMETERS, PLANTS, IdentifiedPlant, Process, ProcessSum, SensorFit
 from aolink.identification.readings import Readings, by_slot
 from aolink.numerics.arrays import FloatArray
 
@@ -42,6 +42,8 @@ _SAME = 0.02
 """Maxima whose parameters differ by less than this share are one."""
 _RIDGE = 0.5
 _STEP = 1e-3
+_KERNEL_CHANGE = 0.05
+"""Start of the sd of the kernel's variance from exposure to exposure, relative to the variance."""
 _NEVER = 1e12
 
 
@@ -53,7 +55,7 @@ class Space:
     with_noise: bool
     """Whether a factor of the pixels' noise variance is one more parameter."""
     with_kernel: bool
-    """Whether the kernel's variance less the rig file's is one more parameter."""
+    """Whether a factor of the kernel's variance, and its changes from exposure to exposure, are two more."""
     kernel_variance: float
     bounds: tuple[tuple[float, float], ...]
     plant: str | None = None
@@ -69,7 +71,7 @@ class Space:
         for k, kind in enumerate(self.kinds):
             number = "" if self.kinds.count(kind) == 1 else self.kinds[: k + 1].count(kind)
             names += [f"{kind}{number}.{name}" if several else name for name in PARAMETERS[kind]]
-        return (*names, *["noise"] * self.with_noise, *["kernel"] * self.with_kernel)
+        return (*names, *["noise"] * self.with_noise, *["kernel", "kernel_change"] * self.with_kernel)
 
     @property
     def _of_plant(self) -> tuple[str, ...]:
@@ -93,19 +95,20 @@ class Space:
             values = values[n:]
         return ProcessSum(tuple(processes))
 
-    def others(self, x: FloatArray) -> tuple[float, float]:
-        """Factor of the pixels' noise variance, and the kernel's variance less the rig file's."""
+    def sensor(self, x: FloatArray) -> SensorFit:
+        """What a vector says of the sensor."""
         own = len(self._of_plant) + sum(len(PARAMETERS[kind]) for kind in self.kinds)
         rest = np.exp(x[own:]).tolist()
         noise = rest.pop(0) if self.with_noise else 1.0
-        return noise, (rest[0] - 1) * self.kernel_variance if self.with_kernel else 0.0
+        factor, change = rest if self.with_kernel else (1.0, 0.0)
+        return SensorFit(noise, (factor - 1) * self.kernel_variance, (change * self.kernel_variance) ** 2)
 
     def log_likelihood(self, x: FloatArray, of: Sequence[Likelihood], nodes: int | None = None) -> float:
         """The sum over recordings, -inf outside of the limits."""
         if any(not low <= value <= high for value, (low, high) in zip(x, self.bounds, strict=True)):
             return -math.inf
-        model, (noise, wider) = self.model(x), self.others(x)
-        return sum(self.driven(x, each)(model, noise, wider, nodes) for each in of)
+        model, sensor = self.model(x), self.sensor(x)
+        return sum(self.driven(x, each)(model, sensor, nodes) for each in of)
 
     def driven(self, x: FloatArray, of: Likelihood, draws: int = 1) -> Likelihood:
         """A recording's likelihood with the fitted plant's response to its inputs, where a plant is fitted.
@@ -165,7 +168,7 @@ def space_of(
         own = limits | {"gain": (1e-3 * one.reach / span, 1e3 * one.reach / span), "damping": (1e-4, 30.0)}
         bounds = [own[name] for name in PLANTS[plant]]
     bounds += [limits[name.removeprefix("second_")] for kind in kinds for name in PARAMETERS[kind]]
-    bounds += [(0.01, 100.0)] * with_noise + [(0.25, 4.0)] * with_kernel
+    bounds += [(0.01, 100.0)] * with_noise + [(0.25, 4.0), (1e-3, 1.0)] * with_kernel
     return Space(
         tuple(kinds), with_noise, with_kernel, kernel_variance,
         tuple((math.log(low), math.log(high)) for low, high in bounds), plant, _sign(seen) if plant else 1.0,
@@ -197,7 +200,8 @@ class Maximum:
 def maxima(space: Space, seen: Sequence[Readings]) -> list[Maximum]:
     """The local maxima within `KEPT` of the highest, the highest first."""
     of = [Likelihood(each, SHORT_RUN) for each in seen]
-    points = [np.array([*point, *[0.0] * (space.with_noise + space.with_kernel)]) for point in _grid(space, seen)]
+    of_sensor = [0.0] * space.with_noise + [0.0, math.log(_KERNEL_CHANGE)] * space.with_kernel
+    points = [np.array([*point, *of_sensor]) for point in _grid(space, seen)]
     points = [np.clip(point, *np.array(space.bounds).T) for point in points]
     values = [space.log_likelihood(point, of) for point in points]
     order = np.argsort(values)[::-1]

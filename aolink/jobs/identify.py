@@ -189,15 +189,15 @@ def _of_output(
         for k, (each, value) in enumerate(zip(sets, np.exp(x).tolist(), strict=True))
     )
     plant = of.fitted_plant(x)
-    noise, wider = of.others(x)
+    sensor = of.sensor(x)
     notes = _ruled_out(of, everything, tops)
     for each in sets:
         if each.name.endswith("frequency_hz") and len(each.pieces) > 1:
             rest = ", ".join(f"{piece.best:.4g}" for piece in each.pieces if not piece.low <= each.best <= piece.high)
             notes.append(f"{each.name}: {rest} Hz explains the exposures nearly as well: an alias that remains")
     return IdentifiedModel(
-        output=output, model=_without_plant(of, x), plant=plant, noise=noise, wider=wider, parameters=sets,
-        tried=tuple(scored), log_likelihood=tops[0].log_likelihood,
+        output=output, model=_without_plant(of, x), plant=plant, noise=sensor.noise, wider=sensor.wider,
+        parameters=sets, tried=tuple(scored), log_likelihood=tops[0].log_likelihood,
         exposures=sum(int(each.usable.any(axis=0).sum()) for each in seen), notes=tuple(notes),
     )  # fmt: skip
 
@@ -210,9 +210,10 @@ def _without_plant(of: Space, x: FloatArray) -> ProcessSum:
 
 def _with_model(rig: Rig, of: Space, x: FloatArray) -> Rig:
     """The rig with the model of a vector of parameters, for a plant of one output."""
-    noise, wider = of.others(x)
+    sensor = of.sensor(x)
     models, plant = [_without_plant(of, x)], of.fitted_plant(x)
-    return parse_rig(identification.identified_text(rig.toml, rig, models, plant=plant, noise=noise, wider=wider))
+    text = identification.identified_text(rig.toml, rig, models, plant=plant, noise=sensor.noise, wider=sensor.wider)
+    return parse_rig(text)
 
 
 def _ruled_out(of: Space, found: Sequence[Maximum], left: Sequence[Maximum]) -> list[str]:

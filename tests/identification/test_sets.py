@@ -1,5 +1,7 @@
 """Sets of a recording that shows an alias; the choice of a model; what a recording without input says."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -7,7 +9,20 @@ from hypothesis import strategies as st
 
 import aolink
 from aolink.errors import IdentificationError
-from aolink.identification import Identified, Piece, chosen, identified, maxima, readings, space_of, tried
+from aolink.identification import (
+    Identified,
+    Piece,
+    Process,
+    ProcessSum,
+    chosen,
+    identified,
+    maxima,
+    readings,
+    space_of,
+    tried,
+)
+from aolink.identification.models import SensorFit
+from aolink.identification.simulate import simulated
 from aolink.jobs.demo import simulated_rig
 from aolink.recording.reader import Recording
 from aolink.session import record
@@ -41,6 +56,25 @@ def test_a_resonance_is_chosen_where_there_is_one(shaken):
     rig, seen = shaken
     names = ("random-walk", "ornstein-uhlenbeck", "resonance")
     assert chosen([tried(name, lambda kinds: space(kinds, seen, rig), seen) for name in names]).name == "resonance"
+
+
+@pytest.mark.long
+def test_the_sets_hold_a_noise_and_a_kernel_that_differ_from_the_rig_files(shaken):
+    """The kernel is wider, and changes from exposure to exposure: noise of the blur's extent, not of the centroid."""
+    _, (like,) = shaken
+    intensity, change = 0.04, 0.5
+    motion = intensity * like.n_steps * like.step_s
+    variance = motion / 2
+    seen = replace(like, square_noise=np.full_like(like.square, (0.1 * motion) ** 2))
+    sensor = SensorFit(2.0, 0.3 * variance, (change * variance) ** 2)
+    held = []
+    for seed in range(3):
+        drawn = [simulated(seen, ProcessSum((Process("random-walk", (intensity,)),)), 4, seed, sensor)]
+        of = space_of(["random-walk"], drawn, variance, with_noise=True, with_kernel=True)
+        sets = identified(of, maxima(of, drawn), drawn)
+        assert [each.name for each in sets] == ["intensity", "noise", "kernel", "kernel_change"]
+        held += [each.holds(true) for each, true in zip(sets, (intensity, 2.0, 1.3, change), strict=True)]
+    assert sum(held) >= 10
 
 
 def test_without_input_there_is_no_plant_to_identify(shaken):

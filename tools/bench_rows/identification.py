@@ -257,7 +257,8 @@ _KEY = (8, 10)
 
 @dataclass(frozen=True)
 class Diffusion:
-    """Variance that the spheres gain in a frame period along one direction, with its standard error, pixels squared."""
+    """Variance that the spheres gain in a frame period along one direction, with its standard error over
+    the spheres, pixels squared."""
 
     ours: float
     ours_sd: float
@@ -268,7 +269,7 @@ class Diffusion:
 def spheres(effort: Effort) -> list[Row]:
     """Diffusion of the film of spheres from sums of frames, beside pylake's estimate, corrected for blur, on the tracks
     of the same frames. The ratio is the joint standard error over the difference."""
-    frames = (1, 2, 4, 8) if effort == FULL else (8,)
+    frames = (1, 2, 3, 4, 6, 8, 12) if effort == FULL else (8,)
     found = {count: diffusion(count) for count in frames}
     first = found[frames[0]]
     rows = []
@@ -290,27 +291,33 @@ def spheres(effort: Effort) -> list[Row]:
 
 
 def diffusion(frames: int) -> Diffusion:
-    """The spheres' diffusion from sums of so many frames, and by pylake's covariance estimator on the means of the
-    positions in these frames."""
+    """The spheres' diffusion from sums of so many frames, each sphere with a noise and a kernel of its own, and by
+    pylake's covariance estimator on the means of the positions in these frames."""
     rig, exposures, _ = film_of_spheres(frames)
-    seen = [readings(rig, exposures, kernel_known=False)]
-    space = space_of(["random-walk"], seen, rig.sensor.kernel.variance, with_noise=True, with_kernel=True)
-    top = maxima(space, seen)
-    (intensity, *_) = identified(space, top, seen)
-    unit = rig.timing.fast_step_s / rig.sensor.pixel_width**2
-    width = intensity.pieces[-1].high - intensity.pieces[0].low
+    seen, unit = readings(rig, exposures, kernel_known=False), rig.timing.fast_step_s / rig.sensor.pixel_width**2
     moves = np.cumsum([each.inputs.sum(axis=0) for each in exposures], axis=0)
     moves = np.vstack([np.zeros(moves.shape[1]), moves[:-1]])
     places = np.array([
         np.full(rig.n_outputs, np.nan) if each.truth is None else each.truth.path.mean(axis=1) - move
         for each, move in zip(exposures, moves, strict=True)
     ]).T / rig.sensor.pixel_width  # fmt: skip
-    return Diffusion(intensity.best * unit, width / (2 * 1.96) * unit, *by_pylake(places, frames))
+    ours = []
+    for x in range(0, rig.n_outputs, 2):
+        one = [seen.of_outputs(range(x, x + 2))]
+        space = space_of(["random-walk"], one, rig.sensor.kernel.variance, with_noise=True, with_kernel=True)
+        ours.append(math.exp(maxima(space, one)[0].x[0]) * unit)
+    pylake = by_pylake(places, frames).reshape(-1, 2).mean(axis=1)
+    return Diffusion(*_with_error(np.array(ours)), *_with_error(pylake))
 
 
-def by_pylake(tracks: NDArray[np.float64], frames: int) -> tuple[float, float]:
-    """Variance that tracks (tracks, exposures) of means of so many frames gain in a frame, and its standard error over
-    the tracks, by pylake's covariance estimator; NaN where there is no position."""
+def _with_error(values: NDArray[np.float64]) -> tuple[float, float]:
+    """The mean, and its standard error."""
+    return float(values.mean()), float(values.std(ddof=1) / math.sqrt(len(values)))
+
+
+def by_pylake(tracks: NDArray[np.float64], frames: int) -> NDArray[np.float64]:
+    """Variance that tracks (tracks, exposures) of means of so many frames gain in a frame, (tracks,), by pylake's
+    covariance estimator; NaN where there is no position."""
     from lumicks.pylake.detail.pixel_calibration import PositionUnit
     from lumicks.pylake.kymotracker.detail.msd_estimation import estimate_diffusion_cve
 
@@ -319,7 +326,7 @@ def by_pylake(tracks: NDArray[np.float64], frames: int) -> tuple[float, float]:
         at = np.flatnonzero(np.isfinite(track))
         one = estimate_diffusion_cve(at, track[at], dt=frames, blur_constant=1 / 6, unit=PositionUnit.pixel)
         found.append(2 * float(one.value))
-    return float(np.mean(found)), float(np.std(found, ddof=1) / math.sqrt(len(found)))
+    return np.array(found)
 
 
 def compression() -> list[Row]:
