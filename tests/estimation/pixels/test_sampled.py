@@ -42,7 +42,7 @@ class LinearView:
 def test_it_is_the_kalman_filter_where_all_is_linear():
     reduced = likelihood.reduction(MODEL, RIG.sensor)
     rng = np.random.default_rng(1)
-    H = rng.standard_normal((4, reduced.size)) * [20, 2, 1, 1, 1, 1]
+    H = rng.standard_normal((4, reduced.size)) * [20, 2, *[1] * (reduced.size - 2)]
     before = reduced.prior(PRIOR)
     truth = before.mean[0] + np.linalg.cholesky(before.covariance[0]) @ rng.standard_normal(reduced.size)
     view = LinearView(H, (H @ truth + 0.3 * rng.standard_normal(4))[None], 0.3, reduced)
