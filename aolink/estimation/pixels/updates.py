@@ -11,7 +11,8 @@ where importance sampling is too sure without showing it (`aolink.estimation.ass
 ``points`` is none, the fit stays as wide as its few effective points make it. Some hundred points miss modes as well,
 and more of them the more coefficients there are. So a share of the posterior remains the Gaussians of the windowed
 moments, whose covariance is wide enough. With as many points as pairs of coefficients, or fewer, this share is one, and
-no point is tempered.
+no point is tempered. Importance sampling about the points weighs the modes that they have found, and half of that share
+is left.
 
 A mode that was lost is found again: a thousandth of the prior is the prediction without any measurement. Its modes are
 searched for where the NIS is larger than chance explains.
@@ -107,7 +108,8 @@ class ImportanceUpdater:
         if not self.points:
             what = "the estimate is wide"
         elif missed < 1:
-            what = f"{self.points} points tempered, and {missed:.0%} of windowed moments"
+            at_most = "" if self._hands_over(reduced) else "up to "
+            what = f"{self.points} points tempered, and {at_most}{missed:.0%} of windowed moments"
         else:
             what = "windowed moments"
         enough = "importance sampling is not enough on this rig"
