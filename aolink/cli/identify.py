@@ -54,7 +54,7 @@ def identify(
         typer.Option(help="Whether the rig file's plant is right, or the kind of plant to fit to the inputs."),
     ] = PlantKind.KNOWN,
     noise: Annotated[bool, typer.Option("--noise", help="Fit the pixels' noise too.")] = False,
-    kernel: Annotated[bool, typer.Option("--kernel", help="Fit the kernel's width too.")] = False,
+    kernel: Annotated[bool, typer.Option("--kernel", help="Fit the kernel's width too, and its changes.")] = False,
     highest: Annotated[
         float | None,
         typer.Option(metavar="HZ", min=0.0, help="Highest frequency to search; without it 4 / exposure time."),
