@@ -191,6 +191,8 @@ def _of_output(
     plant = of.fitted_plant(x)
     sensor = of.sensor(x)
     notes = _ruled_out(of, everything, tops)
+    if of.with_kernel:
+        notes.append("kernel_change is not in the rig file, which has one kernel for all exposures")
     for each in sets:
         if each.name.endswith("frequency_hz") and len(each.pieces) > 1:
             rest = ", ".join(f"{piece.best:.4g}" for piece in each.pieces if not piece.low <= each.best <= piece.high)

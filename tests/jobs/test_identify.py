@@ -25,3 +25,16 @@ def test_the_set_of_a_vibration_beside_a_drift_is_without_the_frequencies_that_t
     assert frequency.best == pytest.approx(HZ, rel=0.01)
     assert frequency.holds(HZ)
     assert not any(frequency.holds(hz) for hz in np.arange(6.0, 18.0))
+
+
+def test_changes_of_the_kernel_are_fitted_but_have_no_place_in_the_rig_file():
+    rig = load_rig("jitter")
+    exposures = list(aolink.simulate(rig, 24, seed=1))
+    wanted = Wanted(models=("random-walk",), noise=True, kernel=True)
+    result = from_readings(rig, [readings(rig, exposures, kernel_known=False)], exposures, wanted)
+    (found,) = result.found
+    assert [each.name for each in found.parameters] == ["intensity", "noise", "kernel", "kernel_change"]
+    assert any(note.startswith("kernel_change is not in the rig file") for note in found.notes)
+    written = parse_rig(result.text).sensor
+    assert written.noise_density == pytest.approx(rig.sensor.noise_density * found.noise, rel=1e-4)
+    assert written.kernel.variance == pytest.approx(rig.sensor.kernel.variance + found.wider, rel=1e-4)
