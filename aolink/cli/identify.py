@@ -188,5 +188,5 @@ def _as_json(found: "IdentifiedModel") -> dict[str, Any]:
     return {
         "output": found.output, "model": found.model.name, "exposures": found.exposures,
         "log_likelihood": found.log_likelihood, "tried": {each.name: each.score for each in found.tried},
-        "parameters": parameters,
+        "parameters": parameters, "notes": list(found.notes),
     }  # fmt: skip

@@ -42,12 +42,14 @@ class Options:
     """Basis of `moments`: "monomial", "legendre" or "fourier"."""
     tempered: int | None = None
     """Points that `profile` and `mixture` temper for an axis and exposure where importance sampling is not enough: the
-    budget of work. None: 600 and 1200. 0: none; such estimates are as wide as their few effective points make them, and
-    too narrow where importance sampling is too sure."""
+    budget of work, beside that of the importance sampling which weighs them. None: 600 and 1200. 0: none; such
+    estimates are as wide as their few effective points make them, and too narrow where importance sampling is too
+    sure."""
     draws: int = 100
     """Points that `profile` and `mixture` draw for importance sampling, in per cent of the usual number: a budget of
-    work as well. With 5 an exposure takes a sixth of the time, the estimates have larger errors, and the log-evidence,
-    which is not from these points, still tells models that differ much apart."""
+    work as well; it does not count where tempered points are weighed. With 5 an exposure takes a sixth of the time, the
+    estimates have larger errors, and the log-evidence, which is not from these points, still tells models that differ
+    much apart."""
     particles: int = 2000
     """Number of particles of `sampled`."""
     seed: int = 0

@@ -7,10 +7,10 @@ measured, p(y, s) = p(y) p(s | y).
 p(y) is Gaussian, exactly, and taken over long runs of exposures. Given y in a short run of exposures the path is
 Gaussian, with mean m and covariance S, and each s_j is a quadratic form of it: its mean is that of (m - c)^2 + diag S
 over the exposure's steps, its variance that of 2 S^2 + 4 (m - c) S (m - c) over pairs of them, and its third cumulant
-is as exact. p(s | y) is taken as the product of gamma distributions of these cumulants, with the pixels' noise: where a
-spot swings several times in an exposure, its mean square is an exponential variable. So it is a composite likelihood:
-each factor is right or nearly so, but the dependence of the mean squares on each other, given y, is left out. The
-effect of this is found by simulation (`sets`), and the sets allow for it.
+is as exact. p(s | y) is taken as the product of gamma distributions of these cumulants, with the pixels' noise and the
+kernel's changes: where a spot swings several times in an exposure, its mean square is an exponential variable. So it is
+a composite likelihood: each factor is right or nearly so, but the dependence of the mean squares on each other, given
+y, is left out. The effect of this is found by simulation (`sets`), and the sets allow for it.
 
 Sums over the steps of an exposure are Gauss's quadrature.
 """

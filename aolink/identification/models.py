@@ -240,7 +240,8 @@ class SensorFit(NamedTuple):
     wider: float = 0.0
     """The kernel's variance less the rig file's, slope units squared."""
     changes: float = 0.0
-    """Variance of the kernel's variance from exposure to exposure, as focus changes it, slope units to the fourth."""
+    """Variance of the exposures' own kernel variances about their mean, as focus changes them, slope units to the
+    fourth; each exposure's is taken as independent of the others'."""
 
 
 AS_IN_FILE = SensorFit()

@@ -43,7 +43,7 @@ _SAME = 0.02
 _RIDGE = 0.5
 _STEP = 1e-3
 _KERNEL_CHANGE = 0.05
-"""Start of the sd of the kernel's variance from exposure to exposure, relative to the variance."""
+"""Start of ``kernel_change``, the sd of the exposures' kernel variances about their mean over the rig file's."""
 _NEVER = 1e12
 
 

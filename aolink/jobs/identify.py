@@ -38,7 +38,7 @@ class Wanted:
     noise: bool = False
     """Whether the pixels' noise is fitted as well."""
     kernel: bool = False
-    """Whether the kernel's width is fitted as well."""
+    """Whether the kernel's width, and its changes from exposure to exposure, are fitted as well."""
     highest_hz: float | None = None
 
 
@@ -191,8 +191,8 @@ def _of_output(
     plant = of.fitted_plant(x)
     sensor = of.sensor(x)
     notes = _ruled_out(of, everything, tops)
-    if of.with_kernel:
-        notes.append("kernel_change is not in the rig file, which has one kernel for all exposures")
+    if of.with_kernel and not sets[-1].pieces[0].open_low:
+        notes.append("kernel_change is not in the rig file: estimators take the kernel as the same in all exposures")
     for each in sets:
         if each.name.endswith("frequency_hz") and len(each.pieces) > 1:
             rest = ", ".join(f"{piece.best:.4g}" for piece in each.pieces if not piece.low <= each.best <= piece.high)

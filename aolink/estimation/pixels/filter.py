@@ -66,7 +66,7 @@ class MixtureUpdate:
     several: BoolArray
     """Whether the posterior has several modes (more than one path explains the blur), (axes,)."""
     poor: BoolArray
-    """Whether importance sampling was not enough for it, or was not tried, (axes,)."""
+    """Whether importance sampling about the modes was not enough for it, or was not tried, (axes,)."""
 
 
 class MixtureUpdater(Protocol):

@@ -13,7 +13,7 @@ that the windowed moments leave decides (`scattered`). In both cases tempered se
 (`aolink.estimation.pixels.tempering`), and their mixture is a part of the proposal density of another
 importance sampling, which weighs the modes more exactly than the number of points in each; where its effective sample
 size is not enough, the tempered points are the posterior. On some rigs neither shows that the fit is too narrow
-(`aolink.estimation.assumptions.importance_is_too_sure`).
+(`aolink.estimation.assumptions.importance_is_too_sure`); there the tempered points always are.
 """
 
 from __future__ import annotations

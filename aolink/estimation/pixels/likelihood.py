@@ -9,7 +9,7 @@ instead. Start states are kept whole.
 
 Pixels see the mean of a path best. Noise that is left out and moves it is taken for another start state, and the end
 state, which it moves too, seems less certain than it is. So the direction in which the rest moves the mean is kept as
-well, where there are fewer than twelve coefficients.
+well, as far as sixteen coefficients do it.
 
 A direction that moves the path far may hardly change the frame, as a vibration with many swings in an exposure does,
 and one that moves it less may change the frame much. So where twelve coefficients leave much of the noise visible, the
@@ -59,8 +59,8 @@ _MEAN_LEFT_OUT = 0.1
 _MOST_WITH_MEAN = 16
 _ONE_SPOT = 2
 # Variance that the noise left out may add to the pixels together, in variances of a pixel's noise, where there are as
-# many coefficients as that. Where it adds more, directions are chosen by how much they change the pixels, until what is
-# left out adds no more than the second number.
+# many coefficients as `_MOST_SEEN`. Where it adds more, directions are chosen by how much they change the pixels, until
+# what is left out adds no more than the second number.
 _MOST_VISIBLE, _HARDLY_VISIBLE = 4.0, 0.2
 # Random paths from which the number of nodes is found, and those from which it is found what changes the pixels.
 _PATHS, _FEW_PATHS = 64, 16

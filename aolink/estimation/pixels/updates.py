@@ -11,8 +11,8 @@ where importance sampling is too sure without showing it (`aolink.estimation.ass
 ``points`` is none, the fit stays as wide as its few effective points make it. Some hundred points miss modes as well,
 and more of them the more coefficients there are. So a share of the posterior remains the Gaussians of the windowed
 moments, whose covariance is wide enough. With as many points as pairs of coefficients, or fewer, this share is one, and
-no point is tempered. Importance sampling about the points weighs the modes that they have found, and half of that share
-is left.
+no point is tempered. Importance sampling about the points then weighs the modes that they have found; where its
+effective sample size is enough, half of that share is left. This is not done where importance sampling is too sure.
 
 A mode that was lost is found again: a thousandth of the prior is the prediction without any measurement. Its modes are
 searched for where the NIS is larger than chance explains.
@@ -108,7 +108,7 @@ class ImportanceUpdater:
         if not self.points:
             what = "the estimate is wide"
         elif missed < 1:
-            at_most = "" if self._hands_over(reduced) else "up to "
+            at_most = "" if self.too_sure else "up to "
             what = f"{self.points} points tempered, and {at_most}{missed:.0%} of windowed moments"
         else:
             what = "windowed moments"
@@ -175,8 +175,8 @@ class ImportanceUpdater:
         wide = wide.replaced(by_share, _by_share_of(points.part(by_share), wide.part(by_share)))
         missed = self._missed(view.reduced)
         fit = joined(points.weighted(1 - missed), wide.weighted(missed))
-        if not self._hands_over(view.reduced):
-            weighed, good = posterior(view, prior, beside_points(proposal, points), self.several, self.enough)
+        if not self.too_sure:
+            weighed, good = posterior(view, prior, beside_points(proposal, points), 1.0, self.enough)
             missed *= _LEFT
             better = joined(weighed.weighted(1 - missed), wide.weighted(missed))
             fit = fit.replaced(np.flatnonzero(good), better.part(np.flatnonzero(good)))

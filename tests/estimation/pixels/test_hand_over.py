@@ -64,14 +64,15 @@ def test_too_few_points_for_the_coefficients_are_not_tempered():
     assert np.mean(estimate.path_sd**2) == pytest.approx(np.mean(moments.path_sd**2), rel=0.3)
 
 
+@pytest.mark.parametrize("name", ["profile", "profile:draws=10"])
 @pytest.mark.parametrize("seed", [11, 12])
-def test_modes_have_the_weights_of_importance_sampling_where_it_is_enough_about_tempered_points(seed):
+def test_modes_have_the_weights_of_importance_sampling_where_it_is_enough_about_tempered_points(seed, name):
     """A blur does not tell a path from the same one backwards, so the mean path in the first exposure is symmetric in
     time. With as many points about each mode as chance has left there, it was a half and a third of its sd off."""
     rig = vibrating(1, (5.2,), damping=0.13, sd=0.19, noise_density=2e-4)
     (exposure,) = simulate(rig, 1, seed=seed, inputs=np.zeros((rig.timing.exposure_steps, 1)))
-    estimate = make_estimator(rig, "profile").step(exposure)
-    assert "600 points tempered" in estimate.reason
+    estimate = make_estimator(rig, name).step(exposure)
+    assert "600 points tempered, and up to" in estimate.reason
     off = (estimate.path[0] - estimate.path[0, ::-1]) / 2
     assert np.sqrt(np.mean(off**2) / np.mean(estimate.path_sd**2)) < 0.1
 
@@ -138,6 +139,7 @@ def test_an_estimate_by_importance_sampling_says_there_that_its_intervals_may_be
     several = [reason for reason in reasons if "more than one path" in reason]
     assert any("often too sure on this rig: intervals may be too narrow" in reason for reason in several)
     assert all("may be too narrow" in reason or "too few importance weights" in reason for reason in several)
+    assert not any("up to" in reason for reason in reasons)  # tempered points are not weighed there
 
 
 def test_there_mixture_does_not_temper_points_that_are_too_few_for_most_of_a_posterior():

@@ -158,7 +158,8 @@ def test_fewer_nodes_and_coefficients_cost_less_than_the_noise():
 
 @pytest.mark.parametrize("noise_density", [1e-6, 1e-4, 1e-2])
 def test_no_more_of_the_path_is_left_out_than_the_pixels_can_hardly_see(noise_density):
-    """Position's information by finite differences of the optics; twelve coefficients are enough of it."""
+    """Position's information by finite differences of the optics; where twelve coefficients are not enough, there are
+    few more, for the mean of the path."""
     sensor = dataclasses.replace(LINE.sensor, noise_density=noise_density)
     model = exposure_model(LINE.plant, 200)
     reduced = likelihood.reduction(model, sensor)
@@ -170,7 +171,7 @@ def test_no_more_of_the_path_is_left_out_than_the_pixels_can_hardly_see(noise_de
     information = (((above - below) / (2 * step)) ** 2).sum(axis=1).mean() * line.pixel_size / noise_density
     kernel_sd = np.sqrt(line.kernel.variance)
     assert rms <= 0.1 * kernel_sd
-    assert rms <= 2.01 / np.sqrt(information) or reduced.size >= 12
+    assert rms <= 2.01 / np.sqrt(information) or 12 <= reduced.size <= 14
 
 
 def slow_and_fast():
