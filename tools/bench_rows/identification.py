@@ -257,37 +257,48 @@ _KEY = (8, 10)
 
 @dataclass(frozen=True)
 class Diffusion:
-    """Variance that the spheres gain in a frame period along one direction, with its standard error over
-    the spheres, pixels squared."""
+    """Variance that each sphere gains in a frame period along one direction, pixels squared, (spheres,)."""
 
-    ours: float
-    ours_sd: float
-    pylake: float
-    pylake_sd: float
+    ours: NDArray[np.float64]
+    pylake: NDArray[np.float64]
 
 
 def spheres(effort: Effort) -> list[Row]:
-    """Diffusion of the film of spheres from sums of frames, beside pylake's estimate, corrected for blur, on the tracks
-    of the same frames. The ratio is the joint standard error over the difference."""
+    """Diffusion of the film of spheres from sums of frames, with the standard error over the spheres, beside pylake's
+    estimate, corrected for blur, on the tracks of the same frames. The ratio is the joint standard error over the
+    difference."""
     frames = (1, 2, 3, 4, 6, 8, 12) if effort == FULL else (8,)
     found = {count: diffusion(count) for count in frames}
     first = found[frames[0]]
     rows = []
     for count, each in found.items():
-        ours, theirs = f"{each.ours:.3f} +- {each.ours_sd:.3f}", f"{each.pylake:.3f} +- {each.pylake_sd:.3f}"
-        off = (each.ours - each.pylake) / math.hypot(each.ours_sd, each.pylake_sd)
+        off = _apart(each.ours, each.pylake)
         rows.append(Row(
-            f"spheres, sums of {count}: pixels squared a frame", ours, f"pylake {theirs}, {off:+.1f} sd",
+            f"spheres, sums of {count}: pixels squared a frame", _shown(each.ours),
+            f"pylake {_shown(each.pylake)}, {off:+.1f} sd; by sphere {_shown(each.ours - each.pylake)}",
             1 / max(abs(off), 1e-3), 1.0,
         ))  # fmt: skip
         if count != frames[0]:
-            off = (each.ours - first.ours) / math.hypot(each.ours_sd, first.ours_sd)
-            tracks = (each.pylake - first.pylake) / math.hypot(each.pylake_sd, first.pylake_sd)
+            off = _apart(each.ours, first.ours)
             rows.append(Row(
-                f"spheres, sums of {count} less single frames", f"{off:+.1f} sd", f"pylake {tracks:+.1f} sd",
-                1 / max(abs(off), 1e-3), 1.0,
+                f"spheres, sums of {count} less single frames", f"{off:+.1f} sd",
+                f"pylake {_apart(each.pylake, first.pylake):+.1f} sd", 1 / max(abs(off), 1e-3), 1.0,
             ))  # fmt: skip
     return [*rows, *compression()]
+
+
+def _apart(one: NDArray[np.float64], other: NDArray[np.float64]) -> float:
+    """The difference of two means over the spheres, in joint standard errors."""
+    return float((one.mean() - other.mean()) / math.hypot(_error(one), _error(other)))
+
+
+def _error(values: NDArray[np.float64]) -> float:
+    """The standard error of the mean."""
+    return float(values.std(ddof=1) / math.sqrt(len(values)))
+
+
+def _shown(values: NDArray[np.float64]) -> str:
+    return f"{values.mean():.3f} +- {_error(values):.3f}"
 
 
 def diffusion(frames: int) -> Diffusion:
@@ -306,13 +317,7 @@ def diffusion(frames: int) -> Diffusion:
         one = [seen.of_outputs(range(x, x + 2))]
         space = space_of(["random-walk"], one, rig.sensor.kernel.variance, with_noise=True, with_kernel=True)
         ours.append(math.exp(maxima(space, one)[0].x[0]) * unit)
-    pylake = by_pylake(places, frames).reshape(-1, 2).mean(axis=1)
-    return Diffusion(*_with_error(np.array(ours)), *_with_error(pylake))
-
-
-def _with_error(values: NDArray[np.float64]) -> tuple[float, float]:
-    """The mean, and its standard error."""
-    return float(values.mean()), float(values.std(ddof=1) / math.sqrt(len(values)))
+    return Diffusion(np.array(ours), by_pylake(places, frames).reshape(-1, 2).mean(axis=1))
 
 
 def by_pylake(tracks: NDArray[np.float64], frames: int) -> NDArray[np.float64]:
