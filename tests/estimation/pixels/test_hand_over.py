@@ -197,9 +197,9 @@ def test_a_demo_leaves_mixture_out_where_it_tempers_in_nearly_every_exposure():
 @pytest.mark.long
 def test_intervals_hold_where_importance_sampling_is_too_sure():
     """If points are tempered only where their weights or the windowed moments show that it is needed, 95 % intervals
-    hold 0.91 of the path, and the NEES is 1.45 times its expectation."""
+    hold 0.85 of the path, and the NEES is 1.74 times its expectation."""
     (inside, _, nees), _ = errors_of(BRIGHT, "mixture", range(4), 10)
-    assert 0.94 < inside < 0.99
+    assert 0.93 < inside < 0.98
     assert nees < 1.25
 
 
