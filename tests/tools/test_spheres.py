@@ -22,10 +22,12 @@ def identification() -> Any:
 
 
 def test_single_frames_of_the_film_are_late_by_its_compression(identification: Any) -> None:
-    """A random walk has no covariance of steps two frames apart, and steps of one size in each frame."""
-    lagged, key = identification.compression()
+    """A random walk has no covariance of steps two frames apart, steps of one size in each frame, and a mean square
+    displacement that grows evenly."""
+    lagged, key, growth = identification.compression()
     assert lagged.ratio > 4  # standard deviations
     assert key.ratio > 1.3
+    assert growth.ratio > 4  # standard deviations
 
 
 @pytest.fixture
@@ -37,16 +39,21 @@ def walk() -> Any:
 
 def test_a_random_walk_shows_no_compression(identification: Any, monkeypatch: pytest.MonkeyPatch, walk: Any) -> None:
     monkeypatch.setattr(identification.np, "load", lambda path: {"tracked_xy": walk})
-    lagged, key = identification.compression()
+    lagged, key, growth = identification.compression()
     assert lagged.ratio < 3
     assert key.ratio == pytest.approx(1, abs=0.2)
+    assert abs(growth.ratio) < 3
 
 
 @pytest.mark.parametrize("frames", [1, 4])
-def test_pylake_finds_the_walks_intensity(identification: Any, walk: Any, frames: int) -> None:
+@pytest.mark.parametrize("noise", [0.2, None])
+def test_pylake_finds_the_walks_intensity(identification: Any, walk: Any, frames: int, noise: float | None) -> None:
     needed("lumicks.pylake")
     tracks = walk.transpose(0, 2, 1).reshape(12, -1, frames).mean(axis=2)
-    found = identification.by_pylake(tracks, frames)
-    sd = found.std() / len(found) ** 0.5
-    assert abs(found.mean() - 1) < 3 * sd
+    tracks = tracks + np.random.default_rng(1).normal(scale=0.2**0.5, size=tracks.shape)
+    found = identification.by_pylake(tracks, frames, noise)
+    sd = found.intensity.std() / len(found.intensity) ** 0.5
+    assert abs(found.intensity.mean() - 1) < 3 * sd
     assert sd < 0.2
+    noise_sd = found.noise.std() / len(found.noise) ** 0.5
+    assert abs(found.noise.mean() - 0.2) < 3 * noise_sd + 1e-9

@@ -10,6 +10,7 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -261,22 +262,31 @@ class Diffusion:
 
     ours: NDArray[np.float64]
     pylake: NDArray[np.float64]
+    """With a noise of the positions that is known."""
+    unknown: NDArray[np.float64]
+    """By pylake too, with a noise of the positions that is estimated with it."""
+    noise: float
+    """That noise, the mean over the tracks, pixels squared."""
 
 
 def spheres(effort: Effort) -> list[Row]:
     """Diffusion of the film of spheres from sums of frames, with the standard error over the spheres, beside pylake's
-    estimate, corrected for blur, on the tracks of the same frames. The ratio is the joint standard error over the
-    difference."""
+    estimate on the tracks of the same frames. The ratio is the joint standard error over the difference.
+
+    Only if the positions' noise is known does pylake's estimate depend on the blur: it is the one that single frames
+    have. Estimated together with the intensity, as in the last column, it has no bounds.
+    """
     frames = (1, 2, 3, 4, 6, 8, 12) if effort == FULL else (8,)
-    found = {count: diffusion(count) for count in frames}
+    noise = float(by_pylake(_tracks(), 1).noise.mean())
+    found = {count: diffusion(count, noise) for count in frames}
     first = found[frames[0]]
     rows = []
     for count, each in found.items():
         off = _apart(each.ours, each.pylake)
         rows.append(Row(
             f"spheres, sums of {count}: pixels squared a frame", _shown(each.ours),
-            f"pylake {_shown(each.pylake)}, {off:+.1f} sd; by sphere {_shown(each.ours - each.pylake)}",
-            1 / max(abs(off), 1e-3), 1.0,
+            f"pylake {_shown(each.pylake)}, {off:+.1f} sd; by sphere {_shown(each.ours - each.pylake)}; with noise"
+            f" {each.noise:+.3f} {_shown(each.unknown)}", 1 / max(abs(off), 1e-3), 1.0,
         ))  # fmt: skip
         if count != frames[0]:
             off = _apart(each.ours, first.ours)
@@ -301,9 +311,10 @@ def _shown(values: NDArray[np.float64]) -> str:
     return f"{values.mean():.3f} +- {_error(values):.3f}"
 
 
-def diffusion(frames: int) -> Diffusion:
+def diffusion(frames: int, noise: float) -> Diffusion:
     """The spheres' diffusion from sums of so many frames, each sphere with a noise and a kernel of its own, and by
-    pylake's covariance estimator on the means of the positions in these frames."""
+    pylake's covariance estimator on the means of the positions in these frames, whose noise has the variance ``noise``
+    in a single frame, pixels squared."""
     rig, exposures, _ = film_of_spheres(frames)
     seen, unit = readings(rig, exposures, kernel_known=False), rig.timing.fast_step_s / rig.sensor.pixel_width**2
     moves = np.cumsum([each.inputs.sum(axis=0) for each in exposures], axis=0)
@@ -317,31 +328,56 @@ def diffusion(frames: int) -> Diffusion:
         one = [seen.of_outputs(range(x, x + 2))]
         space = space_of(["random-walk"], one, rig.sensor.kernel.variance, with_noise=True, with_kernel=True)
         ours.append(math.exp(maxima(space, one)[0].x[0]) * unit)
-    return Diffusion(np.array(ours), by_pylake(places, frames).reshape(-1, 2).mean(axis=1))
+    known, unknown = by_pylake(places, frames, noise / frames), by_pylake(places, frames)
+    of_spheres = [each.intensity.reshape(-1, 2).mean(axis=1) for each in (known, unknown)]
+    return Diffusion(np.array(ours), *of_spheres, float(unknown.noise.mean()))
 
 
-def by_pylake(tracks: NDArray[np.float64], frames: int) -> NDArray[np.float64]:
-    """Variance that tracks (tracks, exposures) of means of so many frames gain in a frame, (tracks,), by pylake's
-    covariance estimator; NaN where there is no position."""
+class ByPylake(NamedTuple):
+    """Pylake's results for each track, pixels squared."""
+
+    intensity: NDArray[np.float64]
+    """Variance gained in a frame."""
+    noise: NDArray[np.float64]
+    """Variance of the positions' noise."""
+
+
+def by_pylake(tracks: NDArray[np.float64], frames: int, noise: float | None = None) -> ByPylake:
+    """Pylake's covariance estimator on tracks (tracks, exposures) of means of so many frames, NaN where there is no
+    position; ``noise`` is the variance of the positions' noise, if it is known."""
     from lumicks.pylake.detail.pixel_calibration import PositionUnit
     from lumicks.pylake.kymotracker.detail.msd_estimation import estimate_diffusion_cve
 
+    exact = None if noise is None else 0.0
     found = []
     for track in tracks:
         at = np.flatnonzero(np.isfinite(track))
-        one = estimate_diffusion_cve(at, track[at], dt=frames, blur_constant=1 / 6, unit=PositionUnit.pixel)
-        found.append(2 * float(one.value))
-    return np.array(found)
+        one = estimate_diffusion_cve(
+            at, track[at], dt=frames, blur_constant=1 / 6, unit=PositionUnit.pixel, localization_var=noise,
+            var_of_localization_var=exact,
+        )  # fmt: skip
+        found.append((2 * float(one.value), float(one.localization_variance)))
+    return ByPylake(*np.array(found).T)
+
+
+def _tracks() -> NDArray[np.float64]:
+    """The spheres' tracks in single frames, (12, frames), pixels."""
+    xy = np.load(SPHERES)["tracked_xy"]
+    return np.asarray(xy.transpose(0, 2, 1).reshape(-1, xy.shape[1]))
 
 
 def compression() -> list[Row]:
-    """What the film's compression does to single frames: motion comes late, and with a group's key frame at once."""
-    xy = np.load(SPHERES)["tracked_xy"]
-    steps = np.diff(xy, axis=1).transpose(0, 2, 1).reshape(-1, xy.shape[1] - 1)
+    """What the film's compression does to single frames: motion comes late, and with a group's key frame at once.
+
+    Noise and exposure add the same to each mean square, so its growth from lag to lag is the walk's intensity.
+    """
+    tracks = _tracks()
+    steps = np.diff(tracks, axis=1)
     lagged = (steps[:, 2:] * steps[:, :-2]).mean(axis=1)
     sd = lagged.std(ddof=1) / math.sqrt(len(lagged))
     at = np.arange(steps.shape[1]) % _PICTURES
     key = (at >= _KEY[0]) & (at < _KEY[1])
+    soon, later = _growth(tracks, 1, 2), _growth(tracks, 6, 12)
     return [
         Row(
             "tracks: covariance of steps two frames apart", f"{lagged.mean():.4f} +- {sd:.4f} px2",
@@ -352,4 +388,15 @@ def compression() -> list[Row]:
             f"{(steps[:, ~key] ** 2).mean():.3f} px2 elsewhere",
             float((steps[:, key] ** 2).mean() / (steps[:, ~key] ** 2).mean()), 0.0,
         ),
+        Row(
+            "tracks: growth of the mean square displacement, 6 to 12 frames", f"{_shown(later)} px2",
+            f"{_shown(soon)} px2, 1 to 2 frames; by sphere {_shown(later - soon)} more",
+            (later - soon).mean() / _error(later - soon), 0.0,
+        ),
     ]  # fmt: skip
+
+
+def _growth(tracks: NDArray[np.float64], first: int, last: int) -> NDArray[np.float64]:
+    """Growth of each sphere's mean square displacement along one direction between two lags, a frame, (spheres,)."""
+    one, other = (((tracks[:, lag:] - tracks[:, :-lag]) ** 2).mean(axis=1) for lag in (first, last))
+    return np.asarray((other - one).reshape(-1, 2).mean(axis=1) / (last - first))

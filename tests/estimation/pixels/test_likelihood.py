@@ -233,10 +233,12 @@ def two_drifts():
     return dataclasses.replace(PLANE, plant=plant, sensor=sensor, timing=timing)
 
 
-@pytest.mark.parametrize("make", [slow_and_fast, slow_on_a_line, two_drifts])
-def test_noise_that_moves_the_mean_of_a_path_visibly_is_kept(make):
-    """Position's information is that of all pixels, by finite differences along one axis."""
-    rig = make()
+def mean_left_out(rig):
+    """The largest variance of the mean of the path that is left out, in variances of the position as measured from the
+    pixels of a spot at rest; and the number of coefficients.
+
+    Position's information is that of all pixels, by finite differences along one axis.
+    """
     model = exposure_model(rig.plant, 100)
     reduced = likelihood.reduction(model, rig.sensor)
     mean = model.basis.mean(axis=1)
@@ -244,8 +246,24 @@ def test_noise_that_moves_the_mean_of_a_path_visibly_is_kept(make):
     places = np.linspace(0, line.pixel_size, 50)[:, None]
     above, below = (exposure_density(line.kernel, line.edges, places + d) for d in (step, -step))
     information = (((above - below) / (2 * step)) ** 2).sum(axis=1).mean() * line.pixel_size / line.noise_density
-    left_out = np.linalg.eigvalsh(mean @ reduced.left_out @ mean.T)
-    assert left_out.max() <= 0.11**2 / information  # rounding may leave even the largest a little below zero
+    return np.linalg.eigvalsh(mean @ reduced.left_out @ mean.T).max() * information, reduced.size
+
+
+@pytest.mark.parametrize("make", [slow_and_fast, slow_on_a_line, two_drifts])
+def test_noise_that_moves_the_mean_of_a_path_visibly_is_kept(make):
+    assert mean_left_out(make())[0] <= 0.11**2  # rounding may leave even the largest a little below zero
+
+
+def test_no_coefficient_is_added_for_the_mean_of_a_path_where_there_are_sixteen():
+    """There are as few as leave out a tenth of the kernel's sd of the path."""
+    rig = vibrating_on_a_line(2.5, 0.05, widths=4, peak_snr=100)
+    noise = exposure_model(rig.plant, 100).basis[0][:, 2:]
+    rest = np.cumsum(np.linalg.svd(noise / 10, compute_uv=False)[::-1] ** 2)[::-1]
+    needed = 2 + np.count_nonzero(rest > 0.1**2 * rig.sensor.kernel.variance)
+    left_out, size = mean_left_out(rig)
+    assert needed > 16
+    assert size == needed
+    assert left_out > 0.11**2
 
 
 def test_both_ends_of_an_exposure_are_as_sure_as_they_are_right_where_a_slow_process_is_the_weaker():
