@@ -262,7 +262,7 @@ class Diffusion:
 
     ours: NDArray[np.float64]
     pylake: NDArray[np.float64]
-    """With a noise of the positions that is known."""
+    """With the noise of the positions that single frames have."""
     unknown: NDArray[np.float64]
     """By pylake too, with a noise of the positions that is estimated with it."""
     noise: float
@@ -277,7 +277,7 @@ def spheres(effort: Effort) -> list[Row]:
     have. Estimated together with the intensity, as in the last column, it has no bounds.
     """
     frames = (1, 2, 3, 4, 6, 8, 12) if effort == FULL else (8,)
-    noise = float(by_pylake(_tracks(), 1).noise.mean())
+    noise = float(by_pylake(_positions(*film_of_spheres(1)[:2]), 1).noise.mean())
     found = {count: diffusion(count, noise) for count in frames}
     first = found[frames[0]]
     rows = []
@@ -317,20 +317,25 @@ def diffusion(frames: int, noise: float) -> Diffusion:
     in a single frame, pixels squared."""
     rig, exposures, _ = film_of_spheres(frames)
     seen, unit = readings(rig, exposures, kernel_known=False), rig.timing.fast_step_s / rig.sensor.pixel_width**2
-    moves = np.cumsum([each.inputs.sum(axis=0) for each in exposures], axis=0)
-    moves = np.vstack([np.zeros(moves.shape[1]), moves[:-1]])
-    places = np.array([
-        np.full(rig.n_outputs, np.nan) if each.truth is None else each.truth.path.mean(axis=1) - move
-        for each, move in zip(exposures, moves, strict=True)
-    ]).T / rig.sensor.pixel_width  # fmt: skip
     ours = []
     for x in range(0, rig.n_outputs, 2):
         one = [seen.of_outputs(range(x, x + 2))]
         space = space_of(["random-walk"], one, rig.sensor.kernel.variance, with_noise=True, with_kernel=True)
         ours.append(math.exp(maxima(space, one)[0].x[0]) * unit)
-    known, unknown = by_pylake(places, frames, noise / frames), by_pylake(places, frames)
+    positions = _positions(rig, exposures)
+    known, unknown = by_pylake(positions, frames, noise / frames), by_pylake(positions, frames)
     of_spheres = [each.intensity.reshape(-1, 2).mean(axis=1) for each in (known, unknown)]
     return Diffusion(np.array(ours), *of_spheres, float(unknown.noise.mean()))
+
+
+def _positions(rig: Rig, exposures: Sequence[Exposure]) -> NDArray[np.float64]:
+    """Each sphere's mean position in each exposure, (12, exposures), pixels; NaN where a frame has none."""
+    moves = np.cumsum([each.inputs.sum(axis=0) for each in exposures], axis=0)
+    moves = np.vstack([np.zeros(moves.shape[1]), moves[:-1]])
+    return np.array([
+        np.full(rig.n_outputs, np.nan) if each.truth is None else each.truth.path.mean(axis=1) - move
+        for each, move in zip(exposures, moves, strict=True)
+    ]).T / rig.sensor.pixel_width  # fmt: skip
 
 
 class ByPylake(NamedTuple):
