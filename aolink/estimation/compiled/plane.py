@@ -57,15 +57,11 @@ def log_likelihoods_of_spots(seen: Plane, row: int, t: FloatArray, begin: int, e
         for spot in range(seen.y.shape[1]):
             _path_of(seen, row, spot, t[:, k], path)
             f[:] = 0.0
-            for node in range(len(seen.weights)):
-                left, column, dx = place(path[0, node], seen.low, seen.per_unit, side, seen.across.shape[1], across)
-                top, line, dy = place(path[1, node], seen.low, seen.per_unit, side, seen.down.shape[1], down)
-                if left < 0 or top < 0:
-                    continue
-                for j in range(len(seen.terms)):
-                    _taylor(seen.across[j, column], dx, seen.terms[j] * seen.weights[node], columns)
-                    _taylor(seen.down[j, line], dy, 1.0, rows)
-                    _add_product(f, top, left, rows, columns)
+            for j in range(len(seen.terms)):
+                _add_spots(
+                    path, seen.weights, seen.terms[j], seen.low, seen.per_unit, side, seen.across[j], seen.down[j],
+                    columns, rows, f,
+                )  # fmt: skip
             light, usable = seen.y[row, spot], seen.usable[row, spot]
             if seen.gain:
                 own = f[down : down + side, across : across + side].copy()
@@ -123,6 +119,40 @@ def _path_of(seen: Plane, row: int, spot: int, t: FloatArray, path: FloatArray) 
             value = t[i]
             for node in range(path.shape[1]):
                 path[d, node] += value * seen.basis[output, i, node]
+
+
+@compiled
+def _add_spots(
+    path: FloatArray, weights: FloatArray, term: float, low: float, per_unit: float, side: int, across: FloatArray,
+    down: FloatArray, columns: FloatArray, rows: FloatArray, f: FloatArray,
+) -> None:  # fmt: skip
+    """The light of a spot at each node, rows times columns, added to padded densities f.
+
+    Indices are unsigned and arrays flat: signed indices might count from the end, and slices would have their
+    references counted; either makes the loop over the pixels of a row twice as slow.
+    """
+    A, D, lit, width = across.ravel(), down.ravel(), f.ravel(), np.uintp(f.shape[1])
+    wide, high = np.uintp(len(columns)), np.uintp(len(rows))
+    for node in range(path.shape[1]):
+        left, column, dx = place(path[0, node], low, per_unit, side, across.shape[0], len(columns))
+        top, line, dy = place(path[1, node], low, per_unit, side, down.shape[0], len(rows))
+        if left < 0 or top < 0:
+            continue
+        weight, at = term * weights[node], np.uintp(4 * column) * wide
+        for p in range(len(columns)):
+            q = at + np.uintp(p)
+            light = A[q] + dx * (A[q + wide] + dx * (A[q + wide + wide] + dx * A[q + wide + wide + wide]))
+            columns[np.uintp(p)] = weight * light
+        at = np.uintp(4 * line) * high
+        for p in range(len(rows)):
+            q = at + np.uintp(p)
+            rows[np.uintp(p)] = D[q] + dy * (D[q + high] + dy * (D[q + high + high] + dy * D[q + high + high + high]))
+        first = np.uintp(top) * width + np.uintp(left)
+        for r in range(len(rows)):
+            light = rows[np.uintp(r)]
+            for c in range(len(columns)):
+                lit[first + np.uintp(c)] += light * columns[np.uintp(c)]
+            first += width
 
 
 @inlined
