@@ -125,8 +125,31 @@ def importance_is_too_sure(rig: Rig) -> bool:
     if peak_snr(rig) < _BRIGHT or rig.plant.n_outputs > _MOST_OUTPUTS:
         return False
     values, seen, apart = _eigenmodes(rig)
-    outlasts = (values.imag > 0) & (np.abs(values) > math.exp(-1 / rig.timing.frame_period_steps))
-    return apart and bool(((seen.sum(axis=1) > 1) & (seen & outlasts).any(axis=1)).any())
+    return apart and bool(((seen.sum(axis=1) > 1) & (seen & _outlasts(rig, values)).any(axis=1)).any())
+
+
+def modes_stay_lost(rig: Rig) -> bool:
+    """Whether a mode of the posterior that an estimator misses stays lost for long: with a vibration that makes a whole
+    swing or more in an exposure, of which the centroid tells little, and goes on for longer than a frame period, so
+    that a wrong state is carried on.
+
+    False with more than two outputs.
+    """
+    if rig.plant.n_outputs > _MOST_OUTPUTS:
+        return False
+    values, seen, _ = _eigenmodes(rig)
+    hardly_moves_centroid = _swings(rig, values) >= 1 - _ROUNDING
+    return bool((seen & _outlasts(rig, values) & hardly_moves_centroid).any())
+
+
+def _outlasts(rig: Rig, values: NDArray[np.complex128]) -> BoolArray:
+    """Which eigenvalues are those of a vibration that goes on for longer than a frame period."""
+    return np.asarray((values.imag > 0) & (np.abs(values) > math.exp(-1 / rig.timing.frame_period_steps)))
+
+
+def _swings(rig: Rig, values: NDArray[np.complex128]) -> FloatArray:
+    """Swings in an exposure, by eigenvalues."""
+    return np.angle(values) / (2 * math.pi) * rig.timing.exposure_steps
 
 
 def narrow_intervals(rig: Rig) -> Iterator[tuple[str, str]]:
@@ -145,7 +168,7 @@ def _modes(rig: Rig) -> tuple[int, FloatArray]:
     """The number of eigenmodes that move the spot along one axis, an oscillation counting as one; and the swings of
     each in an exposure."""
     values, seen, _ = _eigenmodes(rig)
-    return int(seen.sum(axis=1).max()), np.angle(values[seen.any(axis=0)]) / (2 * math.pi) * rig.timing.exposure_steps
+    return int(seen.sum(axis=1).max()), _swings(rig, values[seen.any(axis=0)])
 
 
 def _eigenmodes(rig: Rig) -> tuple[NDArray[np.complex128], BoolArray, bool]:

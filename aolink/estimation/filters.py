@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from aolink.errors import EstimatorError
-from aolink.estimation.assumptions import importance_is_too_sure
+from aolink.estimation.assumptions import importance_is_too_sure, modes_stay_lost
 from aolink.estimation.compiled import make_ready
 from aolink.estimation.frames.centroid_noise import centroid_covariance
 from aolink.estimation.frames.frame_data import Profile, SpotWindows
@@ -140,8 +140,9 @@ def mixture(rig: Rig, options: Options) -> Filter:
 
 def _budgeted(rig: Rig, options: Options, updates: ImportanceUpdater) -> ImportanceUpdater:
     # The copies of a rig whose parameter wanders are to work alike, or their evidence could not be compared.
-    too_sure = rig.plant.wandering is None and importance_is_too_sure(rig)
-    return updates.within(options.tempered, options.draws / 100, too_sure=too_sure)
+    wanders = rig.plant.wandering is not None
+    too_sure, stay_lost = not wanders and importance_is_too_sure(rig), wanders or modes_stay_lost(rig)
+    return updates.within(options.tempered, options.draws / 100, too_sure=too_sure, stay_lost=stay_lost)
 
 
 def sampled(rig: Rig, options: Options) -> Filter:

@@ -12,7 +12,8 @@ where importance sampling is too sure without showing it (`aolink.estimation.ass
 and more of them the more coefficients there are. So a share of the posterior remains the Gaussians of the windowed
 moments, whose covariance is wide enough. With as many points as pairs of coefficients, or fewer, this share is one, and
 no point is tempered. Importance sampling about the points then weighs the modes that they have found; where its
-effective sample size is enough, half of that share is left. This is not done where importance sampling is too sure.
+effective sample size is enough, a quarter of that share is left, and all of it where modes that were missed would stay
+lost for long (`aolink.estimation.assumptions.modes_stay_lost`). This is not done where importance sampling is too sure.
 
 A mode that was lost is found again: a thousandth of the prior is the prediction without any measurement. Its modes are
 searched for where the NIS is larger than chance explains.
@@ -59,8 +60,8 @@ _LEAST_DOUBTED_SHARE = 0.005
 # Posteriors are not tempered for having several modes if the windowed moments would have this share of them.
 _MOST_MISSED = 0.5
 # Share of the posterior that importance sampling about tempered points may have missed, relative to what the points
-# alone may have.
-_LEFT = 0.5
+# alone may have; and the same where modes stay lost.
+_LEFT, _LEFT_LOST = 0.25, 1.0
 
 
 @dataclass(frozen=True)
@@ -86,12 +87,15 @@ class ImportanceUpdater:
     sure."""
     too_sure: bool = False
     """Whether the rig is such a one."""
+    left: float = _LEFT_LOST
+    """Share of what tempered points may have missed that importance sampling about them may have missed too."""
 
-    def within(self, points: int | None, share: float, *, too_sure: bool) -> ImportanceUpdater:
+    def within(self, points: int | None, share: float, *, too_sure: bool, stay_lost: bool) -> ImportanceUpdater:
         """The same with another number of tempered points, if not None, and a share of the others, for a rig where
-        importance sampling is often too sure, or another one."""
-        points = self.points if points is None else points
-        return replace(self, points=points, share=share * self.share, several=share * self.several, too_sure=too_sure)
+        importance sampling is often too sure, or another one, and where modes that were missed stay lost, or not."""
+        points, left = self.points if points is None else points, _LEFT_LOST if stay_lost else _LEFT
+        several, share = share * self.several, share * self.share
+        return replace(self, points=points, share=share, several=several, too_sure=too_sure, left=left)
 
     def _hands_over(self, reduced: Reduction) -> bool:
         """Whether all posteriors with several modes are tempered: where there are points enough for that."""
@@ -108,7 +112,7 @@ class ImportanceUpdater:
         if not self.points:
             what = "the estimate is wide"
         elif missed < 1:
-            at_most = "" if self.too_sure else "up to "
+            at_most = "up to " if self.left < 1 and not self.too_sure else ""
             what = f"{self.points} points tempered, and {at_most}{missed:.0%} of windowed moments"
         else:
             what = "windowed moments"
@@ -177,7 +181,7 @@ class ImportanceUpdater:
         fit = joined(points.weighted(1 - missed), wide.weighted(missed))
         if not self.too_sure:
             weighed, good = posterior(view, prior, beside_points(proposal, points), 1.0, self.enough)
-            missed *= _LEFT
+            missed *= self.left
             better = joined(weighed.weighted(1 - missed), wide.weighted(missed))
             fit = fit.replaced(np.flatnonzero(good), better.part(np.flatnonzero(good)))
         return fit, best
