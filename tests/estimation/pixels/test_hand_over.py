@@ -9,7 +9,7 @@ from scipy.linalg import block_diag, expm, solve_discrete_lyapunov
 
 from aolink.errors import EstimatorError
 from aolink.estimation import make_estimator
-from aolink.estimation.assumptions import importance_is_too_sure
+from aolink.estimation.assumptions import importance_is_too_sure, modes_stay_lost
 from aolink.estimation.pixels import updates
 from aolink.estimation.registry import estimator_row
 from aolink.rig import load_rig
@@ -51,7 +51,32 @@ def test_several_vibrations_are_tempered_and_the_reason_says_so():
     rig, exposure = one_axis(1)
     estimate = make_estimator(rig, "profile", tempered=600).step(exposure)
     assert estimate.status.name == "OK"
-    assert "too few importance weights count: 600 points tempered, and up to 54% of windowed moments" in estimate.reason
+    assert "too few importance weights count: 600 points tempered, and 54% of windowed moments" in estimate.reason
+
+
+@pytest.mark.parametrize("changed", [{"frequencies_hz": (4.6,)}, {"frequencies_hz": (5.3,), "damping": 0.2}])
+def test_where_modes_do_not_stay_lost_the_reason_says_that_less_of_windowed_moments_may_be_left(changed):
+    """A vibration of less than a swing in an exposure, and one that is over after a frame period."""
+    rig = vibrating(1, **{"noise_density": 2e-4, **changed})
+    assert not modes_stay_lost(rig)
+    _, reasons = errors_of(rig, "profile", [1], 3)
+    assert any("600 points tempered, and up to" in reason for reason in reasons)
+
+
+def test_modes_stay_lost_whether_or_not_processes_can_be_told_apart():
+    rig = vibrating(1)
+    assert modes_stay_lost(rig)
+    assert modes_stay_lost(dataclasses.replace(rig, plant=with_late_step(rig.plant)))
+
+
+@pytest.mark.long
+def test_where_modes_stay_lost_all_of_the_windowed_moments_share_is_left():
+    """With a quarter of it 95 % intervals held 0.92 of the path, and the end state's normalised error was 1.7."""
+    rig = vibrating(1, (10.0,), damping=0.025, sd=0.25, noise_density=5e-4)
+    (inside, _, nees), reasons = errors_of(rig, "profile", range(1, 9), 12)
+    assert inside > 0.94
+    assert nees < 1.3
+    assert not any("up to" in reason for reason in reasons)
 
 
 def test_too_few_points_for_the_coefficients_are_not_tempered():
@@ -74,7 +99,7 @@ def test_modes_have_the_weights_of_importance_sampling_where_it_is_enough_about_
     rig = vibrating(1, (5.2,), damping=0.13, sd=0.19, noise_density=2e-4)
     (exposure,) = simulate(rig, 1, seed=seed, inputs=np.zeros((rig.timing.exposure_steps, 1)))
     estimate = make_estimator(rig, name).step(exposure)
-    assert "600 points tempered, and up to" in estimate.reason
+    assert "600 points tempered" in estimate.reason
     off = (estimate.path[0] - estimate.path[0, ::-1]) / 2
     assert np.sqrt(np.mean(off**2) / np.mean(estimate.path_sd**2)) < 0.1
 
@@ -109,6 +134,16 @@ def test_several_vibrations_are_within_their_intervals():
 
 BRIGHT = vibrating(1, (2.5, 12.0), damping=0.01, sd=0.08, noise_density=1e-4)
 """A bright spot that two vibrations move, both of which outlast a frame period."""
+
+
+def with_late_step(plant):
+    """The plant beside two states that keep an input for a step: a matrix that is defective."""
+    late = np.array([[0.0, 0.0], [1.0, 0.0]])
+    return dataclasses.replace(
+        plant, A=block_diag(plant.A, late), B=np.vstack([plant.B, np.eye(2, 1)]), C=np.pad(plant.C, ((0, 0), (0, 2))),
+        B_w=np.vstack([plant.B_w, np.zeros((2, 2))]), initial_mean=np.zeros(plant.n_states + 2),
+        initial_covariance=block_diag(plant.initial_covariance, np.zeros((2, 2))),
+    )  # fmt: skip
 
 
 def errors_of(rig, name, seeds, exposures):
@@ -175,13 +210,7 @@ def test_a_rig_on_which_importance_sampling_is_too_sure_is_known_by_one_axis_of_
     other."""
     plant = BRIGHT.plant
     assert importance_is_too_sure(BRIGHT)
-    late = np.array([[0.0, 0.0], [1.0, 0.0]])
-    with_late_step = dataclasses.replace(
-        plant, A=block_diag(plant.A, late), B=np.vstack([plant.B, np.eye(2, 1)]), C=np.pad(plant.C, ((0, 0), (0, 2))),
-        B_w=np.vstack([plant.B_w, np.zeros((2, 2))]), initial_mean=np.zeros(6),
-        initial_covariance=block_diag(plant.initial_covariance, np.zeros((2, 2))),
-    )  # fmt: skip
-    assert not importance_is_too_sure(dataclasses.replace(BRIGHT, plant=with_late_step))
+    assert not importance_is_too_sure(dataclasses.replace(BRIGHT, plant=with_late_step(plant)))
     drifts, vibration = np.diag([0.98, 0.999]), plant.A[:2, :2]
     two = dataclasses.replace(
         plant, A=block_diag(drifts, vibration), C=np.array([[1.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]]),
