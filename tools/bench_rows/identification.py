@@ -324,8 +324,7 @@ def diffusion(frames: int, noise: float) -> Diffusion:
         ours.append(math.exp(maxima(space, one)[0].x[0]) * unit)
     positions = _positions(rig, exposures)
     known, unknown = by_pylake(positions, frames, noise / frames), by_pylake(positions, frames)
-    of_spheres = [each.intensity.reshape(-1, 2).mean(axis=1) for each in (known, unknown)]
-    return Diffusion(np.array(ours), *of_spheres, float(unknown.noise.mean()))
+    return Diffusion(np.array(ours), _of_spheres(known), _of_spheres(unknown), float(unknown.noise.mean()))
 
 
 def _positions(rig: Rig, exposures: Sequence[Exposure]) -> NDArray[np.float64]:
@@ -345,6 +344,11 @@ class ByPylake(NamedTuple):
     """Variance gained in a frame."""
     noise: NDArray[np.float64]
     """Variance of the positions' noise."""
+
+
+def _of_spheres(found: ByPylake) -> NDArray[np.float64]:
+    """Each sphere's intensity, the mean of both directions, (spheres,)."""
+    return np.asarray(found.intensity.reshape(-1, 2).mean(axis=1))
 
 
 def by_pylake(tracks: NDArray[np.float64], frames: int, noise: float | None = None) -> ByPylake:
