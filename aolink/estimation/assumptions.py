@@ -159,7 +159,7 @@ def narrow_intervals(rig: Rig) -> Iterator[tuple[str, str]]:
             "sensor.noise_density",
             f"signal to noise is {peak_snr(rig):.3g}, and several eigenmodes move the spot, one of them a vibration"
             " that lasts for longer than a frame period: the 95 % intervals of profile are often too narrow on such a"
-            " rig (they held 0.85 to 0.99); those of mixture held 0.90 to 0.98, but it takes some 0.2 s an axis and"
+            " rig (they held 0.88 to 0.99); those of mixture held 0.90 to 0.98, but it takes some 0.2 s an axis and"
             " exposure; compare both with moments",
         )
 
