@@ -273,8 +273,8 @@ def spheres(effort: Effort) -> list[Row]:
     """Diffusion of the film of spheres from sums of frames, with the standard error over the spheres, beside pylake's
     estimate on the tracks of the same frames. The ratio is the joint standard error over the difference.
 
-    Only if the positions' noise is known does pylake's estimate depend on the blur: it is the one that single frames
-    have. Estimated together with the intensity, as in the last column, it has no bounds.
+    Pylake's estimate depends on the blur only if the noise of the positions is known, so it is given that of single
+    frames. The estimate that is printed after it comes with a noise of its own, which has no bounds.
     """
     frames = (1, 2, 3, 4, 6, 8, 12) if effort == FULL else (8,)
     noise = float(by_pylake(_positions(*film_of_spheres(1)[:2]), 1).noise.mean())

@@ -227,6 +227,11 @@ def test_copies_of_a_rig_whose_parameter_wanders_work_alike():
     _, reasons = errors_of(rig, "profile", [2], 4)
     assert any("more than one path" in reason for reason in reasons)
     assert not any("on this rig" in reason for reason in reasons)
+    found_soon = vibrating(1, (4.6,), noise_density=2e-4)
+    rig = dataclasses.replace(found_soon, plant=dataclasses.replace(found_soon.plant, wandering=wandering))
+    _, reasons = errors_of(rig, "profile", [1], 3)
+    assert any("600 points tempered" in reason for reason in reasons)
+    assert not any("up to" in reason for reason in reasons)
 
 
 def test_a_demo_leaves_mixture_out_where_it_tempers_in_nearly_every_exposure():
