@@ -7,7 +7,7 @@ import json
 import math
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import NamedTuple
@@ -275,9 +275,14 @@ def spheres(effort: Effort) -> list[Row]:
 
     Pylake's estimate depends on the blur only if the noise of the positions is known, so it is given that of single
     frames. The estimate that is printed after it comes with a noise of its own, which has no bounds.
+
+    The film's compression delays motion, so that single frames one after the other show less of it than frames further
+    apart (`compression`). So sums are compared with single frames as far apart as they are, too.
     """
     frames = (1, 2, 3, 4, 6, 8, 12) if effort == FULL else (8,)
-    noise = float(by_pylake(_positions(*film_of_spheres(1)[:2]), 1).noise.mean())
+    rig, single, _ = film_of_spheres(1)
+    tracks, seen = _positions(rig, single), readings(rig, single, kernel_known=False)
+    noise = float(by_pylake(tracks, 1).noise.mean())
     found = {count: diffusion(count, noise) for count in frames}
     first = found[frames[0]]
     rows = []
@@ -294,7 +299,27 @@ def spheres(effort: Effort) -> list[Row]:
                 f"spheres, sums of {count} less single frames", f"{off:+.1f} sd",
                 f"pylake {_apart(each.pylake, first.pylake):+.1f} sd", 1 / max(abs(off), 1e-3), 1.0,
             ))  # fmt: skip
+    for count in frames:
+        if count == 1:
+            continue
+        starts = range(effort.of(count))
+        ours = np.mean([_ours(rig, every(seen, count, start)) for start in starts], axis=0)
+        theirs = np.mean([
+            _of_spheres(by_pylake(tracks[:, start::count], count, noise, exposed=1)) for start in starts
+        ], axis=0)  # fmt: skip
+        off = _apart(found[count].ours, ours)
+        rows.append(Row(
+            f"spheres, single frames {count} apart: pixels squared a frame", _shown(ours),
+            f"sums of {count} {off:+.1f} sd; pylake {_shown(theirs)}, its sums"
+            f" {_apart(found[count].pylake, theirs):+.1f} sd", 1 / max(abs(off), 1e-3), 1.0,
+        ))  # fmt: skip
     return [*rows, *compression()]
+
+
+def every(seen: Readings, count: int, start: int) -> Readings:
+    """Readings of which only each slot of so many is used, from ``start`` on; inputs stay as they are."""
+    slots = np.arange(seen.slots)
+    return replace(seen, usable=seen.usable & (slots % count == start))
 
 
 def _apart(one: NDArray[np.float64], other: NDArray[np.float64]) -> float:
@@ -316,15 +341,19 @@ def diffusion(frames: int, noise: float) -> Diffusion:
     pylake's covariance estimator on the means of the positions in these frames, whose noise has the variance ``noise``
     in a single frame, pixels squared."""
     rig, exposures, _ = film_of_spheres(frames)
-    seen, unit = readings(rig, exposures, kernel_known=False), rig.timing.fast_step_s / rig.sensor.pixel_width**2
-    ours = []
+    ours, positions = _ours(rig, readings(rig, exposures, kernel_known=False)), _positions(rig, exposures)
+    known, unknown = by_pylake(positions, frames, noise / frames), by_pylake(positions, frames)
+    return Diffusion(ours, _of_spheres(known), _of_spheres(unknown), float(unknown.noise.mean()))
+
+
+def _ours(rig: Rig, seen: Readings) -> NDArray[np.float64]:
+    """Variance that each sphere gains in a frame along one direction, pixels squared, (spheres,)."""
+    found = []
     for x in range(0, rig.n_outputs, 2):
         one = [seen.of_outputs(range(x, x + 2))]
         space = space_of(["random-walk"], one, rig.sensor.kernel.variance, with_noise=True, with_kernel=True)
-        ours.append(math.exp(maxima(space, one)[0].x[0]) * unit)
-    positions = _positions(rig, exposures)
-    known, unknown = by_pylake(positions, frames, noise / frames), by_pylake(positions, frames)
-    return Diffusion(np.array(ours), _of_spheres(known), _of_spheres(unknown), float(unknown.noise.mean()))
+        found.append(math.exp(maxima(space, one)[0].x[0]))
+    return np.array(found) * rig.timing.fast_step_s / rig.sensor.pixel_width**2
 
 
 def _positions(rig: Rig, exposures: Sequence[Exposure]) -> NDArray[np.float64]:
@@ -351,18 +380,21 @@ def _of_spheres(found: ByPylake) -> NDArray[np.float64]:
     return np.asarray(found.intensity.reshape(-1, 2).mean(axis=1))
 
 
-def by_pylake(tracks: NDArray[np.float64], frames: int, noise: float | None = None) -> ByPylake:
-    """Pylake's covariance estimator on tracks (tracks, exposures) of means of so many frames, NaN where there is no
-    position; ``noise`` is the variance of the positions' noise, if it is known."""
+def by_pylake(
+    tracks: NDArray[np.float64], frames: int, noise: float | None = None, *, exposed: int | None = None
+) -> ByPylake:
+    """Pylake's covariance estimator on tracks (tracks, exposures) of positions so many frames apart, NaN where there is
+    none. They are means of ``exposed`` frames, of all if it is None; ``noise`` is the variance of the positions' noise,
+    if it is known."""
     from lumicks.pylake.detail.pixel_calibration import PositionUnit
     from lumicks.pylake.kymotracker.detail.msd_estimation import estimate_diffusion_cve
 
-    exact = None if noise is None else 0.0
+    exact, blur = None if noise is None else 0.0, (frames if exposed is None else exposed) / frames / 6
     found = []
     for track in tracks:
         at = np.flatnonzero(np.isfinite(track))
         one = estimate_diffusion_cve(
-            at, track[at], dt=frames, blur_constant=1 / 6, unit=PositionUnit.pixel, localization_var=noise,
+            at, track[at], dt=frames, blur_constant=blur, unit=PositionUnit.pixel, localization_var=noise,
             var_of_localization_var=exact,
         )  # fmt: skip
         found.append((2 * float(one.value), float(one.localization_variance)))
