@@ -139,9 +139,15 @@ def mixture(rig: Rig, options: Options) -> Filter:
 
 
 def _budgeted(rig: Rig, options: Options, updates: ImportanceUpdater) -> ImportanceUpdater:
+    """The updater for a rig and a budget: that of `mixture` where importance sampling does not show that it missed a
+    mode, and the mode would stay lost."""
+    from aolink.estimation.pixels.updates import MIXTURE
+
     # The copies of a rig whose parameter wanders are to work alike, or their evidence could not be compared.
     wanders = rig.plant.wandering is not None
     too_sure, stay_lost = not wanders and importance_is_too_sure(rig), wanders or modes_stay_lost(rig)
+    if too_sure and stay_lost and options.tempered != 0:
+        updates = MIXTURE
     return updates.within(options.tempered, options.draws / 100, too_sure=too_sure, stay_lost=stay_lost)
 
 

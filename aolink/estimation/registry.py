@@ -154,16 +154,19 @@ def _pixels_refusal(name: str) -> Callable[[Rig], str | None]:
     return refusal
 
 
-def _is_line(rig: Rig) -> bool:
-    """Whether the sensor is a line: for spots on a plane the filters that use every pixel are too slow for a demo."""
-    return rig.sensor.directions == 1
-
-
 def _is_quick_for_mixture(rig: Rig) -> bool:
-    """Whether the sensor is a line and `mixture` does not temper points in nearly every exposure."""
+    """Whether `mixture` is quick enough for a demo: on a line sensor, where it does not temper points in nearly every
+    exposure. For spots on a plane the filters that use every pixel are too slow."""
     from aolink.estimation.assumptions import importance_is_too_sure
 
-    return _is_line(rig) and not importance_is_too_sure(rig)
+    return rig.sensor.directions == 1 and not importance_is_too_sure(rig)
+
+
+def _is_quick_for_profile(rig: Rig) -> bool:
+    """The same for `profile`, which hands over to `mixture` on fewer rigs."""
+    from aolink.estimation.assumptions import importance_is_too_sure, modes_stay_lost
+
+    return rig.sensor.directions == 1 and not (importance_is_too_sure(rig) and modes_stay_lost(rig))
 
 
 def _built(maker: str, *orders: int) -> Callable[[Rig, Options], Filter]:
@@ -192,7 +195,7 @@ _OURS = {
         ),
         EstimatorRow(
             name="profile", rank=50, colour=(140, 210, 80), build=_built("profile"),
-            refusal=_pixels_refusal("profile"), wanders=True, in_demo=_is_line,
+            refusal=_pixels_refusal("profile"), wanders=True, in_demo=_is_quick_for_profile,
         ),
         EstimatorRow(
             name="mixture", rank=60, colour=(240, 80, 140), build=_built("mixture"),
