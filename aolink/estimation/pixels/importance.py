@@ -32,8 +32,9 @@ from aolink.numerics.arrays import BoolArray, FloatArray
 
 # Most rounds.
 ROUNDS = 4
-# If less than this share of it is reached, points are tempered.
+# If less than this share of it is reached, points are tempered: number of components fitted to their end states.
 _TOO_FEW = 0.5
+_COMPONENTS = 6
 # Modes are scattered if the windowed moments leave the path uncertain by a variance of this many variances of the
 # kernel.
 _SCATTERED = 2.5
@@ -98,15 +99,13 @@ def posterior(
     return fit, np.asarray(effective >= _TOO_FEW * wanted)
 
 
-def tempered(
-    view: PixelView, prior: GaussianMixture, count: int, components: int, number: int
-) -> tuple[GaussianMixture, FloatArray]:
-    """The mixture of so many components by ``count`` tempered points, in the exposure of this number; and the most
-    likely point, (axes, 1, n)."""
+def tempered(view: PixelView, prior: GaussianMixture, count: int, number: int) -> tuple[GaussianMixture, FloatArray]:
+    """The mixture by a number of tempered points, in the exposure of this number; and the most likely point, (axes, 1,
+    n)."""
     points = tempered_points(view, prior, count, [(number, axis) for axis in view.axes.tolist()])
     best = np.argmax(with_noise(prior, points) + view.log_likelihoods(points), axis=1)
     rows = view.reduced.end_rows
-    fit = stacked_axes([fitted(each, rows, components, 0) for each in points])
+    fit = stacked_axes([fitted(each, rows, _COMPONENTS, 0) for each in points])
     return fit, points[np.arange(len(points)), best][:, None]
 
 

@@ -62,10 +62,6 @@ _MOST_MISSED = 0.5
 # Share of the posterior that importance sampling about tempered points may have missed, relative to what the points
 # alone may have; and the same where modes stay lost.
 _LEFT, _LEFT_LOST = 0.25, 1.0
-# Gaussians that are fitted to tempered points. Where these are the posterior of nearly every exposure and are not
-# weighed, its modes are as many as differ: there are more Gaussians, and more of them are carried.
-_COMPONENTS = 6
-_COMPONENTS_ALONE, _CARRIED_ALONE = 16, 24
 
 
 @dataclass(frozen=True)
@@ -91,8 +87,6 @@ class ImportanceUpdater:
     sure."""
     too_sure: bool = False
     """Whether the rig is such a one."""
-    components: int = _COMPONENTS
-    """Gaussians that are fitted to tempered points."""
     left: float = _LEFT_LOST
     """Share of what tempered points may have missed that importance sampling about them may have missed too."""
 
@@ -101,10 +95,7 @@ class ImportanceUpdater:
         importance sampling is often too sure, or another one, and where modes that were missed stay lost, or not."""
         points, left = self.points if points is None else points, _LEFT_LOST if stay_lost else _LEFT
         several, share = share * self.several, share * self.share
-        found = replace(self, points=points, share=share, several=several, too_sure=too_sure, left=left)
-        if too_sure and self.tempers_several:
-            return replace(found, carried=_CARRIED_ALONE, components=_COMPONENTS_ALONE)
-        return found
+        return replace(self, points=points, share=share, several=several, too_sure=too_sure, left=left)
 
     def _hands_over(self, reduced: Reduction) -> bool:
         """Whether all posteriors with several modes are tempered: where there are points enough for that."""
@@ -184,7 +175,7 @@ class ImportanceUpdater:
     ) -> tuple[GaussianMixture, FloatArray]:  # fmt: skip
         """The posterior by tempered points, and a share of the wide Gaussians, which have weights of their own on the
         axes ``by_share``; and the most likely point, (axes, 1, n)."""
-        points, best = tempered(view, prior, self.points, self.components, number)
+        points, best = tempered(view, prior, self.points, number)
         wide = wide.replaced(by_share, _by_share_of(points.part(by_share), wide.part(by_share)))
         missed = self._missed(view.reduced)
         fit = joined(points.weighted(1 - missed), wide.weighted(missed))
