@@ -57,11 +57,8 @@ _DOUBTED = 1e-3
 # the evidence of modes is rough.
 _LEAST_SHARE = 0.05
 _LEAST_DOUBTED_SHARE = 0.005
-# Posteriors are not tempered for having several modes if the windowed moments would have more than this share of them.
+# Posteriors are not tempered for having several modes if the windowed moments would have this share of them.
 _MOST_MISSED = 0.5
-# What tempered points may have missed where modes stay lost and nothing weighs the points, relative to elsewhere; this
-# does not make it more than that share.
-_MISSED_LOST = 2.0
 # Share of the posterior that importance sampling about tempered points may have missed, relative to what the points
 # alone may have; and the same where modes stay lost.
 _LEFT, _LEFT_LOST = 0.25, 1.0
@@ -91,22 +88,23 @@ class ImportanceUpdater:
     too_sure: bool = False
     """Whether the rig is such a one."""
     stay_lost: bool = False
-    """Whether modes that were missed stay lost on the rig."""
-    left: float = _LEFT_LOST
-    """Share of what tempered points may have missed that importance sampling about them may have missed too."""
+    """Whether modes that were missed stay lost for long on the rig."""
 
     def within(self, points: int | None, share: float, *, too_sure: bool, stay_lost: bool) -> ImportanceUpdater:
         """The same with another number of tempered points, if not None, and a share of the others, for a rig where
         importance sampling is often too sure, or another one, and where modes that were missed stay lost, or not."""
-        points, left = self.points if points is None else points, _LEFT_LOST if stay_lost else _LEFT
+        points = self.points if points is None else points
         several, share = share * self.several, share * self.share
-        return replace(
-            self, points=points, share=share, several=several, too_sure=too_sure, stay_lost=stay_lost, left=left
-        )
+        return replace(self, points=points, share=share, several=several, too_sure=too_sure, stay_lost=stay_lost)
+
+    @property
+    def left(self) -> float:
+        """Share of what tempered points may have missed that importance sampling about them may have missed too."""
+        return _LEFT_LOST if self.stay_lost else _LEFT
 
     def _hands_over(self, reduced: Reduction) -> bool:
         """Whether all posteriors with several modes are tempered: where there are points enough for that."""
-        return self.too_sure and self.tempers_several and self._missed(reduced) <= _MOST_MISSED
+        return self.too_sure and self.tempers_several and self._missed(reduced) < _MOST_MISSED
 
     def remarks(self, several: BoolArray, poor: BoolArray, reduced: Reduction) -> Iterator[tuple[BoolArray, str]]:
         yield poor, self._when_poor(reduced)
@@ -128,13 +126,8 @@ class ImportanceUpdater:
 
     def _missed(self, reduced: Reduction) -> float:
         """The share of a posterior that tempered points may have missed: the number of pairs of coefficients for each
-        point, or twice that."""
-        if not self.points:
-            return 1.0
-        missed = reduced.size**2 / self.points
-        if self.too_sure and self.stay_lost and missed < _MOST_MISSED:
-            return min(_MISSED_LOST * missed, _MOST_MISSED)
-        return missed
+        point."""
+        return reduced.size**2 / self.points if self.points else 1.0
 
     def reduction(self, model: ExposureModel, sensor: BaseSensor) -> Reduction:
         return reduction(model, sensor)
@@ -168,8 +161,9 @@ class ImportanceUpdater:
         if len(few) and self.points:
             some = view.part(few)
             if self._missed(reduced) < 1:
-                # Where the spot is bright, a frame rules most of the wide Gaussians out.
-                by_share = np.flatnonzero(self._hands_over(reduced) | np.isin(few, doubted))
+                # Where the spot is bright, a frame rules most of the wide Gaussians out. But one about which no point
+                # lies may be that of a mode that was missed: where that would stay lost, it keeps the prior's weight.
+                by_share = np.flatnonzero((self._hands_over(reduced) and not self.stay_lost) | np.isin(few, doubted))
                 fit, best = self._tempered(some, before.part(few), proposal.part(few), wide.part(few), by_share, number)
                 # The search may have missed the mode that fits.
                 starts = whitened(own.part(few), best)

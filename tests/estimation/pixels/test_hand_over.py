@@ -168,7 +168,7 @@ def errors_of(rig, name, seeds, exposures):
 
 def test_where_importance_sampling_is_too_sure_mixture_tempers_all_that_have_several_modes():
     _, reasons = errors_of(BRIGHT, "mixture", [1], 4)
-    said = "importance sampling is not enough on this rig: 1200 points tempered, and 28% of windowed moments"
+    said = "importance sampling is not enough on this rig: 1200 points tempered, and 14% of windowed moments"
     assert all(said in reason for reason in reasons if "more than one path" in reason)
     assert any("more than one path" in reason for reason in reasons)
 
