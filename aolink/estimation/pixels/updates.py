@@ -7,13 +7,17 @@ posterior comes from importance weights (`aolink.estimation.pixels.importance`).
 
 Where that is not enough (`aolink.estimation.pixels.importance`), points are tempered, as many for an axis as ``points``
 says. So they are, by an updater that ``tempers_several``, wherever a posterior has several modes and the rig is one
-where importance sampling is too sure without showing it (`aolink.estimation.assumptions.importance_is_too_sure`). If
-``points`` is none, the fit stays as wide as its few effective points make it. Some hundred points miss modes as well,
-and more of them the more coefficients there are. So a share of the posterior remains the Gaussians of the windowed
-moments, whose covariance is wide enough. With as many points as pairs of coefficients, or fewer, this share is one, and
-no point is tempered. Importance sampling about the points then weighs the modes that they have found; where its
-effective sample size is enough, a quarter of that share is left, and all of it where modes that were missed would stay
-lost for long (`aolink.estimation.assumptions.modes_stay_lost`). This is not done where importance sampling is too sure.
+where importance sampling is too sure without showing it (`aolink.estimation.assumptions.importance_is_too_sure`); where
+missed modes stay lost there, `profile` is `mixture` (`aolink.estimation.filters`). If ``points`` is none, the fit stays
+as wide as its few effective points make it.
+
+Some hundred points miss modes as well, and more of them the more coefficients there are. So a share of the posterior
+remains the Gaussians of the windowed moments, whose covariance is wide enough. Each has the weight of the prior's
+component that it comes from, or, where the frame may rule it out, of the points about it. With as many points as pairs
+of coefficients, or fewer, this share is one, and no point is tempered. Importance sampling about the points then weighs
+the modes that they have found; where its effective sample size is enough, a quarter of that share is left, and all of
+it where modes that were missed would stay lost for long (`aolink.estimation.assumptions.modes_stay_lost`). This is not
+done where importance sampling is too sure.
 
 A mode that was lost is found again: a thousandth of the prior is the prediction without any measurement. Its modes are
 searched for where the NIS is larger than chance explains.

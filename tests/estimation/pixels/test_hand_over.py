@@ -272,13 +272,14 @@ def test_a_demo_leaves_profile_out_where_it_is_mixture():
 @pytest.mark.long
 def test_intervals_hold_where_importance_sampling_is_too_sure():
     """If points are tempered only where their weights or the windowed moments show that it is needed, 95 % intervals
-    hold 0.85 of the path, and the NEES is 1.74 times its expectation.
+    hold 0.85 of the path, and the NEES is 1.74 times its expectation; if the windowed moments have the weights of the
+    points about them, 0.940 and 1.15.
 
-    These four seeds have 0.940 (eight others 0.978 and 0.945), so the bound is a little below.
+    These four seeds have 0.964 and 0.99 (eight others 0.977 and 0.973).
     """
     (inside, _, nees), _ = errors_of(BRIGHT, "mixture", range(4), 10)
-    assert 0.93 < inside < 0.98
-    assert nees < 1.25
+    assert 0.95 < inside < 0.98
+    assert nees < 1.1
 
 
 @pytest.mark.parametrize("tempered", [-1, 5])
