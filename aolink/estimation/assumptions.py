@@ -156,8 +156,8 @@ def narrow_intervals(rig: Rig) -> Iterator[tuple[str, str]]:
     """The rig file's key and a sentence for a rig on which intervals of `profile` are often too narrow."""
     if importance_is_too_sure(rig):
         what = (
-            "the 95 % intervals of profile are often too narrow on such a rig (they held 0.90 to 0.97); those of mixture"
-            " held 0.94 to 0.98, but it takes some 0.2 s an axis and exposure"
+            "the 95 % intervals of profile are often too narrow on such a rig (they held 0.90 to 0.97); those of"
+            " mixture held 0.94 to 0.98, but it takes some 0.2 s an axis and exposure"
         )
         if modes_stay_lost(rig):
             what = (
