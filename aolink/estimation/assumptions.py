@@ -153,7 +153,7 @@ def _swings(rig: Rig, values: NDArray[np.complex128]) -> FloatArray:
 
 
 def narrow_intervals(rig: Rig) -> Iterator[tuple[str, str]]:
-    """The rig file's key and a sentence for a rig on which intervals of `profile` are often too narrow."""
+    """The rig file's key and a sentence for a rig on which importance sampling is often too sure."""
     if importance_is_too_sure(rig):
         what = (
             "the 95 % intervals of profile are often too narrow on such a rig (they held 0.90 to 0.97); those of"
