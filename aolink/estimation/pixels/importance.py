@@ -12,14 +12,17 @@ finds few of the modes, and the effective sample size of points about those does
 that the windowed moments leave decides (`scattered`). In both cases tempered sequential Monte Carlo draws the points
 (`aolink.estimation.pixels.tempering`), and their mixture is a part of the proposal density of another
 importance sampling, which weighs the modes more exactly than the number of points in each; where its effective sample
-size is not enough, the tempered points are the posterior. On some rigs neither shows that the fit is too narrow
-(`aolink.estimation.assumptions.importance_is_too_sure`); there the tempered points always are.
+size is not enough, the tempered points are the posterior. A fit may have nearly no density where some of the points
+lie, and its effective sample size does not show that; such points keep their share of the posterior (`with_missed`). On
+some rigs neither shows that the fit is too narrow (`aolink.estimation.assumptions.importance_is_too_sure`); there the
+tempered points always are the posterior.
 """
 
 from __future__ import annotations
 
 import math
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 from scipy import special
@@ -35,6 +38,12 @@ ROUNDS = 4
 # If less than this share of it is reached, points are tempered: number of components fitted to their end states.
 _TOO_FEW = 0.5
 _COMPONENTS = 6
+# A fit misses a tempered point where its density, relative to the posterior's, is less by this many nats than at most
+# points. Fewer than the second share of all points, or than twice as many as coefficients, may be so by chance.
+# Number of components fitted to them.
+_MISSED = 3.0
+_LEAST_MISSED = 1 / 30
+_COMPONENTS_OF_MISSED = 2
 # Modes are scattered if the windowed moments leave the path uncertain by a variance of this many variances of the
 # kernel.
 _SCATTERED = 2.5
@@ -99,14 +108,45 @@ def posterior(
     return fit, np.asarray(effective >= _TOO_FEW * wanted)
 
 
-def tempered(view: PixelView, prior: GaussianMixture, count: int, number: int) -> tuple[GaussianMixture, FloatArray]:
-    """The mixture by a number of tempered points, in the exposure of this number; and the most likely point, (axes, 1,
-    n)."""
+class Tempered(NamedTuple):
+    """Tempered points, and a mixture fitted to them."""
+
+    points: FloatArray
+    """(axes, points, n), equally likely."""
+    log_posterior: FloatArray
+    """Of each point, up to a constant, (axes, points)."""
+    fit: GaussianMixture
+
+    @property
+    def best(self) -> FloatArray:
+        """The most likely point, (axes, 1, n)."""
+        best = np.argmax(self.log_posterior, axis=1)
+        return np.asarray(self.points[np.arange(len(best)), best][:, None])
+
+
+def tempered(view: PixelView, prior: GaussianMixture, count: int, number: int) -> Tempered:
+    """A number of tempered points, in the exposure of this number."""
     points = tempered_points(view, prior, count, [(number, axis) for axis in view.axes.tolist()])
-    best = np.argmax(with_noise(prior, points) + view.log_likelihoods(points), axis=1)
     rows = view.reduced.end_rows
     fit = stacked_axes([fitted(each, rows, _COMPONENTS, 0) for each in points])
-    return fit, points[np.arange(len(points)), best][:, None]
+    return Tempered(points, with_noise(prior, points) + view.log_likelihoods(points), fit)
+
+
+def with_missed(fit: GaussianMixture, tempered: Tempered, rows: FloatArray) -> GaussianMixture:
+    """A fit to the posterior, and beside it a mixture of those tempered points that it misses, by their share of all.
+
+    The points' projections ``rows`` @ point are what components are fitted to, as in `tempered`.
+    """
+    away = tempered.log_posterior - fit.log_density(tempered.points)
+    missed = away > np.median(away, axis=1, keepdims=True) + _MISSED
+    _, count, n = tempered.points.shape
+    found = fit
+    for axis in np.flatnonzero(missed.sum(axis=1) >= max(_LEAST_MISSED * count, 2 * n)):
+        those, share = tempered.points[axis, missed[axis]], missed[axis].mean()
+        more = fitted(those, rows, _COMPONENTS_OF_MISSED, 0).weighted(share)
+        which = np.array([axis])
+        found = found.replaced(which, joined(fit.part(which).weighted(1 - share), more))
+    return found
 
 
 def scattered(view: PixelView, wide: GaussianMixture) -> BoolArray:

@@ -16,8 +16,8 @@ remains the Gaussians of the windowed moments, whose covariance is wide enough. 
 component that it comes from, or, where the frame may rule it out, of the points about it. With as many points as pairs
 of coefficients, or fewer, this share is one, and no point is tempered. Importance sampling about the points then weighs
 the modes that they have found; where its effective sample size is enough, a quarter of that share is left, and all of
-it where modes that were missed would stay lost for long (`aolink.estimation.assumptions.modes_stay_lost`). This is not
-done where importance sampling is too sure.
+it where modes that were missed would stay lost for long (`aolink.estimation.assumptions.modes_stay_lost`). Points where
+that has nearly no density keep their share of the posterior. This is not done where importance sampling is too sure.
 
 A mode that was lost is found again: a thousandth of the prior is the prediction without any measurement. Its modes are
 searched for where the NIS is larger than chance explains.
@@ -37,7 +37,7 @@ from aolink.estimation.model.base import ExposureModel
 from aolink.estimation.moments.windowed import MOST_MEMORY, error_memory, slowest
 from aolink.estimation.pixels.filter import MixtureUpdate
 from aolink.estimation.pixels.gaussian_mixture import GaussianMixture, joined, log_sum, single
-from aolink.estimation.pixels.importance import beside_points, posterior, proposed, scattered, tempered
+from aolink.estimation.pixels.importance import beside_points, posterior, proposed, scattered, tempered, with_missed
 from aolink.estimation.pixels.likelihood import PixelView, Reduction, reduction
 from aolink.estimation.pixels.modes import (
     Modes,
@@ -185,16 +185,17 @@ class ImportanceUpdater:
     ) -> tuple[GaussianMixture, FloatArray]:  # fmt: skip
         """The posterior by tempered points, and a share of the wide Gaussians, which have weights of their own on the
         axes ``by_share``; and the most likely point, (axes, 1, n)."""
-        points, best = tempered(view, prior, self.points, number)
-        wide = wide.replaced(by_share, _by_share_of(points.part(by_share), wide.part(by_share)))
+        points = tempered(view, prior, self.points, number)
+        wide = wide.replaced(by_share, _by_share_of(points.fit.part(by_share), wide.part(by_share)))
         missed = self._missed(view.reduced)
-        fit = joined(points.weighted(1 - missed), wide.weighted(missed))
+        fit = joined(points.fit.weighted(1 - missed), wide.weighted(missed))
         if not self.too_sure:
-            weighed, good = posterior(view, prior, beside_points(proposal, points), 1.0, self.enough)
+            weighed, good = posterior(view, prior, beside_points(proposal, points.fit), 1.0, self.enough)
+            weighed = with_missed(weighed, points, view.reduced.end_rows)
             missed *= self.left
             better = joined(weighed.weighted(1 - missed), wide.weighted(missed))
             fit = fit.replaced(np.flatnonzero(good), better.part(np.flatnonzero(good)))
-        return fit, best
+        return fit, points.best
 
 
 PROFILE = ImportanceUpdater(carried=12, free=0.01, share=0.25, points=600)
