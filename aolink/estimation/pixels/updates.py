@@ -15,9 +15,10 @@ Some hundred points miss modes as well, and more of them the more coefficients t
 remains the Gaussians of the windowed moments, whose covariance is wide enough. Each has the weight of the prior's
 component that it comes from, or, where the frame may rule it out, of the points about it. With as many points as pairs
 of coefficients, or fewer, this share is one, and no point is tempered. Importance sampling about the points then weighs
-the modes that they have found; where its effective sample size is enough, a quarter of that share is left, and all of
-it where modes that were missed would stay lost for long (`aolink.estimation.assumptions.modes_stay_lost`). Points where
-that has nearly no density keep their share of the posterior. This is not done where importance sampling is too sure.
+the modes that they have found; where its effective sample size is enough, a quarter of that share is left. Where modes
+that were missed would stay lost for long (`aolink.estimation.assumptions.modes_stay_lost`), `profile` leaves half of
+it, and `mixture`, whose share is half as large, all. Points at which the fit has nearly no density keep their share of
+the posterior. This is not done where importance sampling is too sure.
 
 A mode that was lost is found again: a thousandth of the prior is the prediction without any measurement. Its modes are
 searched for where the NIS is larger than chance explains.
@@ -64,8 +65,8 @@ _LEAST_DOUBTED_SHARE = 0.005
 # Posteriors are not tempered for having several modes if the windowed moments would have this share of them.
 _MOST_MISSED = 0.5
 # Share of the posterior that importance sampling about tempered points may have missed, relative to what the points
-# alone may have; and the same where modes stay lost.
-_LEFT, _LEFT_LOST = 0.25, 1.0
+# alone may have, where missed modes are soon found again.
+_LEFT = 0.25
 
 
 @dataclass(frozen=True)
@@ -84,6 +85,9 @@ class ImportanceUpdater:
     several: float = 1.0
     """The same share where the posterior has several modes: with fewer points, random errors of the modes' weights
     would add up from exposure to exposure."""
+    left_lost: float = 1.0
+    """Share of the posterior that importance sampling about tempered points may have missed, relative to what the
+    points alone may have, where modes stay lost."""
     enough: float = 100.0
     """The usual effective sample size: with less than half of it, points are tempered."""
     tempers_several: bool = False
@@ -104,7 +108,7 @@ class ImportanceUpdater:
     @property
     def left(self) -> float:
         """Share of what tempered points may have missed that importance sampling about them may have missed too."""
-        return _LEFT_LOST if self.stay_lost else _LEFT
+        return self.left_lost if self.stay_lost else _LEFT
 
     def _hands_over(self, reduced: Reduction) -> bool:
         """Whether all posteriors with several modes are tempered: where there are points enough for that."""
@@ -198,7 +202,7 @@ class ImportanceUpdater:
         return fit, points.best
 
 
-PROFILE = ImportanceUpdater(carried=12, free=0.01, share=0.25, points=600)
+PROFILE = ImportanceUpdater(carried=12, free=0.01, share=0.25, points=600, left_lost=0.5)
 MIXTURE = ImportanceUpdater(carried=12, free=1e-3, share=1.0, points=1200, tempers_several=True)
 
 
