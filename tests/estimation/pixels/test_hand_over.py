@@ -70,13 +70,14 @@ def test_modes_stay_lost_whether_or_not_processes_can_be_told_apart():
 
 
 @pytest.mark.long
-def test_where_modes_stay_lost_all_of_the_windowed_moments_share_is_left():
-    """With a quarter of it 95 % intervals held 0.92 of the path, and the end state's normalised error was 1.7."""
+def test_where_modes_stay_lost_more_of_the_windowed_moments_share_is_left():
+    """With a quarter of it, and without the points that importance sampling misses, 95 % intervals held 0.92 of the
+    path, and the end state's normalised error was 1.7."""
     rig = vibrating(1, (10.0,), damping=0.025, sd=0.25, noise_density=5e-4)
     (inside, _, nees), reasons = errors_of(rig, "profile", range(1, 9), 12)
     assert inside > 0.94
     assert nees < 1.3
-    assert not any("up to" in reason for reason in reasons)
+    assert any("600 points tempered" in reason for reason in reasons)
 
 
 def test_too_few_points_for_the_coefficients_are_not_tempered():
@@ -91,18 +92,17 @@ def test_too_few_points_for_the_coefficients_are_not_tempered():
 
 
 @pytest.mark.parametrize("name", ["profile", "profile:draws=10"])
-@pytest.mark.parametrize("seed", [28, 32])
+@pytest.mark.parametrize("seed", [14, 28, 32])
 def test_modes_have_the_weights_of_importance_sampling_where_it_is_enough_about_tempered_points(seed, name):
     """A blur does not tell a path from the same one backwards, so the mean path in the first exposure is symmetric in
-    time. With the number of points that chance has left about each mode, it is 0.73 and 0.48 of its sd off on these
-    seeds, which were taken of forty for that; with a tenth of the draws, 0.31 and 0.15. Some points of seed 32 keep
-    their share, since the fit has too little density there: 0.11."""
+    time. With the number of points that chance has left about each mode, it is 1.06, 0.73 and 0.48 of its sd off on
+    these seeds, which were taken of forty for that; now 0.11, 0.04 and 0.16."""
     rig = vibrating(1, (5.2,), damping=0.13, sd=0.19, noise_density=2e-4)
     (exposure,) = simulate(rig, 1, seed=seed, inputs=np.zeros((rig.timing.exposure_steps, 1)))
     estimate = make_estimator(rig, name).step(exposure)
     assert "600 points tempered" in estimate.reason
     off = (estimate.path[0] - estimate.path[0, ::-1]) / 2
-    assert np.sqrt(np.mean(off**2) / np.mean(estimate.path_sd**2)) < 0.13
+    assert np.sqrt(np.mean(off**2) / np.mean(estimate.path_sd**2)) < 0.2
 
 
 def test_without_a_budget_nothing_is_tempered():
@@ -193,6 +193,13 @@ def test_profile_is_mixture_where_importance_sampling_is_too_sure_and_modes_stay
         assert ours.reason == theirs.reason
 
 
+def test_profile_stays_itself_where_there_are_too_few_points_for_mixture_to_find_the_modes():
+    inputs = np.zeros((3 * BRIGHT.timing.frame_period_steps, 1))
+    one, other = (make_estimator(BRIGHT, f"{name}:tempered=200") for name in ("profile", "mixture"))
+    pairs = [(one.step(each), other.step(each)) for each in simulate(BRIGHT, 3, seed=1, inputs=inputs)]
+    assert any(not np.array_equal(ours.path, theirs.path) for ours, theirs in pairs)
+
+
 def test_profile_stays_itself_where_importance_sampling_is_too_sure_and_modes_are_found_again():
     assert importance_is_too_sure(SLOWER)
     assert not modes_stay_lost(SLOWER)
@@ -252,9 +259,9 @@ def test_copies_of_a_rig_whose_parameter_wanders_work_alike():
     assert not any("on this rig" in reason for reason in reasons)
     found_soon = vibrating(1, (4.6,), noise_density=2e-4)
     rig = dataclasses.replace(found_soon, plant=dataclasses.replace(found_soon.plant, wandering=wandering))
-    _, reasons = errors_of(rig, "profile", [1], 3)
-    assert any("600 points tempered" in reason for reason in reasons)
-    assert not any("up to" in reason for reason in reasons)
+    _, reasons = errors_of(rig, "mixture", [1], 3)
+    assert any("1200 points tempered" in reason for reason in reasons)
+    assert not any("up to" in reason for reason in reasons)  # all of the share, as where modes stay lost
 
 
 def test_a_demo_leaves_mixture_out_where_it_tempers_in_nearly_every_exposure():
