@@ -62,7 +62,8 @@ _DOUBTED = 1e-3
 # the evidence of modes is rough.
 _LEAST_SHARE = 0.05
 _LEAST_DOUBTED_SHARE = 0.005
-# Posteriors are not tempered for having several modes if the windowed moments would have this share of them.
+# Posteriors are not tempered for having several modes if the windowed moments would have this share of them; nor are
+# others where importance sampling is too sure and missed modes stay lost.
 _MOST_MISSED = 0.5
 # Share of the posterior that importance sampling about tempered points may have missed, relative to what the points
 # alone may have, where missed modes are soon found again.
@@ -114,6 +115,10 @@ class ImportanceUpdater:
         """Whether all posteriors with several modes are tempered: where there are points enough for that."""
         return self.too_sure and self.tempers_several and self._missed(reduced) < _MOST_MISSED
 
+    def _tempers(self, reduced: Reduction) -> bool:
+        """Whether there are enough points for tempering to be better than windowed moments."""
+        return self._missed(reduced) < (_MOST_MISSED if self.too_sure and self.stay_lost else 1.0)
+
     def remarks(self, several: BoolArray, poor: BoolArray, reduced: Reduction) -> Iterator[tuple[BoolArray, str]]:
         yield poor, self._when_poor(reduced)
         if self.too_sure:
@@ -124,7 +129,7 @@ class ImportanceUpdater:
         missed = self._missed(reduced)
         if not self.points:
             what = "the estimate is wide"
-        elif missed < 1:
+        elif self._tempers(reduced):
             at_most = "up to " if self.left < 1 and not self.too_sure else ""
             what = f"{self.points} points tempered, and {at_most}{missed:.0%} of windowed moments"
         else:
@@ -168,7 +173,7 @@ class ImportanceUpdater:
         few = np.flatnonzero(poor)
         if len(few) and self.points:
             some = view.part(few)
-            if self._missed(reduced) < 1:
+            if self._tempers(reduced):
                 # Where the spot is bright, a frame rules most of the wide Gaussians out. But one about which no point
                 # lies may be that of a mode that was missed: where that would stay lost, it keeps the prior's weight.
                 by_share = np.flatnonzero((self.hands_over(reduced) and not self.stay_lost) | np.isin(few, doubted))
