@@ -161,8 +161,8 @@ def narrow_intervals(rig: Rig) -> Iterator[tuple[str, str]]:
         )
         if modes_stay_lost(rig):
             what = (
-                "profile is the same as mixture on such a rig, where its 1200 points are enough; it takes 0.1 to 1.2 s"
-                " an axis and exposure, and the 95 % intervals held 0.88 to 0.98"
+                "profile is the same as mixture on such a rig; it takes up to 1.2 s an axis and exposure, and the 95 %"
+                " intervals held 0.88 to 0.98"
             )
         yield (
             "sensor.noise_density",

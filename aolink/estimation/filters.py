@@ -29,8 +29,6 @@ from aolink.plant.alike import alike_systems
 from aolink.rig import Rig
 
 if TYPE_CHECKING:
-    from aolink.estimation.pixels.filter import MixtureUpdater
-    from aolink.estimation.pixels.likelihood import Reduction
     from aolink.estimation.pixels.updates import ImportanceUpdater
 
 
@@ -142,23 +140,15 @@ def mixture(rig: Rig, options: Options) -> Filter:
 
 def _budgeted(rig: Rig, options: Options, updates: ImportanceUpdater) -> ImportanceUpdater:
     """The updater for a rig and a budget: that of `mixture` where importance sampling does not show that it missed a
-    mode, the mode would stay lost, and there are enough tempered points to find it."""
+    mode, and the mode would stay lost."""
     from aolink.estimation.pixels.updates import MIXTURE
 
     # The copies of a rig whose parameter wanders are to work alike, or their evidence could not be compared.
     wanders = rig.plant.wandering is not None
     too_sure, stay_lost = not wanders and importance_is_too_sure(rig), wanders or modes_stay_lost(rig)
-    ours, theirs = (
-        each.within(options.tempered, options.draws / 100, too_sure=too_sure, stay_lost=stay_lost)
-        for each in (updates, MIXTURE)
-    )
-    return theirs if too_sure and stay_lost and theirs.hands_over(_reduction(rig, theirs)) else ours
-
-
-def _reduction(rig: Rig, updates: MixtureUpdater) -> Reduction:
-    """What is left of the exposures' coefficients for pixels to see."""
-    model = exposure_model(rig.plant, rig.timing.exposure_steps, rig.timing.exposure_offset)
-    return updates.reduction(model, rig.sensor)
+    if too_sure and stay_lost and options.tempered != 0:
+        updates = MIXTURE
+    return updates.within(options.tempered, options.draws / 100, too_sure=too_sure, stay_lost=stay_lost)
 
 
 def sampled(rig: Rig, options: Options) -> Filter:
@@ -176,5 +166,5 @@ def _of_pixels(rig: Rig, options: Options, updates: Any) -> Filter:
     # mixture compiles at once what profile would compile at the first posterior of several modes.
     make_ready()
     pixels.warm_up(MIXTURE)
-    _reduction(rig, updates)  # computed here, and not in the first exposure
+    updates.reduction(exposure_model(rig.plant, rig.timing.exposure_steps, rig.timing.exposure_offset), rig.sensor)
     return pixels

@@ -111,7 +111,7 @@ class ImportanceUpdater:
         """Share of what tempered points may have missed that importance sampling about them may have missed too."""
         return self.left_lost if self.stay_lost else _LEFT
 
-    def hands_over(self, reduced: Reduction) -> bool:
+    def _hands_over(self, reduced: Reduction) -> bool:
         """Whether all posteriors with several modes are tempered: where there are points enough for that."""
         return self.too_sure and self.tempers_several and self._missed(reduced) < _MOST_MISSED
 
@@ -135,7 +135,7 @@ class ImportanceUpdater:
         else:
             what = "windowed moments"
         enough = "importance sampling is not enough on this rig"
-        return f"{enough if self.hands_over(reduced) else 'too few importance weights count'}: {what}"
+        return f"{enough if self._hands_over(reduced) else 'too few importance weights count'}: {what}"
 
     def _missed(self, reduced: Reduction) -> float:
         """The share of a posterior that tempered points may have missed: the number of pairs of coefficients for each
@@ -152,7 +152,7 @@ class ImportanceUpdater:
         new = innovation(view, own, modes)
         wide = _wide_part(proposal, prior)
         lost = scattered(view, wide)
-        if self.hands_over(reduced):
+        if self._hands_over(reduced):
             lost |= has_several(modes, _LEAST_DOUBTED_SHARE)
         doubted = np.flatnonzero(new.nis > 2 * special.gammainccinv(new.value.shape[1] / 2, _DOUBTED))
         if len(doubted):
@@ -176,7 +176,7 @@ class ImportanceUpdater:
             if self._tempers(reduced):
                 # Where the spot is bright, a frame rules most of the wide Gaussians out. But one about which no point
                 # lies may be that of a mode that was missed: where that would stay lost, it keeps the prior's weight.
-                by_share = np.flatnonzero((self.hands_over(reduced) and not self.stay_lost) | np.isin(few, doubted))
+                by_share = np.flatnonzero((self._hands_over(reduced) and not self.stay_lost) | np.isin(few, doubted))
                 fit, best = self._tempered(some, before.part(few), proposal.part(few), wide.part(few), by_share, number)
                 # The search may have missed the mode that fits.
                 starts = whitened(own.part(few), best)

@@ -193,11 +193,13 @@ def test_profile_is_mixture_where_importance_sampling_is_too_sure_and_modes_stay
         assert ours.reason == theirs.reason
 
 
-def test_profile_stays_itself_where_there_are_too_few_points_for_mixture_to_find_the_modes():
-    inputs = np.zeros((3 * BRIGHT.timing.frame_period_steps, 1))
-    one, other = (make_estimator(BRIGHT, f"{name}:tempered=200") for name in ("profile", "mixture"))
-    pairs = [(one.step(each), other.step(each)) for each in simulate(BRIGHT, 3, seed=1, inputs=inputs)]
-    assert any(not np.array_equal(ours.path, theirs.path) for ours, theirs in pairs)
+@pytest.mark.parametrize(("points", "tempers"), [(300, False), (600, True)])
+def test_there_fewer_than_two_points_for_each_pair_of_coefficients_are_not_tempered(points, tempers):
+    """BRIGHT has thirteen coefficients. Elsewhere 300 points for 169 pairs would be tempered."""
+    _, reasons = errors_of(BRIGHT, f"mixture:tempered={points}", range(1, 4), 4)
+    assert any("points tempered" in reason for reason in reasons) == tempers
+    if not tempers:
+        assert any("windowed moments" in reason for reason in reasons)
 
 
 def test_profile_stays_itself_where_importance_sampling_is_too_sure_and_modes_are_found_again():
