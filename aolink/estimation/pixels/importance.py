@@ -40,10 +40,12 @@ _TOO_FEW = 0.5
 _COMPONENTS = 6
 # A fit misses a tempered point where its density, relative to the posterior's, is less by this many nats than at most
 # points. Fewer than the second share of all points, or than twice as many as coefficients, may be so by chance.
-# Number of components fitted to them.
+# Number of components fitted to them. Points that are less likely than the best one by the last number of nats are
+# stuck: no posterior has points there.
 _MISSED = 3.0
 _LEAST_MISSED = 1 / 30
 _COMPONENTS_OF_MISSED = 2
+_STUCK = 100.0
 # Modes are scattered if the windowed moments leave the path uncertain by a variance of this many variances of the
 # kernel.
 _SCATTERED = 2.5
@@ -138,7 +140,8 @@ def with_missed(fit: GaussianMixture, tempered: Tempered, rows: FloatArray) -> G
     The points' projections ``rows`` @ point are what components are fitted to, as in `tempered`.
     """
     away = tempered.log_posterior - fit.log_density(tempered.points)
-    missed = away > np.median(away, axis=1, keepdims=True) + _MISSED
+    stuck = tempered.log_posterior < tempered.log_posterior.max(axis=1, keepdims=True) - _STUCK
+    missed = (away > np.median(away, axis=1, keepdims=True) + _MISSED) & ~stuck
     _, count, n = tempered.points.shape
     found = fit
     for axis in np.flatnonzero(missed.sum(axis=1) >= max(_LEAST_MISSED * count, 2 * n)):

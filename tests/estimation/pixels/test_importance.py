@@ -58,6 +58,14 @@ def test_a_few_points_may_be_missed_by_chance():
     np.testing.assert_array_equal(found.mean, FIRST.mean)
 
 
+def test_points_that_are_stuck_are_not_missed():
+    """Tempering has not moved them to where the posterior is."""
+    points = drawn(0.3)
+    far = np.abs(points.points[..., 0] - 9) < 4.5
+    stuck = points._replace(log_posterior=np.where(far, points.log_posterior - 112, points.log_posterior))
+    np.testing.assert_array_equal(with_missed(FIRST, stuck, np.eye(3)).mean, FIRST.mean)
+
+
 def test_an_axis_that_misses_nothing_is_not_changed_by_one_that_does():
     one, other = drawn(0.3), drawn(1e-3)
     both = Tempered(
