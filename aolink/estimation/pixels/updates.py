@@ -14,11 +14,12 @@ as wide as its few effective points make it.
 Some hundred points miss modes as well, and more of them the more coefficients there are. So a share of the posterior
 remains the Gaussians of the windowed moments, whose covariance is wide enough. Each has the weight of the prior's
 component that it comes from, or, where the frame may rule it out, of the points about it. With as many points as pairs
-of coefficients, or fewer, this share is one, and no point is tempered. Importance sampling about the points then weighs
-the modes that they have found; where its effective sample size is enough, a quarter of that share is left. Where modes
-that were missed would stay lost for long (`aolink.estimation.assumptions.modes_stay_lost`), `profile` leaves half of
-it, and `mixture`, whose share is half as large, all. Points at which the fit has nearly no density keep their share of
-the posterior. This is not done where importance sampling is too sure.
+of coefficients, or fewer, this share is one, and no point is tempered; nor, where importance sampling is too sure and
+missed modes stay lost, with fewer than twice as many. Importance sampling about the points then weighs the modes that
+they have found; where its effective sample size is enough, a quarter of that share is left. Where modes that were
+missed would stay lost for long (`aolink.estimation.assumptions.modes_stay_lost`), `profile` leaves half of it, and
+`mixture`, whose share is half as large, all. Points at which the fit has nearly no density keep their share of the
+posterior. This is not done where importance sampling is too sure.
 
 A mode that was lost is found again: a thousandth of the prior is the prediction without any measurement. Its modes are
 searched for where the NIS is larger than chance explains.
