@@ -12,8 +12,11 @@ from typing import NamedTuple
 import numpy as np
 
 from aolink.estimation.compiled.small import compiled, inlined
+from aolink.estimation.compiled.vectors import LANES, add_cubic, add_product
 from aolink.numerics.arrays import BoolArray, FloatArray
 
+AT_ONCE = 64
+"""Points whose paths are computed together."""
 LARGE = 1e200
 """A product of variance ratios is replaced by its logarithm when it exceeds this."""
 
@@ -32,7 +35,8 @@ class Line(NamedTuple):
     weights: FloatArray
     """Each node's share of the exposure, (nodes,)."""
     table: FloatArray
-    """Taylor coefficients of the light about points of a pixel, in pixels, (points, 4, reach)."""
+    """Taylor coefficients of the light about points of a pixel, in pixels, (points, 4, reach); the reach is a multiple
+    of `vectors.LANES`."""
     low: float
     """Edge at which the first pixel begins, slope units."""
     per_unit: float
@@ -47,7 +51,7 @@ class Line(NamedTuple):
 def place(theta: float, low: float, per_unit: float, pixels: int, points: int, reach: int) -> tuple[int, int, float]:
     """First pixel in a padded row that a spot lights, or -1; nearest point of the table; distance from it in pixels.
 
-    The arguments are numbers, not the `Line`: counting references to its arrays would take longer than all the rest.
+    The arguments are numbers, not the `Line`, as `log_likelihoods_of_lines` says.
     """
     v = (theta - low) * per_unit
     if not (v > -0.5 * reach and v < pixels + 0.5 * reach):
@@ -59,55 +63,69 @@ def place(theta: float, low: float, per_unit: float, pixels: int, points: int, r
 
 
 @inlined
-def expected_light(line: Line, path: FloatArray, f: FloatArray) -> None:
-    """Densities without noise, padded on both sides by the table's reach."""
-    f[:] = 0.0
-    points, _, reach = line.table.shape
-    for k in range(len(path)):
-        first, point, d = place(path[k], line.low, line.per_unit, line.y.shape[1], points, reach)
-        if first < 0:
-            continue
-        w = line.weights[k]
-        row = line.table[point]
-        for p in range(reach):
-            f[first + p] += w * (row[0, p] + d * (row[1, p] + d * (row[2, p] + d * row[3, p])))
+def expected_light(
+    paths: FloatArray, point: int, weights: FloatArray, table: FloatArray, low: float, per_unit: float, f: FloatArray
+) -> None:
+    """Densities without noise under one of the paths (nodes, points), padded on both sides by the table's reach."""
+    points, _, reach = table.shape
+    for p in range(len(f)):
+        f[p] = 0.0
+    for k in range(len(weights)):
+        first, nearest, d = place(paths[k, point], low, per_unit, len(f) - 2 * reach, points, reach)
+        if first >= 0:
+            row = 4 * reach * nearest
+            for p in range(0, reach, LANES):
+                add_cubic(f, first + p, weights[k], d, table, row + p, reach)
 
 
 @inlined
-def linearised_light(line: Line, path: FloatArray, basis: FloatArray, f: FloatArray, J: FloatArray) -> None:
+def linearised_light(
+    path: FloatArray, weights: FloatArray, table: FloatArray, low: float, per_unit: float, basis: FloatArray,
+    slope: FloatArray, f: FloatArray, J: FloatArray,
+) -> None:  # fmt: skip
     """The densities of `expected_light`, and their Jacobian J (n, padded pixels) by the coefficients of a basis (n,
-    nodes)."""
-    f[:] = 0.0
-    J[:] = 0.0
-    points, _, reach = line.table.shape
-    slope = np.empty(reach)
+    nodes).
+
+    ``slope`` is room for (reach,).
+    """
+    points, _, reach = table.shape
+    for p in range(len(f)):
+        f[p] = 0.0
+    for i in range(len(J)):
+        for p in range(len(f)):
+            J[i, p] = 0.0
     for k in range(len(path)):
-        first, point, d = place(path[k], line.low, line.per_unit, line.y.shape[1], points, reach)
-        if first < 0:
-            continue
-        w = line.weights[k]
-        row = line.table[point]
-        # The loop of `expected_light`: in a function of its own it would make both a seventh slower.
-        for p in range(reach):
-            f[first + p] += w * (row[0, p] + d * (row[1, p] + d * (row[2, p] + d * row[3, p])))
-        w *= line.per_unit
-        for p in range(reach):
-            slope[p] = w * (row[1, p] + d * (2.0 * row[2, p] + 3.0 * d * row[3, p]))
-        for i in range(len(basis)):
-            b = basis[i, k]
+        first, nearest, d = place(path[k], low, per_unit, len(f) - 2 * reach, points, reach)
+        if first >= 0:
+            row, w = 4 * reach * nearest, weights[k] * per_unit
+            for p in range(0, reach, LANES):
+                add_cubic(f, first + p, weights[k], d, table, row + p, reach)
             for p in range(reach):
-                J[i, first + p] += b * slope[p]
+                steeper = 2.0 * table[nearest, 2, p] + 3.0 * d * table[nearest, 3, p]
+                slope[p] = w * (table[nearest, 1, p] + d * steeper)
+            for i in range(len(basis)):
+                for p in range(0, reach, LANES):
+                    add_product(J, i * len(f) + first + p, basis[i, k], slope, p)
 
 
 @inlined
-def log_likelihood_of(y: FloatArray, usable: BoolArray, f: FloatArray, read_noise: float, gain: float) -> float:
-    """Log-likelihood of pixels with expected densities f, all (pixels,)."""
+def log_likelihood_of(
+    y: FloatArray, usable: BoolArray, f: FloatArray, pad: int, read_noise: float, gain: float
+) -> float:
+    """Log-likelihood of pixels (pixels,) with expected densities f, which begin after ``pad`` others."""
     total, product, quiet = 0.0, 1.0, 1.0 / read_noise
+    if not gain:
+        for p in range(len(y)):
+            if usable[p]:
+                e = y[p] - f[pad + p]
+                total += e * e * quiet
+        return -0.5 * total
     for p in range(len(y)):
         if usable[p]:
-            e = y[p] - f[p]
-            if gain and f[p] > 0.0:
-                R = read_noise + gain * f[p]
+            light = f[pad + p]
+            e = y[p] - light
+            if light > 0.0:
+                R = read_noise + gain * light
                 total += e * e / R
                 # One logarithm of a product is taken: one for each pixel would take longer than everything else here.
                 product *= R * quiet
@@ -122,7 +140,8 @@ def log_likelihood_of(y: FloatArray, usable: BoolArray, f: FloatArray, read_nois
 @inlined
 def path_of(offset: FloatArray, basis: FloatArray, t: FloatArray, path: FloatArray) -> None:
     """The path at the nodes, (nodes,), of coefficients t (n,) of a basis (n, nodes)."""
-    path[:] = offset
+    for k in range(len(path)):
+        path[k] = offset[k]
     for i in range(len(t)):
         x = t[i]
         for k in range(len(path)):
@@ -131,34 +150,53 @@ def path_of(offset: FloatArray, basis: FloatArray, t: FloatArray, path: FloatArr
 
 @compiled
 def log_likelihoods_of_lines(line: Line, row: int, t: FloatArray, begin: int, end: int, out: FloatArray) -> None:
-    """Log-likelihoods of the points ``begin`` to ``end`` of t (n, points) in one row."""
-    pad = line.table.shape[2]
-    path = np.empty(len(line.weights))
-    f = np.empty(line.y.shape[1] + 2 * pad)
-    for k in range(begin, end):
-        path_of(line.inputs[row], line.basis, t[:, k], path)
-        expected_light(line, path, f)
-        out[k] = log_likelihood_of(line.y[row], line.usable[row], f[pad:], line.read_noise, line.gain)
+    """Log-likelihoods of the points ``begin`` to ``end`` of t (n, points) in one row.
+
+    In the loop over points no part of an array and no field of the `Line` is taken: each would be counted as another
+    reference, and that would take as long as all the rest.
+    """
+    y, usable, inputs, basis, weights = line.y[row], line.usable[row], line.inputs[row], line.basis, line.weights
+    table, low, per_unit, read_noise, gain = line.table, line.low, line.per_unit, line.read_noise, line.gain
+    pad = table.shape[2]
+    paths, f = np.empty((len(weights), AT_ONCE)), np.empty(len(y) + 2 * pad)
+    for first in range(begin, end, AT_ONCE):
+        count = min(AT_ONCE, end - first)
+        paths_of(inputs, basis, t, first, count, paths)
+        for point in range(count):
+            expected_light(paths, point, weights, table, low, per_unit, f)
+            out[first + point] = log_likelihood_of(y, usable, f, pad, read_noise, gain)
+
+
+@compiled
+def paths_of(offset: FloatArray, basis: FloatArray, t: FloatArray, first: int, count: int, paths: FloatArray) -> None:
+    """Paths at the nodes, (nodes, points), of ``count`` points from ``first`` on of t (n, points)."""
+    for node in range(len(offset)):
+        for k in range(count):
+            paths[node, k] = offset[node]
+        for i in range(len(t)):
+            x = basis[i, node]
+            for k in range(count):
+                paths[node, k] += x * t[i, first + k]
 
 
 @inlined
 def fisher_information(
-    line: Line, row: int, f: FloatArray, J: FloatArray, scores: FloatArray, H: FloatArray, pull: FloatArray
-) -> tuple[float, float]:
-    """Lower half of H = J' I J, I each pixel's Fisher information; pull = J' score.
+    y: FloatArray, usable: BoolArray, f: FloatArray, J: FloatArray, pad: int, read_noise: float, gain: float,
+    scores: FloatArray, H: FloatArray, pull: FloatArray,
+) -> tuple[float, float]:  # fmt: skip
+    """Lower half of H = J' I J, I each pixel's Fisher information; pull = J' score. f and J as `linearised_light`.
 
     Returns the log-likelihood and the sum of score^2 / I over the pixels.
 
     ``scores`` is room for (3, pixels).
     """
-    n, pixels, pad = len(J), line.y.shape[1], line.table.shape[2]
+    n, pixels = len(J), len(y)
     total = square = 0.0
-    product, quiet = 1.0, 1.0 / line.read_noise
-    y, usable, gain = line.y[row], line.usable[row], line.gain
+    product, quiet = 1.0, 1.0 / read_noise
     for p in range(pixels):
         light = max(f[pad + p], 0.0)
         relative = 0.5 * gain if f[pad + p] > 0.0 else 0.0
-        information = 1.0 / (line.read_noise + gain * light)
+        information = 1.0 / (read_noise + gain * light)
         seen = 1.0 if usable[p] else 0.0
         e = seen * (y[p] - f[pad + p])
         score = e * information

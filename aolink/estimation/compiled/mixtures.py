@@ -9,7 +9,7 @@ import numpy as np
 from aolink.estimation.compiled.likelihoods import log_likelihoods_of_row
 from aolink.estimation.compiled.line import Line
 from aolink.estimation.compiled.plane import Plane
-from aolink.estimation.compiled.small import cholesky_into, compiled, compiled_sums, decay, lower_inverse_into
+from aolink.estimation.compiled.small import cholesky_into, compiled, compiled_sums, decay, inlined, lower_inverse_into
 from aolink.numerics.arrays import FloatArray
 
 _LOG_2PI = math.log(2 * math.pi)
@@ -119,7 +119,7 @@ def merge(log_weight: FloatArray, mean: FloatArray, covariance: FloatArray, most
                     cost[i, k] = _cost(w, x, P, logs, i, k, merged, root)
 
 
-@compiled
+@inlined
 def _log_determinant(P: FloatArray, root: FloatArray) -> float:
     cholesky_into(P, root)
     total = 0.0
@@ -128,7 +128,7 @@ def _log_determinant(P: FloatArray, root: FloatArray) -> float:
     return total
 
 
-@compiled
+@inlined
 def _merged(w: FloatArray, x: FloatArray, P: FloatArray, i: int, j: int, out: FloatArray) -> float:
     """Covariance of two merged components, and their log-weight."""
     top = max(w[i], w[j])
@@ -142,7 +142,7 @@ def _merged(w: FloatArray, x: FloatArray, P: FloatArray, i: int, j: int, out: Fl
     return float(total)
 
 
-@compiled
+@inlined
 def _cost(
     w: FloatArray, x: FloatArray, P: FloatArray, logs: FloatArray, i: int, j: int, merged: FloatArray, root: FloatArray
 ) -> float:

@@ -17,7 +17,7 @@ from aolink.estimation.compiled.small import (
     lower_solve,
     times,
 )
-from aolink.numerics.arrays import FloatArray, Indices
+from aolink.numerics.arrays import BoolArray, FloatArray, Indices
 
 # A search ends where its squared distance from a known mode, in that mode's standard deviations, is below this.
 _NEXT_TO = 0.25
@@ -67,16 +67,19 @@ def innovations_of_lines(
     """
     rows, k = value.shape
     n, nodes = line.basis.shape
-    width = line.y.shape[1] + 2 * line.table.shape[2]
-    path, B, root, s = np.empty(nodes), np.empty((n, nodes)), np.empty((n, n)), np.empty(n)
+    weights, table, low, per_unit = line.weights, line.table, line.low, line.per_unit
+    read_noise, gain, pad = line.read_noise, line.gain, line.table.shape[2]
+    width = line.y.shape[1] + 2 * pad
+    path, B, root, s, slope = np.empty(nodes), np.empty((n, nodes)), np.empty((n, n)), np.empty(n), np.empty(pad)
     f, J, scores = np.empty(width), np.empty((n, width)), np.empty((3, line.y.shape[1]))
     H, pull, values, vectors = np.empty((n, n)), np.empty(n), np.empty(n), np.empty((n, n))
     for row in range(rows):
         cholesky_into(covariance[row], root)
         times(root.T, line.basis, B)
         path_of(line.inputs[row], line.basis, t[row], path)
-        linearised_light(line, path, B, f, J)
-        _, square[row] = fisher_information(line, row, f, J, scores, H, pull)
+        linearised_light(path, weights, table, low, per_unit, B, slope, f, J)
+        y, usable = line.y[row], line.usable[row]
+        _, square[row] = fisher_information(y, usable, f, J, pad, read_noise, gain, scores, H, pull)
         for i in range(n):
             s[i] = t[row, i] - mean[row, i]
             for j in range(i):
@@ -112,7 +115,9 @@ def find_modes_of_lines(
     """
     rows, n = mean.shape
     nodes, room = line.basis.shape[1], out_mean.shape[1]
-    width = line.y.shape[1] + 2 * line.table.shape[2]
+    weights, table, low, per_unit = line.weights, line.table, line.low, line.per_unit
+    read_noise, gain, pad = line.read_noise, line.gain, line.table.shape[2]
+    width, slope = line.y.shape[1] + 2 * pad, np.empty(pad)
     path, rest, B = np.empty(nodes), np.empty(nodes), np.empty((n, nodes))
     f, J, scores = np.empty(width), np.empty((n, width)), np.empty((3, line.y.shape[1]))
     s, there, step = np.empty(n), np.empty(n), np.empty(n)
@@ -120,6 +125,7 @@ def find_modes_of_lines(
     root, damped, lower, inverse = np.empty((n, n)), np.empty((n, n)), np.empty((n, n)), np.empty((n, n))
     begins, ends, their_H = np.empty((room, n)), np.empty((room, n)), np.empty((room, n, n))
     for row in range(rows):
+        y, usable = line.y[row], line.usable[row]
         cholesky_into(covariance[row], root)
         times(root.T, line.basis, B)
         path_of(line.inputs[row], line.basis, mean[row], rest)
@@ -133,7 +139,10 @@ def find_modes_of_lines(
             if twin < 0:
                 for i in range(n):
                     s[i] = begins[done, i]
-                now = _at(line, row, rest, B, s, path, f, J, scores, H, pull)
+                now = _at(
+                    y, usable, weights, table, low, per_unit, read_noise, gain, rest, B, s, path, slope, f, J, scores,
+                    H, pull,
+                )  # fmt: skip
                 damping = first_damping
                 for _ in range(passes):
                     for i in range(n):
@@ -147,21 +156,25 @@ def find_modes_of_lines(
                     for i in range(n):
                         there[i] = s[i] + step[i]
                         decrement += step[i] * pull[i]
-                    objective = _at(line, row, rest, B, there, path, f, J, scores, other, its_pull)
-                    gain, before = now - objective, damping
-                    better = gain > 0
+                    objective = _at(
+                        y, usable, weights, table, low, per_unit, read_noise, gain, rest, B, there, path, slope, f, J,
+                        scores, other, its_pull,
+                    )  # fmt: skip
+                    decrease, before = now - objective, damping
+                    better = decrease > 0
                     if better:
                         now = objective
-                        s, there = there, s
-                        H, other = other, H
-                        pull, its_pull = its_pull, pull
+                        for i in range(n):
+                            s[i], pull[i] = there[i], its_pull[i]
+                            for j in range(i + 1):
+                                H[i, j] = other[i, j]
                         damping = damping / 8
                         twin = _near(s, ends, their_H, found)
                         if twin >= 0:
                             break
                     else:
                         damping = max(damping, 1e-3) * 8
-                    if before <= free_damping and ((better and gain < converged) or decrement < converged):
+                    if before <= free_damping and ((better and decrease < converged) or decrement < converged):
                         break
                     if damping > largest_damping:
                         break
@@ -251,14 +264,18 @@ def _near(s: FloatArray, ends: FloatArray, H: FloatArray, count: int) -> int:
 
 @inlined
 def _at(
-    line: Line, row: int, rest: FloatArray, B: FloatArray, s: FloatArray, path: FloatArray, f: FloatArray,
-    J: FloatArray, scores: FloatArray, H: FloatArray, pull: FloatArray,
+    y: FloatArray, usable: BoolArray, weights: FloatArray, table: FloatArray, low: float, per_unit: float,
+    read_noise: float, gain: float, rest: FloatArray, B: FloatArray, s: FloatArray, path: FloatArray,
+    slope: FloatArray, f: FloatArray, J: FloatArray, scores: FloatArray, H: FloatArray, pull: FloatArray,
 ) -> float:  # fmt: skip
-    """Information H, negative gradient ``pull`` and objective (returned) at whitened coordinates s."""
+    """Information H, negative gradient ``pull`` and objective (returned) at whitened coordinates s.
+
+    The fields of the `Line` and its row are arguments, as `log_likelihoods_of_lines` says.
+    """
     n = len(s)
     path_of(rest, B, s, path)
-    linearised_light(line, path, B, f, J)
-    log_likelihood, _ = fisher_information(line, row, f, J, scores, H, pull)
+    linearised_light(path, weights, table, low, per_unit, B, slope, f, J)
+    log_likelihood, _ = fisher_information(y, usable, f, J, table.shape[2], read_noise, gain, scores, H, pull)
     square = 0.0
     for i in range(n):
         H[i, i] += 1.0

@@ -10,8 +10,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from aolink.estimation.compiled.line import log_likelihood_of, place
+from aolink.estimation.compiled.line import AT_ONCE, log_likelihood_of, paths_of, place
 from aolink.estimation.compiled.small import compiled, compiled_sums, inlined
+from aolink.estimation.compiled.vectors import LANES, add_product, put_cubic
 from aolink.numerics.arrays import BoolArray, FloatArray
 
 
@@ -29,7 +30,8 @@ class Plane(NamedTuple):
     weights: FloatArray
     """Each node's share of the exposure, (nodes,)."""
     across: FloatArray
-    """Taylor coefficients of the densities of columns of pixels about points of a pixel, (terms, points, 4, reach)."""
+    """Taylor coefficients of the densities of columns of pixels about points of a pixel, (terms, points, 4, reach); the
+    reach is a multiple of `vectors.LANES`."""
     down: FloatArray
     """The same coefficients for rows of pixels."""
     terms: FloatArray
@@ -46,28 +48,40 @@ class Plane(NamedTuple):
 
 @compiled
 def log_likelihoods_of_spots(seen: Plane, row: int, t: FloatArray, begin: int, end: int, out: FloatArray) -> None:
-    """Log-likelihoods of the points ``begin`` to ``end`` of t (n, points) in one row."""
-    side, across, down = seen.y.shape[2], seen.across.shape[3], seen.down.shape[3]
-    path = np.empty((2, len(seen.weights)))
+    """Log-likelihoods of the points ``begin`` to ``end`` of t (n, points) in one row.
+
+    In the loop over points no part of an array is taken, as `compiled.line.log_likelihoods_of_lines` says.
+    """
+    weights, terms, low, per_unit = seen.weights, seen.terms, seen.low, seen.per_unit
+    across, down, read_noise, gain = seen.across, seen.down, seen.read_noise, seen.gain
+    side, wide, high = seen.y.shape[2], across.shape[3], down.shape[3]
     # Padded by what a spot outside the window still lights in it.
-    f = np.empty((side + 2 * down, side + 2 * across))
-    columns, rows = np.empty(across), np.empty(down)
-    for k in range(begin, end):
-        out[k] = 0.0
+    f = np.zeros((side + 2 * high, side + 2 * wide))
+    columns, rows, own, dark = np.empty(wide), np.empty(high), np.empty(side * side), np.empty(side)
+    x, y = np.empty((len(weights), AT_ONCE)), np.empty((len(weights), AT_ONCE))
+    for first in range(begin, end, AT_ONCE):
+        count = min(AT_ONCE, end - first)
+        for k in range(count):
+            out[first + k] = 0.0
         for spot in range(seen.y.shape[1]):
-            _path_of(seen, row, spot, t[:, k], path)
-            f[:] = 0.0
-            for j in range(len(seen.terms)):
-                _add_spots(
-                    path, seen.weights, seen.terms[j], seen.low, seen.per_unit, side, seen.across[j], seen.down[j],
-                    columns, rows, f,
-                )  # fmt: skip
-            light, usable = seen.y[row, spot], seen.usable[row, spot]
-            if seen.gain:
-                own = f[down : down + side, across : across + side].copy()
-                out[k] += log_likelihood_of(light.ravel(), usable.ravel(), own.ravel(), seen.read_noise, seen.gain)
-            else:
-                out[k] -= 0.5 * _squares(light, usable, f, down, across) / seen.read_noise
+            paths_of(seen.inputs[row, 2 * spot], seen.basis[2 * spot], t, first, count, x)
+            paths_of(seen.inputs[row, 2 * spot + 1], seen.basis[2 * spot + 1], t, first, count, y)
+            light, usable = seen.y[row, spot].ravel(), seen.usable[row, spot].ravel()
+            _squares(light, usable, f, side, 0, 0, 0, 0, dark)
+            for k in range(count):
+                top, bottom, left, right = _add_light(
+                    x, y, k, weights, terms, across, down, low, per_unit, side, columns, rows, f
+                )
+                if gain:
+                    for r in range(side):
+                        for c in range(side):
+                            own[r * side + c] = f[high + r, wide + c]
+                    out[first + k] += log_likelihood_of(light, usable, own, 0, read_noise, gain)
+                else:
+                    out[first + k] -= 0.5 * _squares(light, usable, f, side, high, wide, top, bottom, dark) / read_noise
+                for r in range(top, bottom):
+                    for c in range(left, right):
+                        f[r, c] = 0.0
 
 
 @compiled
@@ -122,37 +136,34 @@ def _path_of(seen: Plane, row: int, spot: int, t: FloatArray, path: FloatArray) 
 
 
 @compiled
-def _add_spots(
-    path: FloatArray, weights: FloatArray, term: float, low: float, per_unit: float, side: int, across: FloatArray,
-    down: FloatArray, columns: FloatArray, rows: FloatArray, f: FloatArray,
-) -> None:  # fmt: skip
-    """The light of a spot at each node, rows times columns, added to padded densities f.
+def _add_light(
+    x: FloatArray, y: FloatArray, point: int, weights: FloatArray, terms: FloatArray, across: FloatArray,
+    down: FloatArray, low: float, per_unit: float, side: int, columns: FloatArray, rows: FloatArray, f: FloatArray,
+) -> tuple[int, int, int, int]:  # fmt: skip
+    """Densities without noise under one of the paths x and y (nodes, points), added to padded densities f.
 
-    Indices are unsigned and arrays flat: signed indices might count from the end, and slices would have their
-    references counted; either makes the loop over the pixels of a row twice as slow.
+    The results are the first row and the one after the last that get light, and the same for columns.
     """
-    A, D, lit, width = across.ravel(), down.ravel(), f.ravel(), np.uintp(f.shape[1])
-    wide, high = np.uintp(len(columns)), np.uintp(len(rows))
-    for node in range(path.shape[1]):
-        left, column, dx = place(path[0, node], low, per_unit, side, across.shape[0], len(columns))
-        top, line, dy = place(path[1, node], low, per_unit, side, down.shape[0], len(rows))
-        if left < 0 or top < 0:
-            continue
-        weight, at = term * weights[node], np.uintp(4 * column) * wide
-        for p in range(len(columns)):
-            q = at + np.uintp(p)
-            light = A[q] + dx * (A[q + wide] + dx * (A[q + wide + wide] + dx * A[q + wide + wide + wide]))
-            columns[np.uintp(p)] = weight * light
-        at = np.uintp(4 * line) * high
-        for p in range(len(rows)):
-            q = at + np.uintp(p)
-            rows[np.uintp(p)] = D[q] + dy * (D[q + high] + dy * (D[q + high + high] + dy * D[q + high + high + high]))
-        first = np.uintp(top) * width + np.uintp(left)
-        for r in range(len(rows)):
-            light = rows[np.uintp(r)]
-            for c in range(len(columns)):
-                lit[first + np.uintp(c)] += light * columns[np.uintp(c)]
-            first += width
+    wide, high, width = across.shape[3], down.shape[3], f.shape[1]
+    begin, end, first, last = len(f), 0, width, 0
+    for j in range(len(terms)):
+        for k in range(len(weights)):
+            left, column, dx = place(x[k, point], low, per_unit, side, across.shape[1], wide)
+            top, line, dy = place(y[k, point], low, per_unit, side, down.shape[1], high)
+            if left < 0 or top < 0:
+                continue
+            begin, end, first, last = min(begin, top), max(end, top + high), min(first, left), max(last, left + wide)
+            of_columns, of_rows = 4 * (j * across.shape[1] + column) * wide, 4 * (j * down.shape[1] + line) * high
+            for p in range(0, wide, LANES):
+                put_cubic(columns, p, terms[j] * weights[k], dx, across, of_columns + p, wide)
+            for p in range(0, high, LANES):
+                put_cubic(rows, p, 1.0, dy, down, of_rows + p, high)
+            at = top * width + left
+            for r in range(high):
+                for p in range(0, wide, LANES):
+                    add_product(f, at + p, rows[r], columns, p)
+                at += width
+    return begin, end, first, last
 
 
 @inlined
@@ -177,15 +188,25 @@ def _taylor_slope(series: FloatArray, d: float, factor: float, out: FloatArray) 
 
 
 @compiled_sums
-def _squares(y: FloatArray, usable: BoolArray, padded: FloatArray, down: int, across: int) -> float:
-    """Sum of the usable pixels' squared deviations from padded expected densities."""
-    total = 0.0
-    for r in range(len(y)):
-        # Slices of one row, as in `_add_product`.
-        seen, counts, f = y[r], usable[r], padded[down + r, across : across + y.shape[1]]
-        of_row = 0.0
-        for c in range(len(seen)):
-            e = seen[c] - f[c]
-            of_row += e * e if counts[c] else 0.0
+def _squares(
+    y: FloatArray, usable: BoolArray, padded: FloatArray, side: int, down: int, across: int, begin: int, end: int,
+    dark: FloatArray,
+) -> float:  # fmt: skip
+    """Sum of squared deviations of the usable pixels of y (side * side,) from padded expected densities.
+
+    Only the padded rows ``begin`` to ``end`` have light; ``dark`` are the sums of rows without, (side,), which are
+    computed where no row has light.
+    """
+    total, f, width = 0.0, padded.ravel(), np.uintp(padded.shape[1])
+    for r in range(side):
+        if begin < end and not begin <= down + r < end:
+            total += dark[r]
+            continue
+        of_row, pixel, first = 0.0, np.uintp(r * side), np.uintp(down + r) * width + np.uintp(across)
+        for c in range(side):
+            e = y[pixel + np.uintp(c)] - f[first + np.uintp(c)]
+            of_row += e * e if usable[pixel + np.uintp(c)] else 0.0
         total += of_row
+        if begin >= end:
+            dark[r] = of_row
     return total

@@ -51,7 +51,7 @@ _SWEEPS = 30
 _ROUNDING = 1e-28
 
 
-@compiled
+@inlined
 def cholesky_into(a: FloatArray, root: FloatArray) -> None:
     """Lower triangular root, (n, n), of a covariance that may be singular, from its lower half.
 
@@ -77,7 +77,7 @@ def floored_cholesky_into(a: FloatArray, root: FloatArray) -> None:
     _factor(a, root, 1e-15)
 
 
-@compiled
+@inlined
 def _factor(a: FloatArray, root: FloatArray, least: float) -> None:
     """Cholesky's factorisation of ``a`` with the diagonal that ``root`` holds; ``least`` is a squared pivot's floor."""
     n = len(a)

@@ -1,0 +1,55 @@
+"""Four numbers at a time, against the same sums one by one."""
+
+import numba
+import numpy as np
+import pytest
+
+from aolink.estimation.compiled.vectors import LANES, add_cubic, add_product, put_cubic
+
+
+@numba.njit
+def product_added(out, at, factor, x, begin):
+    add_product(out, at, factor, x, begin)
+
+
+@numba.njit
+def cubic_added(out, at, factor, d, table, begin, stride):
+    add_cubic(out, at, factor, d, table, begin, stride)
+
+
+@numba.njit
+def cubic_put(out, at, factor, d, table, begin, stride):
+    put_cubic(out, at, factor, d, table, begin, stride)
+
+
+def cubic(table, begin, stride, d):
+    c = [table.ravel()[begin + k * stride : begin + k * stride + LANES] for k in range(4)]
+    return c[0] + d * (c[1] + d * (c[2] + d * c[3]))
+
+
+@pytest.mark.parametrize("at", [0, 3, 8])
+def test_a_product_is_added_to_four_numbers_and_to_no_other(at):
+    rng = np.random.default_rng(at)
+    out, x = rng.standard_normal((3, 4)), rng.standard_normal(9)
+    expected = out.copy()
+    expected.ravel()[at : at + LANES] += -1.5 * x[5:]
+    product_added(out, at, -1.5, x, 5)
+    assert np.allclose(out, expected, rtol=1e-15)
+    untouched = np.delete(np.arange(12), np.arange(at, at + LANES))
+    assert np.array_equal(out.ravel()[untouched], expected.ravel()[untouched])
+
+
+@pytest.mark.parametrize("at", [0, 3, 8])
+def test_a_cubic_is_added_to_four_numbers_or_takes_their_place(at):
+    rng = np.random.default_rng(at)
+    out, table = rng.standard_normal((3, 4)), rng.standard_normal((2, 4, 8))
+    begin, d = 32 + 4, 0.3
+    added, placed = out.copy(), out.copy()
+    added.ravel()[at : at + LANES] += 0.7 * cubic(table, begin, 8, d)
+    placed.ravel()[at : at + LANES] = 0.7 * cubic(table, begin, 8, d)
+    for function, expected in ((cubic_added, added), (cubic_put, placed)):
+        found = out.copy()
+        function(found, at, 0.7, d, table, begin, 8)
+        assert np.allclose(found, expected, rtol=1e-14)
+        untouched = np.delete(np.arange(12), np.arange(at, at + LANES))
+        assert np.array_equal(found.ravel()[untouched], out.ravel()[untouched])
