@@ -13,7 +13,7 @@ import numpy as np
 
 from aolink.estimation.compiled.small import compiled, inlined
 from aolink.estimation.compiled.vectors import LANES, add_cubic, add_product
-from aolink.numerics.arrays import BoolArray, FloatArray
+from aolink.numerics.arrays import BoolArray, FloatArray, IntArray
 
 AT_ONCE = 64
 """Points whose paths are computed together."""
@@ -62,20 +62,40 @@ def place(theta: float, low: float, per_unit: float, pixels: int, points: int, r
     return int(cell) + reach // 2, point, u - (point + 0.5) / points
 
 
+@compiled
+def places_of(
+    paths: FloatArray, count: int, low: float, per_unit: float, pixels: int, points: int, reach: int,
+    firsts: IntArray, nearest: IntArray, away: FloatArray,
+) -> None:  # fmt: skip
+    """`place` of each node of ``count`` paths (nodes, points), without a branch, so that several are computed at a
+    time; all results are (nodes, points)."""
+    for node in range(len(paths)):
+        for k in range(count):
+            v = (paths[node, k] - low) * per_unit
+            lit = v > -0.5 * reach and v < pixels + 0.5 * reach
+            cell = math.floor(v if lit else 0.0)
+            u = v - cell
+            point = min(int(u * points), points - 1)
+            firsts[node, k] = int(cell) + reach // 2 if lit else -1
+            nearest[node, k] = point
+            away[node, k] = u - (point + 0.5) / points
+
+
 @inlined
 def expected_light(
-    paths: FloatArray, point: int, weights: FloatArray, table: FloatArray, low: float, per_unit: float, f: FloatArray
-) -> None:
-    """Densities without noise under one of the paths (nodes, points), padded on both sides by the table's reach."""
-    points, _, reach = table.shape
+    firsts: IntArray, nearest: IntArray, away: FloatArray, point: int, weights: FloatArray, table: FloatArray,
+    f: FloatArray,
+) -> None:  # fmt: skip
+    """Densities without noise under one of the paths that `places_of` has placed, padded on both sides by the table's
+    reach."""
+    reach = table.shape[2]
     for p in range(len(f)):
         f[p] = 0.0
     for k in range(len(weights)):
-        first, nearest, d = place(paths[k, point], low, per_unit, len(f) - 2 * reach, points, reach)
-        if first >= 0:
-            row = 4 * reach * nearest
+        if firsts[k, point] >= 0:
+            first, row = firsts[k, point], 4 * reach * nearest[k, point]
             for p in range(0, reach, LANES):
-                add_cubic(f, first + p, weights[k], d, table, row + p, reach)
+                add_cubic(f, first + p, weights[k], away[k, point], table, row + p, reach)
 
 
 @inlined
@@ -157,13 +177,16 @@ def log_likelihoods_of_lines(line: Line, row: int, t: FloatArray, begin: int, en
     """
     y, usable, inputs, basis, weights = line.y[row], line.usable[row], line.inputs[row], line.basis, line.weights
     table, low, per_unit, read_noise, gain = line.table, line.low, line.per_unit, line.read_noise, line.gain
-    pad = table.shape[2]
-    paths, f = np.empty((len(weights), AT_ONCE)), np.empty(len(y) + 2 * pad)
+    points, _, pad = table.shape
+    nodes, f = len(weights), np.empty(len(y) + 2 * pad)
+    paths, away = np.empty((nodes, AT_ONCE)), np.empty((nodes, AT_ONCE))
+    firsts, nearest = np.empty((nodes, AT_ONCE), np.int64), np.empty((nodes, AT_ONCE), np.int64)
     for first in range(begin, end, AT_ONCE):
         count = min(AT_ONCE, end - first)
         paths_of(inputs, basis, t, first, count, paths)
+        places_of(paths, count, low, per_unit, len(y), points, pad, firsts, nearest, away)
         for point in range(count):
-            expected_light(paths, point, weights, table, low, per_unit, f)
+            expected_light(firsts, nearest, away, point, weights, table, f)
             out[first + point] = log_likelihood_of(y, usable, f, pad, read_noise, gain)
 
 

@@ -10,10 +10,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from aolink.estimation.compiled.line import AT_ONCE, log_likelihood_of, paths_of, place
+from aolink.estimation.compiled.line import AT_ONCE, log_likelihood_of, paths_of, place, places_of
 from aolink.estimation.compiled.small import compiled, compiled_sums, inlined
 from aolink.estimation.compiled.vectors import LANES, add_product, put_cubic
-from aolink.numerics.arrays import BoolArray, FloatArray
+from aolink.numerics.arrays import BoolArray, FloatArray, IntArray
 
 
 class Plane(NamedTuple):
@@ -58,19 +58,24 @@ def log_likelihoods_of_spots(seen: Plane, row: int, t: FloatArray, begin: int, e
     # Padded by what a spot outside the window still lights in it.
     f = np.zeros((side + 2 * high, side + 2 * wide))
     columns, rows, own, dark = np.empty(wide), np.empty(high), np.empty(side * side), np.empty(side)
-    x, y = np.empty((len(weights), AT_ONCE)), np.empty((len(weights), AT_ONCE))
+    nodes = len(weights)
+    path, dx, dy = np.empty((nodes, AT_ONCE)), np.empty((nodes, AT_ONCE)), np.empty((nodes, AT_ONCE))
+    lefts, tops = np.empty((nodes, AT_ONCE), np.int64), np.empty((nodes, AT_ONCE), np.int64)
+    of_columns, of_rows = np.empty((nodes, AT_ONCE), np.int64), np.empty((nodes, AT_ONCE), np.int64)
     for first in range(begin, end, AT_ONCE):
         count = min(AT_ONCE, end - first)
         for k in range(count):
             out[first + k] = 0.0
         for spot in range(seen.y.shape[1]):
-            paths_of(seen.inputs[row, 2 * spot], seen.basis[2 * spot], t, first, count, x)
-            paths_of(seen.inputs[row, 2 * spot + 1], seen.basis[2 * spot + 1], t, first, count, y)
+            paths_of(seen.inputs[row, 2 * spot], seen.basis[2 * spot], t, first, count, path)
+            places_of(path, count, low, per_unit, side, across.shape[1], wide, lefts, of_columns, dx)
+            paths_of(seen.inputs[row, 2 * spot + 1], seen.basis[2 * spot + 1], t, first, count, path)
+            places_of(path, count, low, per_unit, side, down.shape[1], high, tops, of_rows, dy)
             light, usable = seen.y[row, spot].ravel(), seen.usable[row, spot].ravel()
             _squares(light, usable, f, side, 0, 0, 0, 0, dark)
             for k in range(count):
                 top, bottom, left, right = _add_light(
-                    x, y, k, weights, terms, across, down, low, per_unit, side, columns, rows, f
+                    k, lefts, of_columns, dx, tops, of_rows, dy, weights, terms, across, down, columns, rows, f
                 )
                 if gain:
                     for r in range(side):
@@ -137,10 +142,11 @@ def _path_of(seen: Plane, row: int, spot: int, t: FloatArray, path: FloatArray) 
 
 @compiled
 def _add_light(
-    x: FloatArray, y: FloatArray, point: int, weights: FloatArray, terms: FloatArray, across: FloatArray,
-    down: FloatArray, low: float, per_unit: float, side: int, columns: FloatArray, rows: FloatArray, f: FloatArray,
+    point: int, lefts: IntArray, of_columns: IntArray, dx: FloatArray, tops: IntArray, of_rows: IntArray,
+    dy: FloatArray, weights: FloatArray, terms: FloatArray, across: FloatArray, down: FloatArray, columns: FloatArray,
+    rows: FloatArray, f: FloatArray,
 ) -> tuple[int, int, int, int]:  # fmt: skip
-    """Densities without noise under one of the paths x and y (nodes, points), added to padded densities f.
+    """Densities without noise under one of the paths that `places_of` has placed, added to padded densities f.
 
     The results are the first row and the one after the last that get light, and the same for columns.
     """
@@ -148,16 +154,16 @@ def _add_light(
     begin, end, first, last = len(f), 0, width, 0
     for j in range(len(terms)):
         for k in range(len(weights)):
-            left, column, dx = place(x[k, point], low, per_unit, side, across.shape[1], wide)
-            top, line, dy = place(y[k, point], low, per_unit, side, down.shape[1], high)
+            left, top = lefts[k, point], tops[k, point]
             if left < 0 or top < 0:
                 continue
             begin, end, first, last = min(begin, top), max(end, top + high), min(first, left), max(last, left + wide)
-            of_columns, of_rows = 4 * (j * across.shape[1] + column) * wide, 4 * (j * down.shape[1] + line) * high
+            column = 4 * (j * across.shape[1] + of_columns[k, point]) * wide
+            row = 4 * (j * down.shape[1] + of_rows[k, point]) * high
             for p in range(0, wide, LANES):
-                put_cubic(columns, p, terms[j] * weights[k], dx, across, of_columns + p, wide)
+                put_cubic(columns, p, terms[j] * weights[k], dx[k, point], across, column + p, wide)
             for p in range(0, high, LANES):
-                put_cubic(rows, p, 1.0, dy, down, of_rows + p, high)
+                put_cubic(rows, p, 1.0, dy[k, point], down, row + p, high)
             at = top * width + left
             for r in range(high):
                 for p in range(0, wide, LANES):

@@ -128,7 +128,7 @@ class Tempered(NamedTuple):
 
 def tempered(view: PixelView, prior: GaussianMixture, count: int, number: int) -> Tempered:
     """A number of tempered points, in the exposure of this number."""
-    points = tempered_points(view, prior, count, [(number, axis) for axis in view.axes.tolist()])
+    points, _ = tempered_points(view, prior, count, [(number, axis) for axis in view.axes.tolist()])
     rows = view.reduced.end_rows
     fit = stacked_axes([fitted(each, rows, _COMPONENTS, 0) for each in points])
     return Tempered(points, with_noise(prior, points) + view.log_likelihoods(points), fit)

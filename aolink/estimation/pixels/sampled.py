@@ -15,11 +15,11 @@ from aolink.estimation.model.base import ExposureModel
 from aolink.estimation.pixels.filter import MixtureUpdate
 from aolink.estimation.pixels.gaussian_mixture import GaussianMixture, stacked_axes
 from aolink.estimation.pixels.likelihood import PixelView, Reduction, reduction
-from aolink.estimation.pixels.modes import innovation
-from aolink.estimation.pixels.tempering import fitted, tempered_points
-from aolink.estimation.pixels.updates import explored, has_several
+from aolink.estimation.pixels.modes import find_modes, innovation, whitened, without_repeats
+from aolink.estimation.pixels.tempering import Particles, fitted, tempered_points
+from aolink.estimation.pixels.updates import has_several
 from aolink.numerics import batched
-from aolink.numerics.arrays import BoolArray, FloatArray
+from aolink.numerics.arrays import BoolArray
 from aolink.optics.sensor import BaseSensor
 
 # Rms of the path that is left out, in standard deviations of the kernel.
@@ -43,23 +43,22 @@ class TemperedUpdater:
         return reduction(model, sensor, left_out=_LEFT_OUT)
 
     def update(self, view: PixelView, prior: GaussianMixture, unseen: Gaussian, number: int) -> MixtureUpdate:
-        t = self.sample(view, prior, number)
+        t, evidence = self.sample(view, prior, number)
         reduced, before = view.reduced, view.reduced.prior(prior.gaussian)
         mean = t.mean(axis=1)
         away = t - mean[:, None]
         after = Gaussian(mean, batched.matmul(batched.transpose(away), away) / (t.shape[1] - 1))
-        modes, _ = explored(view, prior)
-        new = innovation(view, before, modes)
         fit = stacked_axes([fitted(points, reduced.end_rows, _COMPONENTS, self.seed) for points in t])
+        modes = without_repeats(find_modes(view, before, whitened(before, fit.mean)))
+        new = innovation(view, before, modes)
         end = Gaussian(fit.mean, fit.covariance).mapped(reduced.end_rows, reduced.end_remainder)
         carried = GaussianMixture(fit.log_weight, end.mean, end.covariance)
-        return MixtureUpdate(
-            fit, after, carried, new, modes.total_evidence, has_several(modes), np.zeros(len(mean), dtype=bool)
-        )
+        return MixtureUpdate(fit, after, carried, new, evidence, has_several(modes), np.zeros(len(mean), dtype=bool))
 
-    def sample(self, view: PixelView, prior: GaussianMixture, number: int) -> FloatArray:
-        """Equally likely particles of the posterior, (axes, particles, n), from the prior of the start state; the noise
-        coefficients have N(0, I). With the estimator's seed and the axis, the exposure's ``number`` seeds the random
-        numbers."""
+    def sample(self, view: PixelView, prior: GaussianMixture, number: int) -> Particles:
+        """Particles of the posterior from the prior of the start state; the noise coefficients have N(0, I).
+
+        With the estimator's seed and the axis, the exposure's ``number`` seeds the random numbers.
+        """
         keys = [(self.seed, number, axis) for axis in view.axes.tolist()]
         return tempered_points(view, prior, self.particles, keys)

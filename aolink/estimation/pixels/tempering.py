@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from scipy import optimize
@@ -30,25 +31,37 @@ _LEAST_SPREAD = 1e-3
 _WHOLE = 4
 
 
-def tempered_points(view: PixelView, prior: GaussianMixture, count: int, keys: Sequence[tuple[int, ...]]) -> FloatArray:
-    """Equally likely points of the posterior, (axes, count, n); the same key, the seed of an axis, gives the same
-    points.
+class Particles(NamedTuple):
+    """Equally likely points of a posterior."""
+
+    points: FloatArray
+    """(axes, count, n)"""
+    log_evidence: FloatArray
+    """Log-likelihood of the frame, (axes,): the sum over the powers of the logs of the points' mean weights."""
+
+
+def tempered_points(view: PixelView, prior: GaussianMixture, count: int, keys: Sequence[tuple[int, ...]]) -> Particles:
+    """Points of the posterior; the same key, the seed of an axis, gives the same points.
 
     ``prior`` is that of the start state; the noise coefficients have N(0, I).
     """
     each = (np.array([axis]) for axis in range(len(keys)))
-    return np.stack([_of_axis(view.part(a), prior.part(a), count, key) for a, key in zip(each, keys, strict=True)])
+    found = [_of_axis(view.part(a), prior.part(a), count, key) for a, key in zip(each, keys, strict=True)]
+    return Particles(np.stack([points for points, _ in found]), np.array([evidence for _, evidence in found]))
 
 
-def _of_axis(view: PixelView, prior: GaussianMixture, count: int, key: tuple[int, ...]) -> FloatArray:
-    """`tempered_points` of one axis, (count, n)."""
+def _of_axis(view: PixelView, prior: GaussianMixture, count: int, key: tuple[int, ...]) -> tuple[FloatArray, float]:
+    """`tempered_points` of one axis: points (count, n) and the log-evidence."""
     rng, n = np.random.default_rng(key), view.reduced.size
     t = _drawn(prior, rng, count, n)
     log_prior, log_likelihood = with_noise(prior, t[None])[0], view.log_likelihoods(t[None])[0]
-    power, walk, difference = 0.0, 1.0, 1.0
+    power, walk, difference, evidence = 0.0, 1.0, 1.0, 0.0
     while power < 1.0:
         power, before = _next_power(log_likelihood, power), power
-        chosen = _resampled(np.exp((power - before) * (log_likelihood - log_likelihood.max())), rng)
+        most = log_likelihood.max()
+        weights = np.exp((power - before) * (log_likelihood - most))
+        evidence += (power - before) * float(most) + math.log(weights.mean())
+        chosen = _resampled(weights, rng)
         t, log_prior, log_likelihood = t[chosen], log_prior[chosen], log_likelihood[chosen]
         root = cholesky(np.cov(t, rowvar=False).reshape(n, n))
         for move in range(_MOVES):
@@ -70,7 +83,7 @@ def _of_axis(view: PixelView, prior: GaussianMixture, count: int, key: tuple[int
                 walk *= change
             elif move % _WHOLE:
                 difference *= change
-    return t
+    return t, evidence
 
 
 def fitted(points: FloatArray, rows: FloatArray, components: int, seed: int) -> GaussianMixture:

@@ -89,5 +89,5 @@ def test_profile_has_density_where_tempered_points_of_another_chance_lie():
     view = PixelView(rig.sensor, model, model.response(exposure.inputs), measured, seen)
     state = Gaussian(np.zeros((1, 2)), rig.plant.initial_covariance[None])
     update = PROFILE.within(None, 1.0, too_sure=False, stay_lost=True).update(view, single(state), state, 0)
-    points = tempered_points(view, single(state), 2000, [(7, 0)])
+    points, _ = tempered_points(view, single(state), 2000, [(7, 0)])
     assert GaussianMixture(*update.posterior).log_density(points).mean() > -16.0

@@ -47,12 +47,15 @@ def test_it_is_the_kalman_filter_where_all_is_linear():
     truth = before.mean[0] + np.linalg.cholesky(before.covariance[0]) @ rng.standard_normal(reduced.size)
     view = LinearView(H, (H @ truth + 0.3 * rng.standard_normal(4))[None], 0.3, reduced)
     # It has all of a PixelView that is asked for.
-    t = TemperedUpdater(particles=4000).sample(cast(likelihood.PixelView, view), single(PRIOR), 0)[0]
+    (t,), (evidence,) = TemperedUpdater(particles=4000).sample(cast(likelihood.PixelView, view), single(PRIOR), 0)
     kalman = joseph_update(before, view.y - before.mean @ H.T, H[None], 0.09 * np.eye(4)[None]).posterior
     sd = np.sqrt(np.diag(kalman.covariance[0]))
     np.testing.assert_allclose((t.mean(axis=0) - kalman.mean[0]) / sd, 0, atol=0.1)
     white = np.linalg.solve(np.linalg.cholesky(kalman.covariance[0]), (t - kalman.mean[0]).T)
     np.testing.assert_allclose(np.cov(white), np.eye(reduced.size), atol=0.15)
+    # The likelihood above is without its normalisation.
+    expected = stats.multivariate_normal(H @ before.mean[0], H @ before.covariance[0] @ H.T + 0.09 * np.eye(4))
+    assert evidence == pytest.approx(expected.logpdf(view.y[0]) + 2 * np.log(2 * np.pi * 0.09), abs=0.15)
 
 
 def seen(rig, exposure):
@@ -69,13 +72,13 @@ def test_other_particles_and_twice_as_many_say_the_same():
     mean = truth_of(exposure).start_state + np.array([0.01, 0.1])
     prior = single(Gaussian(mean, RIG.plant.initial_covariance[None] / 9))
     one, other, more = (
-        TemperedUpdater(count, seed).sample(view, prior, 0)[0] for count, seed in ((600, 0), (600, 1), (1200, 2))
+        TemperedUpdater(count, seed).sample(view, prior, 0).points[0] for count, seed in ((600, 0), (600, 1), (1200, 2))
     )
     sd = more.std(axis=0)
     for each in (one, other):
         assert np.sqrt(np.mean(((each.mean(axis=0) - more.mean(axis=0)) / sd) ** 2)) < 0.2
         np.testing.assert_allclose(each.std(axis=0) / sd, 1, atol=0.15)
-    again = TemperedUpdater(600, 0).sample(view, prior, 0)[0]
+    again = TemperedUpdater(600, 0).sample(view, prior, 0).points[0]
     assert again.tobytes() == one.tobytes()
 
 
@@ -97,7 +100,7 @@ def ranks(count, particles, seed=5):
         dark = Profile(density=np.zeros((1, 40)), mask=np.ones((1, 40), bool))
         view = likelihood.PixelView(rig.sensor, MODEL, MODEL.response(np.zeros((200, 1))), dark, reduced)
         view.y = PlainView.of(view).predicted(t)[:, 0] + np.sqrt(view.read_noise) * rng.standard_normal((1, 40))
-        drawn = TemperedUpdater(particles).sample(view, single(PRIOR), number)[0]
+        drawn = TemperedUpdater(particles).sample(view, single(PRIOR), number).points[0]
 
         thin = drawn[rng.permutation(particles)[:99]]
         found.append((functions(view, thin) < functions(view, t[0])).sum(axis=1))
