@@ -68,12 +68,13 @@ def places_of(
     firsts: IntArray, nearest: IntArray, away: FloatArray,
 ) -> None:  # fmt: skip
     """`place` of each node of ``count`` paths (nodes, points), without a branch, so that several are computed at a
-    time; all results are (nodes, points)."""
+    time; all results are (nodes, points). Where the first pixel is -1 the others mean nothing."""
     for node in range(len(paths)):
         for k in range(count):
             v = (paths[node, k] - low) * per_unit
             lit = v > -0.5 * reach and v < pixels + 0.5 * reach
-            cell = math.floor(v if lit else 0.0)
+            v = v if lit else 0.0
+            cell = math.floor(v)
             u = v - cell
             point = min(int(u * points), points - 1)
             firsts[node, k] = int(cell) + reach // 2 if lit else -1
@@ -86,7 +87,7 @@ def expected_light(
     firsts: IntArray, nearest: IntArray, away: FloatArray, point: int, weights: FloatArray, table: FloatArray,
     f: FloatArray,
 ) -> None:  # fmt: skip
-    """Densities without noise under one of the paths that `places_of` has placed, padded on both sides by the table's
+    """Densities without noise of one of the paths that `places_of` has placed, padded on both sides by the table's
     reach."""
     reach = table.shape[2]
     for p in range(len(f)):

@@ -163,6 +163,7 @@ def find_modes_of_lines(
                     decrease, before = now - objective, damping
                     better = decrease > 0
                     if better:
+                        # Copied, not swapped: names that change arrays have their references counted.
                         now = objective
                         for i in range(n):
                             s[i], pull[i] = there[i], its_pull[i]

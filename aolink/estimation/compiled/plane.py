@@ -57,6 +57,7 @@ def log_likelihoods_of_spots(seen: Plane, row: int, t: FloatArray, begin: int, e
     side, wide, high = seen.y.shape[2], across.shape[3], down.shape[3]
     # Padded by what a spot outside the window still lights in it.
     f = np.zeros((side + 2 * high, side + 2 * wide))
+    flat = f.ravel()
     columns, rows, own, dark = np.empty(wide), np.empty(high), np.empty(side * side), np.empty(side)
     nodes = len(weights)
     path, dx, dy = np.empty((nodes, AT_ONCE)), np.empty((nodes, AT_ONCE)), np.empty((nodes, AT_ONCE))
@@ -72,7 +73,8 @@ def log_likelihoods_of_spots(seen: Plane, row: int, t: FloatArray, begin: int, e
             paths_of(seen.inputs[row, 2 * spot + 1], seen.basis[2 * spot + 1], t, first, count, path)
             places_of(path, count, low, per_unit, side, down.shape[1], high, tops, of_rows, dy)
             light, usable = seen.y[row, spot].ravel(), seen.usable[row, spot].ravel()
-            _squares(light, usable, f, side, 0, 0, 0, 0, dark)
+            # The sums of rows without light, for all points.
+            _squares(light, usable, flat, f.shape[1], side, 0, 0, 0, 0, dark)
             for k in range(count):
                 top, bottom, left, right = _add_light(
                     k, lefts, of_columns, dx, tops, of_rows, dy, weights, terms, across, down, columns, rows, f
@@ -83,7 +85,8 @@ def log_likelihoods_of_spots(seen: Plane, row: int, t: FloatArray, begin: int, e
                             own[r * side + c] = f[high + r, wide + c]
                     out[first + k] += log_likelihood_of(light, usable, own, 0, read_noise, gain)
                 else:
-                    out[first + k] -= 0.5 * _squares(light, usable, f, side, high, wide, top, bottom, dark) / read_noise
+                    squares = _squares(light, usable, flat, f.shape[1], side, high, wide, top, bottom, dark)
+                    out[first + k] -= 0.5 * squares / read_noise
                 for r in range(top, bottom):
                     for c in range(left, right):
                         f[r, c] = 0.0
@@ -146,7 +149,7 @@ def _add_light(
     dy: FloatArray, weights: FloatArray, terms: FloatArray, across: FloatArray, down: FloatArray, columns: FloatArray,
     rows: FloatArray, f: FloatArray,
 ) -> tuple[int, int, int, int]:  # fmt: skip
-    """Densities without noise under one of the paths that `places_of` has placed, added to padded densities f.
+    """Densities without noise of one of the paths that `places_of` has placed, added to padded densities f.
 
     The results are the first row and the one after the last that get light, and the same for columns.
     """
@@ -195,20 +198,21 @@ def _taylor_slope(series: FloatArray, d: float, factor: float, out: FloatArray) 
 
 @compiled_sums
 def _squares(
-    y: FloatArray, usable: BoolArray, padded: FloatArray, side: int, down: int, across: int, begin: int, end: int,
-    dark: FloatArray,
+    y: FloatArray, usable: BoolArray, f: FloatArray, width: int, side: int, down: int, across: int, begin: int,
+    end: int, dark: FloatArray,
 ) -> float:  # fmt: skip
-    """Sum of squared deviations of the usable pixels of y (side * side,) from padded expected densities.
+    """Sum of squared deviations of the usable pixels of y (side * side,) from padded expected densities f, flat, with
+    ``width`` columns.
 
-    Only the padded rows ``begin`` to ``end`` have light; ``dark`` are the sums of rows without, (side,), which are
-    computed where no row has light.
+    Only the padded rows ``begin`` to ``end`` have light. ``dark`` (side,) has the sum of each row without light: where
+    no row has any (``begin`` >= ``end``) it is filled, otherwise it is read.
     """
-    total, f, width = 0.0, padded.ravel(), np.uintp(padded.shape[1])
+    total = 0.0
     for r in range(side):
         if begin < end and not begin <= down + r < end:
             total += dark[r]
             continue
-        of_row, pixel, first = 0.0, np.uintp(r * side), np.uintp(down + r) * width + np.uintp(across)
+        of_row, pixel, first = 0.0, np.uintp(r * side), np.uintp((down + r) * width + across)
         for c in range(side):
             e = y[pixel + np.uintp(c)] - f[first + np.uintp(c)]
             of_row += e * e if usable[pixel + np.uintp(c)] else 0.0

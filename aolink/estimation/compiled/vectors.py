@@ -1,8 +1,9 @@
 """Four numbers at a time, in loops over the pixels that a spot lights.
 
-These are too short for the compiler: where it does not know how long a loop is, it takes sixteen numbers at a time and
-the rest one by one. The results have the same bits as in a loop. Arrays are contiguous, and an index is that in the
-flat array.
+These loops are too short to be vectorised: where the compiler does not know how long a loop is, it takes sixteen
+numbers at a time and the rest one by one. The results have the same bits as in a loop that is compiled by
+`small.compiled`. Arrays are contiguous and of float64, or compilation fails; indices count in the flattened array.
+Nothing checks bounds.
 """
 
 from __future__ import annotations
@@ -12,15 +13,17 @@ from typing import Any
 
 from llvmlite import ir
 from numba import types
+from numba.core.errors import TypingError
 from numba.extending import intrinsic
 
 LANES = 4
 _FOUR = ir.VectorType(ir.DoubleType(), LANES)
+# A product and a sum may be computed as one operation, as in `small.compiled`.
 _FUSED = ("contract",)
 
 
 def _intrinsic(function: Callable[..., Any]) -> Any:
-    """Decorator of a function that generates code for others that are compiled."""
+    """Numba's `intrinsic`, typed: a function that generates LLVM code at the place of its call."""
     return intrinsic(function)
 
 
@@ -33,7 +36,7 @@ def add_product(_: Any, out: Any, at: Any, factor: Any, x: Any, begin: Any) -> A
         _add(builder, _four(context, builder, out, given[0], given[1]), given[2], values)
         return context.get_dummy_value()
 
-    return types.void(out, at, factor, x, begin), generate
+    return _signature(out, at, factor, x, begin), generate
 
 
 @_intrinsic
@@ -45,23 +48,48 @@ def add_cubic(_: Any, out: Any, at: Any, factor: Any, d: Any, table: Any, begin:
         _add(builder, _four(context, builder, out, given[0], given[1]), given[2], value)
         return context.get_dummy_value()
 
-    return types.void(out, at, factor, d, table, begin, stride), generate
+    return _signature(out, at, factor, d, table, begin, stride), generate
 
 
 @_intrinsic
 def put_cubic(_: Any, out: Any, at: Any, factor: Any, d: Any, table: Any, begin: Any, stride: Any) -> Any:
-    """The same, in place of what was there."""
+    """As `add_cubic`, in place of what was there."""
 
     def generate(context: Any, builder: Any, signature: Any, given: Any) -> Any:
-        value = builder.fmul(_alike(builder, given[2]), _cubic(context, builder, given[3], table, *given[4:]))
+        value = builder.fmul(_broadcast(builder, given[2]), _cubic(context, builder, given[3], table, *given[4:]))
         builder.store(value, _four(context, builder, out, given[0], given[1]), align=8)
         return context.get_dummy_value()
 
-    return types.void(out, at, factor, d, table, begin, stride), generate
+    return _signature(out, at, factor, d, table, begin, stride), generate
+
+
+def _signature(*arguments: Any) -> Any:
+    """The signature of a function of these types without a result.
+
+    Raises TypingError for an array that is not contiguous or not of float64: its memory would be taken for another's.
+    """
+    for kind in arguments:
+        if isinstance(kind, types.Array) and (kind.layout != "C" or kind.dtype != types.float64):
+            raise TypingError(f"four numbers at a time need a contiguous array of float64, not {kind}")
+    return types.void(*arguments)
+
+
+def _four(context: Any, builder: Any, kind: Any, array: Any, index: Any) -> Any:
+    """Pointer to four numbers of an array."""
+    data = context.make_array(kind)(context, builder, array).data
+    return builder.bitcast(builder.gep(data, [index]), _FOUR.as_pointer())
+
+
+def _broadcast(builder: Any, number: Any) -> Any:
+    """The same number four times."""
+    first = builder.insert_element(ir.Constant(_FOUR, ir.Undefined), number, ir.IntType(32)(0))
+    places = ir.VectorType(ir.IntType(32), LANES)([0] * LANES)
+    return builder.shuffle_vector(first, ir.Constant(_FOUR, ir.Undefined), places)
 
 
 def _cubic(context: Any, builder: Any, d: Any, kind: Any, table: Any, index: Any, stride: Any) -> Any:
-    coefficients, distance = [], _alike(builder, d)
+    """Four cubic polynomials of d, with coefficients from a table, by Horner's rule."""
+    coefficients, distance = [], _broadcast(builder, d)
     for _ in range(4):
         coefficients.append(builder.load(_four(context, builder, kind, table, index), align=8))
         index = builder.add(index, stride)
@@ -71,19 +99,7 @@ def _cubic(context: Any, builder: Any, d: Any, kind: Any, table: Any, index: Any
     return value
 
 
-def _four(context: Any, builder: Any, kind: Any, array: Any, index: Any) -> Any:
-    """Pointer to four numbers of an array."""
-    data = context.make_array(kind)(context, builder, array).data
-    return builder.bitcast(builder.gep(data, [index]), _FOUR.as_pointer())
-
-
-def _alike(builder: Any, number: Any) -> Any:
-    """The same number four times."""
-    first = builder.insert_element(ir.Constant(_FOUR, ir.Undefined), number, ir.IntType(32)(0))
-    places = ir.VectorType(ir.IntType(32), LANES)([0] * LANES)
-    return builder.shuffle_vector(first, ir.Constant(_FOUR, ir.Undefined), places)
-
-
 def _add(builder: Any, place: Any, factor: Any, values: Any) -> None:
-    product = builder.fmul(_alike(builder, factor), values, flags=_FUSED)
+    """Four products added to what a pointer points to."""
+    product = builder.fmul(_broadcast(builder, factor), values, flags=_FUSED)
     builder.store(builder.fadd(builder.load(place, align=8), product, flags=_FUSED), place, align=8)

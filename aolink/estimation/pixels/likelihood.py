@@ -360,7 +360,7 @@ def _light_table(variance: float, pixel: float, order: int = 0) -> FloatArray:
     """Taylor coefficients of the densities of pixels about a spot, for points in its own pixel, (points, 4, pixels).
 
     They are those of powers of its distance from the point, in pixels; of the derivative of this ``order`` by the
-    spot's position. The number of pixels is a multiple of `LANES`; those beyond the reach get no light.
+    spot's position. The number of pixels is rounded up to a multiple of `LANES`; those added get no light.
     """
     points = math.ceil(_POINTS * pixel / math.sqrt(variance))
     half = math.ceil(_REACH * math.sqrt(variance) / pixel) + 1

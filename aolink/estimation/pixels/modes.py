@@ -133,6 +133,11 @@ def modes_of(view: PixelView, prior: Gaussian, wide: Gaussian) -> Modes:
     found = find_modes(view, prior, starts[:, :3])
     if len(some := np.flatnonzero(many)):
         found = with_more(found, some, find_modes(view.part(some), prior.part(some), starts[some, 3:]))
+    return with_reversals(view, prior, found)
+
+
+def with_reversals(view: PixelView, prior: Gaussian, found: Modes) -> Modes:
+    """Modes, and after them those that the best one's reversal and mirror images lead to."""
     back = reversed_starts(view, prior, found.mean[np.arange(len(found.mean)), found.best][:, None])
     return with_more(found, slice(None), find_modes(view, prior, back))
 

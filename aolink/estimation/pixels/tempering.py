@@ -37,7 +37,8 @@ class Particles(NamedTuple):
     points: FloatArray
     """(axes, count, n)"""
     log_evidence: FloatArray
-    """Log-likelihood of the frame, (axes,): the sum over the powers of the logs of the points' mean weights."""
+    """Estimate of the frame's log-likelihood, up to the constant that `PixelView.log_likelihoods` leaves out, (axes,):
+    the sum over the steps of the power of the log of the points' mean weight."""
 
 
 def tempered_points(view: PixelView, prior: GaussianMixture, count: int, keys: Sequence[tuple[int, ...]]) -> Particles:

@@ -8,6 +8,8 @@ import pytest
 from scipy import linalg
 
 from aolink.estimation import exposure_model, make_estimator
+from aolink.estimation.compiled.likelihoods import log_likelihoods, log_likelihoods_of_row
+from aolink.estimation.compiled.line import place, places_of
 from aolink.estimation.compiled.modes import find_modes_of_lines
 from aolink.estimation.frames.frame_data import Needs, Profile, SpotWindows
 from aolink.estimation.frames.measure import measure
@@ -55,6 +57,7 @@ def side_by_side(rig, axes):
 
 
 AXES = 12
+MANY = 150  # more points than are computed together
 KINDS = {
     "lively": changed(LIVELY, noise_density=0.01),
     "bright": changed(LIVELY, noise_density=0.001),
@@ -100,13 +103,32 @@ def test_the_likelihood_of_many_points_is_that_of_the_twin(pair):
     view, in_numpy, state = pair
     prior = view.reduced.prior(state)
     rng = np.random.default_rng(2)
-    t = prior.mean[:, None] + rng.standard_normal((AXES, 40, view.reduced.size)) * 0.3
+    t = prior.mean[:, None] + rng.standard_normal((AXES, MANY, view.reduced.size)) * 0.3
     f = in_numpy.predicted(t)
     ours, theirs = view.log_likelihoods(t), in_numpy.log_likelihoods(t)
     # An error of the light by 2e-7 of the brightest pixel moves it by what that is of a pixel's noise, times residuals.
     noise = np.sqrt(view.read_noise)
     residual = np.abs(view.y[:, None] - f).sum(axis=2) / noise
     assert np.all(np.abs(ours - theirs) < 2e-7 * f.max() / noise * (residual + 1) + 1e-9 * np.abs(theirs))
+
+
+def test_places_are_the_same_one_by_one_and_several_at_a_time():
+    """At and beside the edges of pixels and of the sensor, beyond it, and without a number."""
+    edges = np.linspace(-0.8, 1.2, 41)
+    paths = np.concatenate([edges, np.nextafter(edges, -9), np.nextafter(edges, 9), [np.nan, np.inf, -1e300, 1e19]])[
+        None
+    ]
+    firsts, nearest = np.empty(paths.shape, np.int64), np.empty(paths.shape, np.int64)
+    away, count = np.empty(paths.shape), paths.shape[1]
+    places_of(paths, count, -0.3, 20.0, 16, 12, 8, firsts, nearest, away)
+    lit = 0
+    for theta, first, point, d in zip(paths[0], firsts[0], nearest[0], away[0], strict=True):
+        expected = place(theta, -0.3, 20.0, 16, 12, 8)
+        assert first == expected[0]
+        if first >= 0:
+            lit += 1
+            assert (point, d) == (expected[1], pytest.approx(expected[2], abs=1e-14))
+    assert 20 < lit < count - 20
 
 
 @pytest.mark.parametrize("memory", [None, np.linspace(1, 5, AXES)], ids=["alone", "remembered"])
@@ -302,19 +324,59 @@ def test_the_likelihood_of_a_spot_on_a_plane_is_that_of_the_twin(kind, masked):
     view, in_numpy, state = looked_at_plane(kind, masked)
     prior = view.reduced.prior(state)
     rng = np.random.default_rng(4)
-    t = prior.mean[:, None] + rng.standard_normal((1, 60, view.reduced.size)) * 0.3
-    t[0, 40:50, 0] += 1.0
-    t[0, 50:, :4] += 7.0
+    t = prior.mean[:, None] + rng.standard_normal((1, MANY, view.reduced.size)) * 0.3
+    t[0, -20:-10, 0] += 1.0
+    t[0, -10:, :4] += 7.0
     f = in_numpy.predicted(t)
     light = f.sum(axis=2) * view.optics.pixel_size
-    assert light[0, :40].min() > 0.9
-    assert ((light[0, 40:50] > 0.01) & (light[0, 40:50] < 0.9)).any()
-    assert light[0, 50:].max() < 1e-6
+    assert light[0, :-20].min() > 0.5
+    assert ((light[0, -20:-10] > 0.01) & (light[0, -20:-10] < 0.9)).any()
+    assert light[0, -10:].max() < 1e-6
     ours, theirs = view.log_likelihoods(t), in_numpy.log_likelihoods(t)
     noise = np.sqrt(view.read_noise)
     residual = np.abs(view.y[:, None] - f).sum(axis=2) / noise
     assert np.all(np.abs(ours - theirs) < 4e-7 * f.max() / noise * (residual + 1) + 1e-9 * np.abs(theirs))
     assert masked == 0 or not np.allclose(theirs, looked_at_plane(kind, 0)[1].log_likelihoods(t))
+
+
+@pytest.mark.parametrize("gain", [0.0, 0.01])
+def test_the_likelihood_of_several_spots_is_the_product_of_theirs(gain):
+    view, _, state = looked_at_plane("round", 9)
+    one = view.seen._replace(gain=gain * view.seen.y.max())
+    t = np.random.default_rng(6).standard_normal((1, view.reduced.size, MANY)) * 0.3
+    t += view.reduced.prior(state).mean[:, :, None]
+    together, apart = np.empty((1, MANY)), np.empty((3, 1, MANY))
+    # Each spot has frame, path and bad pixels of its own.
+    spots = [
+        one._replace(
+            y=one.y * (1 + spot), usable=np.roll(one.usable, spot, axis=3), inputs=one.inputs + 0.1 * spot,
+            basis=np.ascontiguousarray(one.basis[:: -1 if spot == 1 else 1]),
+        )
+        for spot in range(3)
+    ]  # fmt: skip
+    for spot, out in zip(spots, apart, strict=True):
+        log_likelihoods(spot, t, out)
+    joined = {
+        name: np.concatenate([getattr(spot, name) for spot in spots], axis=axis)
+        for name, axis in (("y", 1), ("usable", 1), ("inputs", 1), ("basis", 0))
+    }
+    log_likelihoods(one._replace(**joined), t, together)
+    np.testing.assert_allclose(together, apart.sum(axis=0), rtol=1e-12)
+    assert len(np.unique(apart[:, 0, 0])) == 3
+
+
+@pytest.mark.parametrize("kind", ["lively", "dark pixels", "round", "aslant", "shot noise"])
+def test_points_have_the_same_likelihood_wherever_they_are_among_others(kind):
+    view, _, state = looked_at_plane(kind, 0) if kind in PLANES else looked_at(kind)
+    t = np.random.default_rng(7).standard_normal((view.reduced.size, MANY)) * 0.3
+    t += view.reduced.prior(state).mean[1 if view.on_line else 0, :, None]
+    whole, part = np.empty(MANY), np.full(MANY, np.nan)
+    log_likelihoods_of_row(view.seen, len(view.y) - 1, t, 0, MANY, whole)
+    log_likelihoods_of_row(view.seen, len(view.y) - 1, t, 37, 133, part)
+    assert np.isfinite(whole).all()
+    assert part[37:133].tobytes() == whole[37:133].tobytes()
+    assert np.isnan(part[:37]).all()
+    assert np.isnan(part[133:]).all()
 
 
 @pytest.mark.parametrize("kind", PLANES)

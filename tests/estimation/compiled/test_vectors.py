@@ -34,7 +34,7 @@ def test_a_product_is_added_to_four_numbers_and_to_no_other(at):
     expected = out.copy()
     expected.ravel()[at : at + LANES] += -1.5 * x[5:]
     product_added(out, at, -1.5, x, 5)
-    assert np.allclose(out, expected, rtol=1e-15)
+    assert np.allclose(out, expected, rtol=1e-15, atol=0)
     untouched = np.delete(np.arange(12), np.arange(at, at + LANES))
     assert np.array_equal(out.ravel()[untouched], expected.ravel()[untouched])
 
@@ -50,6 +50,14 @@ def test_a_cubic_is_added_to_four_numbers_or_takes_their_place(at):
     for function, expected in ((cubic_added, added), (cubic_put, placed)):
         found = out.copy()
         function(found, at, 0.7, d, table, begin, 8)
-        assert np.allclose(found, expected, rtol=1e-14)
+        assert np.allclose(found, expected, rtol=1e-14, atol=0)
         untouched = np.delete(np.arange(12), np.arange(at, at + LANES))
         assert np.array_equal(found.ravel()[untouched], out.ravel()[untouched])
+
+
+@pytest.mark.parametrize("wrong", [np.zeros(12, np.float32), np.zeros(24)[::2], np.zeros((4, 3)).T])
+def test_arrays_of_other_layouts_are_refused(wrong):
+    with pytest.raises(numba.TypingError, match="contiguous array of float64"):
+        product_added(wrong, 0, 1.0, np.ones(4), 0)
+    with pytest.raises(numba.TypingError, match="contiguous array of float64"):
+        product_added(np.ones(4), 0, 1.0, wrong, 0)

@@ -78,8 +78,10 @@ def test_other_particles_and_twice_as_many_say_the_same():
     for each in (one, other):
         assert np.sqrt(np.mean(((each.mean(axis=0) - more.mean(axis=0)) / sd) ** 2)) < 0.2
         np.testing.assert_allclose(each.std(axis=0) / sd, 1, atol=0.15)
-    again = TemperedUpdater(600, 0).sample(view, prior, 0).points[0]
-    assert again.tobytes() == one.tobytes()
+    again = TemperedUpdater(600, 0).sample(view, prior, 0)
+    assert again.points[0].tobytes() == one.tobytes()
+    update = TemperedUpdater(600, 0).update(view, prior, prior.gaussian, 0)
+    assert update.log_evidence.tobytes() == again.log_evidence.tobytes()
 
 
 def functions(view, t):
