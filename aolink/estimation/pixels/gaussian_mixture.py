@@ -14,6 +14,8 @@ from aolink.numerics import batched
 from aolink.numerics.arrays import FloatArray, Indices
 from aolink.numerics.covariance import cholesky, lower_inverse
 
+_LEAST_LOG_WEIGHT = math.log(1e-12)
+
 
 class GaussianMixture(NamedTuple):
     """A mixture of Gaussians for each axis."""
@@ -81,8 +83,12 @@ class GaussianMixture(NamedTuple):
         Repeatedly, the two components whose merger costs least are merged. The cost is Runnalls' bound on the
         Kullback-Leibler divergence, in nats; a merger keeps mean and covariance. Runnalls, Kullback-Leibler approach to
         Gaussian mixture reduction, IEEE Trans. AES 43 (2007), (21).
+
+        Components of a weight below 1e-12 are dropped: on a plant that is unstable those would move away without end,
+        and a merger costs the more the farther away they are.
         """
         merged = self.copy()
+        merged.log_weight[merged.log_weight < _LEAST_LOG_WEIGHT] = -np.inf
         compiled_mixtures.merge(*merged.contiguous, most, free)
         return merged.ordered(most)
 

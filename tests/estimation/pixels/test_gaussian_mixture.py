@@ -93,3 +93,10 @@ def test_what_is_not_there_does_not_change_a_bit_of_a_sum():
     for more in (1, 3, 10):
         padded = np.concatenate([values, np.full((200, more), -np.inf)], axis=1)
         assert log_sum(padded, axis=1).tobytes() == log_sum(values, axis=1).tobytes()
+
+
+def test_components_of_hardly_any_weight_are_dropped_however_far_away_they_are():
+    weight = np.array([[0.4, 0.6 - 2e-13, 2e-13]])
+    mean = np.array([[[0.0], [5.0], [1e9]]])
+    kept = GaussianMixture(np.log(weight), mean, np.ones((1, 3, 1, 1))).reduced(3)
+    assert sorted(kept.mean[0, :, 0]) == [0.0, 5.0]
