@@ -84,8 +84,8 @@ class GaussianMixture(NamedTuple):
         Kullback-Leibler divergence, in nats; a merger keeps mean and covariance. Runnalls, Kullback-Leibler approach to
         Gaussian mixture reduction, IEEE Trans. AES 43 (2007), (21).
 
-        Components of a weight below 1e-12 are dropped: on a plant that is unstable those would move away without end,
-        and a merger costs the more the farther away they are.
+        Components of a weight below 1e-12 are dropped. On an unstable plant their means move away without end, and the
+        farther away they are the more their merger costs, so that they would stay.
         """
         merged = self.copy()
         merged.log_weight[merged.log_weight < _LEAST_LOG_WEIGHT] = -np.inf

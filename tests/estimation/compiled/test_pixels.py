@@ -115,9 +115,8 @@ def test_the_likelihood_of_many_points_is_that_of_the_twin(pair):
 def test_places_are_the_same_one_by_one_and_several_at_a_time():
     """At and beside the edges of pixels and of the sensor, beyond it, and without a number."""
     edges = np.linspace(-0.8, 1.2, 41)
-    paths = np.concatenate([edges, np.nextafter(edges, -9), np.nextafter(edges, 9), [np.nan, np.inf, -1e300, 1e19]])[
-        None
-    ]
+    beside = np.nextafter(edges, -9), np.nextafter(edges, 9)
+    paths = np.concatenate([edges, *beside, [np.nan, np.inf, -1e300, 1e19]])[None]
     firsts, nearest = np.empty(paths.shape, np.int64), np.empty(paths.shape, np.int64)
     away, count = np.empty(paths.shape), paths.shape[1]
     places_of(paths, count, -0.3, 20.0, 16, 12, 8, firsts, nearest, away)
@@ -329,7 +328,8 @@ def test_the_likelihood_of_a_spot_on_a_plane_is_that_of_the_twin(kind, masked):
     t[0, -10:, :4] += 7.0
     f = in_numpy.predicted(t)
     light = f.sum(axis=2) * view.optics.pixel_size
-    assert light[0, :-20].min() > 0.5
+    assert light[0, :-20].min() > 0.5  # one of the 130 random paths leaves the window for a while
+    assert np.median(light[0, :-20]) > 0.99
     assert ((light[0, -20:-10] > 0.01) & (light[0, -20:-10] < 0.9)).any()
     assert light[0, -10:].max() < 1e-6
     ours, theirs = view.log_likelihoods(t), in_numpy.log_likelihoods(t)

@@ -4,6 +4,7 @@ import numba
 import numpy as np
 import pytest
 
+from aolink.estimation.compiled.small import compiled
 from aolink.estimation.compiled.vectors import LANES, add_cubic, add_product, put_cubic
 
 
@@ -20,6 +21,15 @@ def cubic_added(out, at, factor, d, table, begin, stride):
 @numba.njit
 def cubic_put(out, at, factor, d, table, begin, stride):
     put_cubic(out, at, factor, d, table, begin, stride)
+
+
+@compiled
+def in_a_loop(out, at, factor, d, table, begin, stride):
+    out, c = out.ravel(), table.ravel()
+    for p in range(LANES):
+        q = begin + p
+        light = c[q] + d * (c[q + stride] + d * (c[q + 2 * stride] + d * c[q + 3 * stride]))
+        out[at + p] += factor * light
 
 
 def cubic(table, begin, stride, d):
@@ -53,6 +63,16 @@ def test_a_cubic_is_added_to_four_numbers_or_takes_their_place(at):
         assert np.allclose(found, expected, rtol=1e-14, atol=0)
         untouched = np.delete(np.arange(12), np.arange(at, at + LANES))
         assert np.array_equal(found.ravel()[untouched], out.ravel()[untouched])
+
+
+def test_the_bits_are_those_of_a_loop():
+    rng = np.random.default_rng(5)
+    for _ in range(200):
+        out, table, numbers = rng.standard_normal(8), rng.standard_normal((4, 8)), rng.standard_normal(2)
+        looped = out.copy()
+        cubic_added(out, 3, *numbers, table, 2, 8)
+        in_a_loop(looped, 3, *numbers, table, 2, 8)
+        assert out.tobytes() == looped.tobytes()
 
 
 @pytest.mark.parametrize("wrong", [np.zeros(12, np.float32), np.zeros(24)[::2], np.zeros((4, 3)).T])
