@@ -6,10 +6,12 @@ It ends with the process that made it, however that ends.
 
 from __future__ import annotations
 
+import ctypes
 import multiprocessing
 import os
 import select
 import signal
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -31,6 +33,8 @@ _CALLS_MS = 50
 _PIECE = 1 << 20
 _FOR_THE_PARENT = {signal.SIGINT, signal.SIGHUP}
 """A terminal sends these to every process of a command. The parent decides what they mean for its workers."""
+_LIBC = ctypes.CDLL(None) if sys.platform == "linux" else None
+_PR_SET_PDEATHSIG = 1
 
 
 def in_threads(function: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
@@ -90,6 +94,17 @@ def end_with_parent() -> None:
     """
     signal.signal(signal.SIGTERM, _exit)
     _begin_to_watch()
+
+
+def end_with(parent: int) -> None:
+    """Make this process end at once when the process ``parent``, which has started it, is gone, however that ends.
+
+    On systems other than Linux it ends only if its parent is gone by now. It may run between fork and exec.
+    """
+    if _LIBC is not None:
+        _LIBC.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+    if os.getppid() != parent:  # it ended before this
+        os._exit(1)
 
 
 def _begin_to_watch() -> None:

@@ -8,7 +8,6 @@ it and is at the other end of the socket.
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import gc
 import os
 import pickle
@@ -24,6 +23,7 @@ import numpy as np
 from aolink.errors import AolinkError
 from aolink.estimation import make_estimator
 from aolink.exposure import Exposure
+from aolink.numerics.workers import end_with
 from aolink.recording import convert
 from aolink.rig import Rig
 
@@ -32,8 +32,6 @@ LENGTH = struct.Struct("<Q")
 NICENESS = 5
 """Niceness of an estimator that nothing waits for: where all cores are busy, the loop, the devices' drivers, the disk
 and the estimator that closes the loop come first."""
-_PARENT_DEATH_SIGNAL = 1
-"""PR_SET_PDEATHSIG of Linux."""
 
 
 READY = None
@@ -49,7 +47,7 @@ def packed(message: object) -> bytes:
 
 def main(fileno: int, parent: int, niceness: int) -> None:
     """Estimate the exposures that come over the socket until it is closed."""
-    _end_with(parent)
+    end_with(parent)
     if sys.platform == "linux":  # a session runs at real-time priority for its loop's sake only
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
     os.nice(niceness)
@@ -94,12 +92,3 @@ def _dark(rig: Rig) -> Exposure:
         mask=np.ones(shape, dtype=bool), inputs=np.zeros((steps, rig.n_inputs)),
         lead_inputs=np.zeros((0, rig.n_inputs)), start_offset=rig.timing.exposure_offset,
     )  # fmt: skip
-
-
-def _end_with(parent: int) -> None:
-    """Make this process end with its parent, however that ends. On systems other than Linux it ends when its exposure
-    is done."""
-    if sys.platform == "linux":
-        ctypes.CDLL(None).prctl(_PARENT_DEATH_SIGNAL, signal.SIGKILL)
-    if os.getppid() != parent:  # it ended before this
-        os._exit(1)

@@ -6,9 +6,7 @@ the call that started it. Nothing here loads Rerun itself, which takes most of a
 
 from __future__ import annotations
 
-import ctypes
 import os
-import signal
 import socket
 import subprocess
 import sys
@@ -17,6 +15,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import IO
 from urllib.parse import quote
@@ -24,6 +23,7 @@ from urllib.parse import quote
 import rerun_cli  # type: ignore[import-untyped] # it has only its program
 
 from aolink.errors import RendererError, ViewerError
+from aolink.numerics.workers import end_with
 from aolink.viewing.vulkan import has_vulkan
 
 HOST = "127.0.0.1"
@@ -158,7 +158,7 @@ def running_rerun(options: Sequence[str], said: IO[bytes]) -> Iterator[subproces
         # With a session of its own: Ctrl-C comes to this process alone, which ends Rerun's.
         process = subprocess.Popen(
             [str(_program()), "--bind", HOST, *options], stdin=subprocess.DEVNULL, stdout=said, stderr=said,
-            env=environment, start_new_session=True, preexec_fn=_end_with_parent,
+            env=environment, start_new_session=True, preexec_fn=partial(end_with, os.getpid()),
         )  # fmt: skip
         try:
             yield process
@@ -178,16 +178,6 @@ def _program() -> Path:
         if (folder / name).is_file():
             return folder / name
     raise ViewerError("the Rerun viewer is missing: install rerun-sdk again")
-
-
-_LIBC = ctypes.CDLL(None) if sys.platform == "linux" else None
-_PR_SET_PDEATHSIG = 1
-
-
-def _end_with_parent() -> None:
-    """Make the child process, in which this runs, end with its parent, however that ends. It works on Linux only."""
-    if _LIBC is not None:
-        _LIBC.prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
 
 
 def wait_for(ready: Callable[[], bool], process: subprocess.Popen[bytes], said: IO[bytes]) -> None:

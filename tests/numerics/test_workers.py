@@ -174,6 +174,14 @@ def test_the_simulated_rig_of_a_killed_demo_ends(tmp_path: Path) -> None:
     assert all_end(children)
 
 
+def test_a_process_whose_parent_ended_before_it_began_to_watch_ends() -> None:
+    program = "import os; from aolink.numerics.workers import end_with; end_with({parent}); print(1, flush=True)"
+    for parent, said in (("os.getppid()", b"1\n"), ("os.getpid()", b"")):
+        command = [sys.executable, "-c", program.format(parent=parent)]
+        done = subprocess.run(command, stdout=subprocess.PIPE, check=False, timeout=_PATIENCE_S)
+        assert (done.stdout, done.returncode) == (said, int(not said))
+
+
 def test_the_viewer_of_a_killed_command_ends(recorded: Session, tmp_path: Path) -> None:
     with started(tmp_path, "view", str(recorded.path), "--web") as process:
         wait_for(lambda: psutil.Process(process.pid).children(recursive=True), process)
