@@ -12,11 +12,14 @@ from typing import NamedTuple
 import numpy as np
 
 from aolink.estimation.compiled.small import compiled, inlined
-from aolink.estimation.compiled.vectors import LANES, add_cubic, add_product
+from aolink.estimation.compiled.vectors import add_cubic, add_product, lanes_of, put_sums, sums_of
 from aolink.numerics.arrays import BoolArray, FloatArray, IntArray
 
 AT_ONCE = 64
 """Points whose paths are computed together."""
+_IN_TURN = 4
+"""Points whose light is added in turn. The light of a node falls beside that of the node before, and a processor that
+goes on with one point waits until what it has just stored can be read."""
 LARGE = 1e200
 """A product of variance ratios is replaced by its logarithm when it exceeds this."""
 
@@ -36,7 +39,7 @@ class Line(NamedTuple):
     """Each node's share of the exposure, (nodes,)."""
     table: FloatArray
     """Taylor coefficients of the light about points of a pixel, in pixels, (points, 4, reach); the reach is a multiple
-    of `vectors.LANES`."""
+    of `vectors.lanes_of`."""
     low: float
     """Edge at which the first pixel begins, slope units."""
     per_unit: float
@@ -69,34 +72,38 @@ def places_of(
 ) -> None:  # fmt: skip
     """`place` of each node of ``count`` paths (nodes, points), without a branch, so that several are computed at a
     time; all results are (nodes, points). Where the first pixel is -1 the others mean nothing."""
+    number = paths.dtype.type  # of constants as well: otherwise single precision would be left here
+    least, most, nowhere, half = number(-0.5 * reach), number(pixels + 0.5 * reach), number(0.0), number(0.5)
+    low, per_unit, density = number(low), number(per_unit), number(points)
     for node in range(len(paths)):
         for k in range(count):
             v = (paths[node, k] - low) * per_unit
-            lit = v > -0.5 * reach and v < pixels + 0.5 * reach
-            v = v if lit else 0.0
-            cell = math.floor(v)
+            lit = v > least and v < most
+            v = v if lit else nowhere
+            cell = number(math.floor(v))
             u = v - cell
-            point = min(int(u * points), points - 1)
+            point = min(int(u * density), points - 1)
             firsts[node, k] = int(cell) + reach // 2 if lit else -1
             nearest[node, k] = point
-            away[node, k] = u - (point + 0.5) / points
+            away[node, k] = u - (number(point) + half) / density
 
 
 @inlined
 def expected_light(
-    firsts: IntArray, nearest: IntArray, away: FloatArray, point: int, weights: FloatArray, table: FloatArray,
-    f: FloatArray,
+    firsts: IntArray, nearest: IntArray, away: FloatArray, point: int, count: int, weights: FloatArray,
+    table: FloatArray, f: FloatArray, padded: int,
 ) -> None:  # fmt: skip
-    """Densities without noise of one of the paths that `places_of` has placed, padded on both sides by the table's
-    reach."""
-    reach = table.shape[2]
-    for p in range(len(f)):
+    """Densities without noise of ``count`` of the paths that `places_of` has placed, one behind the other in f: each
+    takes ``padded`` places, with the table's reach on both sides."""
+    reach, lanes = table.shape[2], lanes_of(f)
+    for p in range(count * padded):
         f[p] = 0.0
     for k in range(len(weights)):
-        if firsts[k, point] >= 0:
-            first, row = firsts[k, point], 4 * reach * nearest[k, point]
-            for p in range(0, reach, LANES):
-                add_cubic(f, first + p, weights[k], away[k, point], table, row + p, reach)
+        for j in range(count):
+            if firsts[k, point + j] >= 0:
+                first, row = j * padded + firsts[k, point + j], 4 * reach * nearest[k, point + j]
+                for p in range(0, reach, lanes):
+                    add_cubic(f, first + p, weights[k], away[k, point + j], table, row + p, reach)
 
 
 @inlined
@@ -110,6 +117,7 @@ def linearised_light(
     ``slope`` is room for (reach,).
     """
     points, _, reach = table.shape
+    lanes = lanes_of(f)
     for p in range(len(f)):
         f[p] = 0.0
     for i in range(len(J)):
@@ -119,13 +127,13 @@ def linearised_light(
         first, nearest, d = place(path[k], low, per_unit, len(f) - 2 * reach, points, reach)
         if first >= 0:
             row, w = 4 * reach * nearest, weights[k] * per_unit
-            for p in range(0, reach, LANES):
+            for p in range(0, reach, lanes):
                 add_cubic(f, first + p, weights[k], d, table, row + p, reach)
             for p in range(reach):
                 steeper = 2.0 * table[nearest, 2, p] + 3.0 * d * table[nearest, 3, p]
                 slope[p] = w * (table[nearest, 1, p] + d * steeper)
             for i in range(len(basis)):
-                for p in range(0, reach, LANES):
+                for p in range(0, reach, lanes):
                     add_product(J, i * len(f) + first + p, basis[i, k], slope, p)
 
 
@@ -179,28 +187,35 @@ def log_likelihoods_of_lines(line: Line, row: int, t: FloatArray, begin: int, en
     y, usable, inputs, basis, weights = line.y[row], line.usable[row], line.inputs[row], line.basis, line.weights
     table, low, per_unit, read_noise, gain = line.table, line.low, line.per_unit, line.read_noise, line.gain
     points, _, pad = table.shape
-    nodes, f = len(weights), np.empty(len(y) + 2 * pad)
-    paths, away = np.empty((nodes, AT_ONCE)), np.empty((nodes, AT_ONCE))
+    number, nodes, padded = table.dtype, len(weights), len(y) + 2 * pad
+    f, paths = np.empty(_IN_TURN * padded, number), np.empty((nodes, AT_ONCE), number)
     firsts, nearest = np.empty((nodes, AT_ONCE), np.int64), np.empty((nodes, AT_ONCE), np.int64)
+    away = np.empty((nodes, AT_ONCE), number)
     for first in range(begin, end, AT_ONCE):
         count = min(AT_ONCE, end - first)
         paths_of(inputs, basis, t, first, count, paths)
         places_of(paths, count, low, per_unit, len(y), points, pad, firsts, nearest, away)
-        for point in range(count):
-            expected_light(firsts, nearest, away, point, weights, table, f)
-            out[first + point] = log_likelihood_of(y, usable, f, pad, read_noise, gain)
+        for point in range(0, count, _IN_TURN):
+            together = min(_IN_TURN, count - point)
+            expected_light(firsts, nearest, away, point, together, weights, table, f, padded)
+            for k in range(together):
+                begins = k * padded + pad
+                out[first + point + k] = log_likelihood_of(y, usable, f, begins, read_noise, gain)
 
 
 @compiled
 def paths_of(offset: FloatArray, basis: FloatArray, t: FloatArray, first: int, count: int, paths: FloatArray) -> None:
     """Paths at the nodes, (nodes, points), of ``count`` points from ``first`` on of t (n, points)."""
-    for node in range(len(offset)):
-        for k in range(count):
-            paths[node, k] = offset[node]
-        for i in range(len(t)):
-            x = basis[i, node]
-            for k in range(count):
-                paths[node, k] += x * t[i, first + k]
+    n, nodes, points, width, together = len(t), len(offset), t.shape[1], paths.shape[1], sums_of(paths)
+    many = count - count % together
+    for node in range(nodes):
+        for k in range(0, many, together):
+            put_sums(paths, node * width + k, offset[node], basis, node, nodes, t, first + k, points, n)
+        for k in range(many, count):
+            value = offset[node]
+            for i in range(n):
+                value += basis[i, node] * t[i, first + k]
+            paths[node, k] = value
 
 
 @inlined

@@ -12,7 +12,7 @@ import numpy as np
 
 from aolink.estimation.compiled.line import AT_ONCE, log_likelihood_of, paths_of, place, places_of
 from aolink.estimation.compiled.small import compiled, compiled_sums, inlined
-from aolink.estimation.compiled.vectors import LANES, add_product, put_cubic
+from aolink.estimation.compiled.vectors import add_outer, lanes_of, put_cubic
 from aolink.numerics.arrays import BoolArray, FloatArray, IntArray
 
 
@@ -31,7 +31,7 @@ class Plane(NamedTuple):
     """Each node's share of the exposure, (nodes,)."""
     across: FloatArray
     """Taylor coefficients of the densities of columns of pixels about points of a pixel, (terms, points, 4, reach); the
-    reach is a multiple of `vectors.LANES`."""
+    reach is a multiple of `vectors.lanes_of`."""
     down: FloatArray
     """The same coefficients for rows of pixels."""
     terms: FloatArray
@@ -56,11 +56,13 @@ def log_likelihoods_of_spots(seen: Plane, row: int, t: FloatArray, begin: int, e
     across, down, read_noise, gain = seen.across, seen.down, seen.read_noise, seen.gain
     side, wide, high = seen.y.shape[2], across.shape[3], down.shape[3]
     # Padded by what a spot outside the window still lights in it.
-    f = np.zeros((side + 2 * high, side + 2 * wide))
+    number, nodes = across.dtype, len(weights)
+    f = np.zeros((side + 2 * high, side + 2 * wide), number)
     flat = f.ravel()
-    columns, rows, own, dark = np.empty(wide), np.empty(high), np.empty(side * side), np.empty(side)
-    nodes = len(weights)
-    path, dx, dy = np.empty((nodes, AT_ONCE)), np.empty((nodes, AT_ONCE)), np.empty((nodes, AT_ONCE))
+    columns, rows = np.empty(wide, number), np.empty(high, number)
+    own, dark = np.empty(side * side, number), np.empty(side)
+    path = np.empty((nodes, AT_ONCE), number)
+    dx, dy = np.empty((nodes, AT_ONCE), number), np.empty((nodes, AT_ONCE), number)
     lefts, tops = np.empty((nodes, AT_ONCE), np.int64), np.empty((nodes, AT_ONCE), np.int64)
     of_columns, of_rows = np.empty((nodes, AT_ONCE), np.int64), np.empty((nodes, AT_ONCE), np.int64)
     for first in range(begin, end, AT_ONCE):
@@ -153,7 +155,7 @@ def _add_light(
 
     The results are the first row and the one after the last that get light, and the same for columns.
     """
-    wide, high, width = across.shape[3], down.shape[3], f.shape[1]
+    wide, high, width, lanes = across.shape[3], down.shape[3], f.shape[1], lanes_of(f)
     begin, end, first, last = len(f), 0, width, 0
     for j in range(len(terms)):
         for k in range(len(weights)):
@@ -163,15 +165,13 @@ def _add_light(
             begin, end, first, last = min(begin, top), max(end, top + high), min(first, left), max(last, left + wide)
             column = 4 * (j * across.shape[1] + of_columns[k, point]) * wide
             row = 4 * (j * down.shape[1] + of_rows[k, point]) * high
-            for p in range(0, wide, LANES):
+            for p in range(0, wide, lanes):
                 put_cubic(columns, p, terms[j] * weights[k], dx[k, point], across, column + p, wide)
-            for p in range(0, high, LANES):
+            for p in range(0, high, lanes):
                 put_cubic(rows, p, 1.0, dy[k, point], down, row + p, high)
             at = top * width + left
-            for r in range(high):
-                for p in range(0, wide, LANES):
-                    add_product(f, at + p, rows[r], columns, p)
-                at += width
+            for p in range(0, wide, lanes):
+                add_outer(f, at + p, width, rows, high, columns, p)
     return begin, end, first, last
 
 

@@ -30,7 +30,7 @@ import numpy as np
 from aolink.estimation.compiled.likelihoods import log_likelihoods
 from aolink.estimation.compiled.line import Line
 from aolink.estimation.compiled.plane import Plane, linearised_light_of_spots
-from aolink.estimation.compiled.vectors import LANES
+from aolink.estimation.compiled.vectors import BYTES
 from aolink.estimation.frames.frame_data import Profile, SpotWindows
 from aolink.estimation.kalman.gaussian import Gaussian
 from aolink.estimation.model import quadrature
@@ -360,12 +360,12 @@ def _light_table(variance: float, pixel: float, order: int = 0) -> FloatArray:
     """Taylor coefficients of the densities of pixels about a spot, for points in its own pixel, (points, 4, pixels).
 
     They are those of powers of its distance from the point, in pixels; of the derivative of this ``order`` by the
-    spot's position. The number of pixels is rounded up to a multiple of `LANES`; those added get no light.
+    spot's position. The bytes of a row are rounded up to a multiple of `BYTES`; the pixels added get no light.
     """
     points = math.ceil(_POINTS * pixel / math.sqrt(variance))
     half = math.ceil(_REACH * math.sqrt(variance) / pixel) + 1
     places = (np.arange(points) + 0.5) * pixel / points
     masses = pixel_masses(variance, pixel * np.arange(-half, half + 1.0), places, order + 3)[order:]
     table = np.stack([mass * pixel ** (k - 1) / math.factorial(k) for k, mass in enumerate(masses)], axis=1)
-    beyond = (-half) % (LANES // 2)
+    beyond = (-half) % (BYTES // table.itemsize // 2)
     return np.pad(table, [(0, 0), (0, 0), (beyond, beyond)])
