@@ -50,7 +50,7 @@ class Options:
     work as well; it does not count where tempered points are weighed. With 5 an exposure takes a sixth of the time, the
     estimates have larger errors, and the log-evidence, which is not from these points, still tells models that differ
     much apart."""
-    particles: int = 2000
+    particles: int = 500
     """Number of particles of `sampled`."""
     seed: int = 0
     """Seed of `sampled`: the same one gives the same estimates, bit for bit."""

@@ -11,8 +11,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from aolink.estimation.compiled.small import compiled, inlined
-from aolink.estimation.compiled.vectors import add_cubic, add_product, lanes_of, put_sums, sums_of
+from aolink.estimation.compiled.small import compiled, compiled_sums, inlined
+from aolink.estimation.compiled.vectors import add_cubic, add_product, lanes_of, put_sums, sum_cubic_slope, sums_of
 from aolink.numerics.arrays import BoolArray, FloatArray, IntArray
 
 AT_ONCE = 64
@@ -201,6 +201,88 @@ def log_likelihoods_of_lines(line: Line, row: int, t: FloatArray, begin: int, en
             for k in range(together):
                 begins = k * padded + pad
                 out[first + point + k] = log_likelihood_of(y, usable, f, begins, read_noise, gain)
+
+
+@compiled
+def gradients_of_lines(
+    line: Line, row: int, t: FloatArray, begin: int, end: int, out: FloatArray, gradients: FloatArray
+) -> None:
+    """As `log_likelihoods_of_lines`; the log-likelihoods' gradients by t are added to ``gradients``, (n, points)."""
+    y, usable, inputs, basis, weights = line.y[row], line.usable[row], line.inputs[row], line.basis, line.weights
+    table, low, per_unit, read_noise, gain = line.table, line.low, line.per_unit, line.read_noise, line.gain
+    points, _, pad = table.shape
+    number, nodes, padded, lanes = table.dtype, len(weights), len(y) + 2 * pad, lanes_of(table)
+    f, paths = np.empty(_IN_TURN * padded, number), np.empty((nodes, AT_ONCE), number)
+    firsts, nearest = np.empty((nodes, AT_ONCE), np.int64), np.empty((nodes, AT_ONCE), np.int64)
+    away, pulls = np.empty((nodes, AT_ONCE), number), np.empty((nodes, AT_ONCE), number)
+    for first in range(begin, end, AT_ONCE):
+        count = min(AT_ONCE, end - first)
+        paths_of(inputs, basis, t, first, count, paths)
+        places_of(paths, count, low, per_unit, len(y), points, pad, firsts, nearest, away)
+        for point in range(0, count, _IN_TURN):
+            together = min(_IN_TURN, count - point)
+            expected_light(firsts, nearest, away, point, together, weights, table, f, padded)
+            for k in range(together):
+                out[first + point + k] = _scores(y, usable, f, k * padded, pad, read_noise, gain)
+            for node in range(nodes):
+                for k in range(together):
+                    pull = paths[node, point + k] * 0
+                    if firsts[node, point + k] >= 0:
+                        at, place = k * padded + firsts[node, point + k], 4 * pad * nearest[node, point + k]
+                        for p in range(0, pad, lanes):
+                            pull += sum_cubic_slope(f, at + p, away[node, point + k], table, place + p, pad)
+                    pulls[node, point + k] = pull * weights[node] * per_unit
+        add_gradients(basis, pulls, first, count, gradients)
+
+
+@compiled_sums
+def _scores(
+    y: FloatArray, usable: BoolArray, f: FloatArray, begin: int, pad: int, read_noise: float, gain: float
+) -> float:
+    """`log_likelihood_of` pixels whose expected densities begin at ``begin + pad`` in f; its derivatives by them take
+    their place, and zeros that of the padding."""
+    number = f.dtype.type
+    nothing, quiet, total, product = number(0.0), number(1.0 / read_noise), 0.0, 1.0
+    for p in range(pad):
+        f[begin + p] = f[begin + pad + len(y) + p] = nothing
+    first = np.uintp(begin + pad)
+    if not gain:
+        squares = nothing
+        for p in range(len(y)):
+            e = y[p] - f[first + np.uintp(p)] if usable[p] else nothing
+            squares += e * e
+            f[first + np.uintp(p)] = e * quiet
+        return -0.5 * squares / read_noise
+    for p in range(len(y)):
+        light, score = f[first + np.uintp(p)], 0.0
+        if usable[p]:
+            e, R = y[p] - light, read_noise + gain * max(light, nothing)
+            score = e / R
+            total += e * score
+            if light > nothing:
+                product *= R / read_noise
+                if product > LARGE:
+                    total += math.log(product)
+                    product = 1.0
+                score += 0.5 * gain * (e * score - 1.0) / R
+        f[first + np.uintp(p)] = score
+    return -0.5 * (total + math.log(product))
+
+
+@compiled
+def add_gradients(basis: FloatArray, pulls: FloatArray, first: int, count: int, gradients: FloatArray) -> None:
+    """Add gradients by t, (n, points), of ``count`` points from ``first`` on: derivatives by the path at the nodes,
+    (nodes, points), times those of the path. The adjoint of `paths_of`."""
+    n, nodes, points, width, together = len(gradients), len(pulls), gradients.shape[1], pulls.shape[1], sums_of(pulls)
+    many, sums = count - count % together, np.empty(together, pulls.dtype)
+    for i in range(n):
+        for k in range(0, many, together):
+            put_sums(sums, 0, 0.0, basis, i * nodes, 1, pulls, k, width, nodes)
+            for p in range(0, together, lanes_of(pulls)):
+                add_product(gradients, i * points + first + k + p, 1.0, sums, p)
+        for k in range(many, count):
+            for node in range(nodes):
+                gradients[i, first + k] += basis[i, node] * pulls[node, k]
 
 
 @compiled

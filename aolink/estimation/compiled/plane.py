@@ -6,13 +6,22 @@ series, and a pixel's light is the product of the two; where the kernel lies asl
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
 
-from aolink.estimation.compiled.line import AT_ONCE, log_likelihood_of, paths_of, place, places_of
+from aolink.estimation.compiled.line import (
+    AT_ONCE,
+    LARGE,
+    add_gradients,
+    log_likelihood_of,
+    paths_of,
+    place,
+    places_of,
+)
 from aolink.estimation.compiled.small import compiled, compiled_sums, inlined
-from aolink.estimation.compiled.vectors import add_outer, lanes_of, put_cubic
+from aolink.estimation.compiled.vectors import add_outer, add_slopes, lanes_of, put_cubic, put_cubic_slope
 from aolink.numerics.arrays import BoolArray, FloatArray, IntArray
 
 
@@ -92,6 +101,138 @@ def log_likelihoods_of_spots(seen: Plane, row: int, t: FloatArray, begin: int, e
                 for r in range(top, bottom):
                     for c in range(left, right):
                         f[r, c] = 0.0
+
+
+@compiled
+def gradients_of_spots(
+    seen: Plane, row: int, t: FloatArray, begin: int, end: int, out: FloatArray, gradients: FloatArray
+) -> None:
+    """As `log_likelihoods_of_spots`; the log-likelihoods' gradients by t are added to ``gradients``, (n, points)."""
+    weights, terms, low, per_unit = seen.weights, seen.terms, seen.low, seen.per_unit
+    across, down, read_noise, gain = seen.across, seen.down, seen.read_noise, seen.gain
+    side, wide, high = seen.y.shape[2], across.shape[3], down.shape[3]
+    number, nodes = across.dtype, len(weights)
+    f = np.zeros((side + 2 * high, side + 2 * wide), number)
+    columns, rows, dark = np.empty(wide, number), np.empty(high, number), np.empty(side)
+    column_slopes, row_slopes, pull = np.empty(wide, number), np.empty(high, number), np.empty(2, number)
+    path = np.empty((nodes, AT_ONCE), number)
+    dx, dy = np.empty((nodes, AT_ONCE), number), np.empty((nodes, AT_ONCE), number)
+    lefts, tops = np.empty((nodes, AT_ONCE), np.int64), np.empty((nodes, AT_ONCE), np.int64)
+    of_columns, of_rows = np.empty((nodes, AT_ONCE), np.int64), np.empty((nodes, AT_ONCE), np.int64)
+    pulls_x, pulls_y = np.empty((nodes, AT_ONCE), number), np.empty((nodes, AT_ONCE), number)
+    for first in range(begin, end, AT_ONCE):
+        count = min(AT_ONCE, end - first)
+        for k in range(count):
+            out[first + k] = 0.0
+        for spot in range(seen.y.shape[1]):
+            by_x, by_y = seen.basis[2 * spot], seen.basis[2 * spot + 1]
+            paths_of(seen.inputs[row, 2 * spot], by_x, t, first, count, path)
+            places_of(path, count, low, per_unit, side, across.shape[1], wide, lefts, of_columns, dx)
+            paths_of(seen.inputs[row, 2 * spot + 1], by_y, t, first, count, path)
+            places_of(path, count, low, per_unit, side, down.shape[1], high, tops, of_rows, dy)
+            light, usable = seen.y[row, spot], seen.usable[row, spot]
+            _squares(light.ravel(), usable.ravel(), f.ravel(), f.shape[1], side, 0, 0, 0, 0, dark)
+            for k in range(count):
+                top, bottom, left, right = _add_light(
+                    k, lefts, of_columns, dx, tops, of_rows, dy, weights, terms, across, down, columns, rows, f
+                )
+                out[first + k] += _scores(
+                    light, usable, f, high, wide, top, bottom, left, right, dark, read_noise, gain
+                )
+                _put_pulls(
+                    k, lefts, of_columns, dx, tops, of_rows, dy, weights, terms, across, down, columns, rows,
+                    column_slopes, row_slopes, f, per_unit, pull, pulls_x, pulls_y,
+                )  # fmt: skip
+                for r in range(top, bottom):
+                    for c in range(left, right):
+                        f[r, c] = 0.0
+            add_gradients(by_x, pulls_x, first, count, gradients)
+            add_gradients(by_y, pulls_y, first, count, gradients)
+
+
+@compiled_sums
+def _scores(
+    y: FloatArray, usable: BoolArray, f: FloatArray, down: int, across: int, top: int, bottom: int, left: int,
+    right: int, dark: FloatArray, read_noise: float, gain: float,
+) -> float:  # fmt: skip
+    """Log-likelihood of the usable pixels of y (side, side) with padded expected densities f.
+
+    Only the padded rows ``top`` to ``bottom`` and columns ``left`` to ``right`` have light; there the log-likelihood's
+    derivatives take the place of the densities, and zeros that of the padding. ``dark`` is as in `_squares`.
+    """
+    side, number = len(y), f.dtype.type
+    nothing, noise, growth, half, one = number(0.0), number(read_noise), number(gain), number(0.5), number(1.0)
+    quiet = one / noise
+    squares, logs = 0.0, 0.0
+    for r in range(side):
+        squares += dark[r]
+    first, end = max(left - across, 0), min(right - across, side)
+    for padded in range(top, bottom):
+        r = padded - down
+        if r < 0 or r >= side:
+            for c in range(left, right):
+                f[padded, c] = nothing
+            continue
+        for c in range(left, across):
+            f[padded, c] = nothing
+        for c in range(across + side, right):
+            f[padded, c] = nothing
+        more, base = nothing, np.uintp(across)
+        if not gain:
+            for c in range(first, end):
+                light = f[padded, base + np.uintp(c)]
+                e = y[r, np.uintp(c)] - light
+                seen = one if usable[r, np.uintp(c)] else nothing
+                more -= seen * light * (e + y[r, np.uintp(c)])  # e^2 - y^2
+                f[padded, base + np.uintp(c)] = seen * e * quiet
+            squares += more
+            continue
+        product = 1.0
+        for c in range(first, end):
+            score = nothing
+            if usable[r, c]:
+                light = f[padded, across + c]
+                R, e = noise + growth * max(light, nothing), y[r, c] - light
+                score = e / R
+                squares += read_noise * (e * score) - y[r, c] * y[r, c]
+                if light > nothing:
+                    product *= R * quiet
+                    if product > LARGE:
+                        logs += math.log(product)
+                        product = 1.0
+                    score += half * growth * (e * score - one) / R
+            f[padded, across + c] = score
+        logs += math.log(product)
+    return -0.5 * (squares / read_noise + logs)
+
+
+@compiled
+def _put_pulls(
+    point: int, lefts: IntArray, of_columns: IntArray, dx: FloatArray, tops: IntArray, of_rows: IntArray,
+    dy: FloatArray, weights: FloatArray, terms: FloatArray, across: FloatArray, down: FloatArray, columns: FloatArray,
+    rows: FloatArray, column_slopes: FloatArray, row_slopes: FloatArray, scores: FloatArray, per_unit: float,
+    pull: FloatArray, pulls_x: FloatArray, pulls_y: FloatArray,
+) -> None:  # fmt: skip
+    """Derivatives of the log-likelihood by the path at the nodes, (nodes, points), of the point of `_add_light`, from
+    those by the densities: its adjoint. ``pull`` is room for (2,)."""
+    wide, high, width, lanes = across.shape[3], down.shape[3], scores.shape[1], lanes_of(scores)
+    for k in range(len(weights)):
+        left, top = lefts[k, point], tops[k, point]
+        pull[0] = pull[1] = 0.0
+        if left >= 0 and top >= 0:
+            at, x, y = top * width + left, dx[k, point], dy[k, point]
+            for j in range(len(terms)):
+                column = 4 * (j * across.shape[1] + of_columns[k, point]) * wide
+                row = 4 * (j * down.shape[1] + of_rows[k, point]) * high
+                weight = terms[j] * weights[k] * per_unit
+                for p in range(0, high, lanes):
+                    put_cubic(rows, p, 1.0, y, down, row + p, high)
+                    put_cubic_slope(row_slopes, p, 1.0, y, down, row + p, high)
+                for p in range(0, wide, lanes):
+                    put_cubic(columns, p, weight, x, across, column + p, wide)
+                    put_cubic_slope(column_slopes, p, weight, x, across, column + p, wide)
+                    add_slopes(pull, scores, at + p, width, rows, row_slopes, high, columns, column_slopes, p)
+        pulls_x[k, point], pulls_y[k, point] = pull[0], pull[1]
 
 
 @compiled
@@ -207,15 +348,15 @@ def _squares(
     Only the padded rows ``begin`` to ``end`` have light. ``dark`` (side,) has the sum of each row without light: where
     no row has any (``begin`` >= ``end``) it is filled, otherwise it is read.
     """
-    total = 0.0
+    total, nothing = 0.0, f.dtype.type(0.0)
     for r in range(side):
         if begin < end and not begin <= down + r < end:
             total += dark[r]
             continue
-        of_row, pixel, first = 0.0, np.uintp(r * side), np.uintp((down + r) * width + across)
+        of_row, pixel, first = nothing, np.uintp(r * side), np.uintp((down + r) * width + across)
         for c in range(side):
             e = y[pixel + np.uintp(c)] - f[first + np.uintp(c)]
-            of_row += e * e if usable[pixel + np.uintp(c)] else 0.0
+            of_row += e * e if usable[pixel + np.uintp(c)] else nothing
         total += of_row
         if begin >= end:
             dark[r] = of_row

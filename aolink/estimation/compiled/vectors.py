@@ -90,6 +90,66 @@ def add_outer(
 
 
 @_intrinsic
+def add_slopes(
+    _: Any, out: Any, x: Any, at: Any, stride: Any, rows: Any, row_slopes: Any, count: Any, columns: Any,
+    column_slopes: Any, begin: Any,
+) -> Any:  # fmt: skip
+    """Add to out[0] the sum of x[at + r stride + p] * rows[r] * column_slopes[begin + p], and to out[1] that of x[at +
+    r stride + p] * row_slopes[r] * columns[begin + p], over p below `lanes_of` and r below ``count``, a positive
+    multiple of two: the adjoint of `add_outer` and the slopes of its factors."""
+
+    def generate(context: Any, builder: Any, signature: Any, given: Any) -> Any:
+        number = context.get_value_type(types.intp)
+
+        def term(r: Any, before: Sequence[Any]) -> list[Any]:
+            place, *sums = before
+            for k in range(2):
+                values = _load(context, builder, x, given[1], place)
+                for j, kind, array in ((0, rows, given[4]), (1, row_slopes, given[5])):
+                    factor = _number(context, builder, kind, array, builder.add(r, number(k)))
+                    product = builder.fmul(_broadcast(builder, factor, values.type.count), values, flags=_FUSED)
+                    sums[2 * k + j] = builder.fadd(sums[2 * k + j], product, flags=_FUSED)
+                place = builder.add(place, given[3])
+            return [place, *sums]
+
+        nothing = ir.Constant(ir.VectorType(context.get_value_type(x.dtype), _lanes(x)), None)
+        _, *sums = _loop(builder, number(0), given[6], 2, [given[2], *[nothing] * 4], term)
+        for j, kind, array in ((0, column_slopes, given[8]), (1, columns, given[7])):
+            along = builder.fmul(builder.fadd(sums[j], sums[2 + j]), _load(context, builder, kind, array, given[9]))
+            place = builder.gep(context.make_array(out)(context, builder, given[0]).data, [number(j)])
+            builder.store(builder.fadd(builder.load(place), _sum(builder, along)), place)
+        return context.get_dummy_value()
+
+    arguments = (out, x, at, stride, rows, row_slopes, count, columns, column_slopes, begin)
+    return _signature(*arguments), generate
+
+
+@_intrinsic
+def sum_cubic_slope(_: Any, x: Any, at: Any, d: Any, table: Any, begin: Any, stride: Any) -> Any:
+    """Sum of x[at + p] * (c1 + d (2 c2 + 3 d c3)) over p below `lanes_of`, with ck as in `add_cubic`."""
+
+    def generate(context: Any, builder: Any, signature: Any, given: Any) -> Any:
+        slope = _cubic_slope(context, builder, given[2], table, *given[3:])
+        return _sum(builder, builder.fmul(_load(context, builder, x, given[0], given[1]), slope))
+
+    return _signature(x, at, d, table, begin, stride, gives=x.dtype), generate
+
+
+@_intrinsic
+def put_cubic_slope(_: Any, out: Any, at: Any, factor: Any, d: Any, table: Any, begin: Any, stride: Any) -> Any:
+    """out[at + p] = factor * (c1 + d (2 c2 + 3 d c3)) for p below `lanes_of`, with ck as in `add_cubic`."""
+
+    def generate(context: Any, builder: Any, signature: Any, given: Any) -> Any:
+        factors = _broadcast(builder, given[2], _lanes(out))
+        value = builder.fmul(factors, _cubic_slope(context, builder, given[3], table, *given[4:]))
+        place = _several(context, builder, out, given[0], given[1])
+        builder.store(value, place, align=_alignment(value.type))
+        return context.get_dummy_value()
+
+    return _signature(out, at, factor, d, table, begin, stride), generate
+
+
+@_intrinsic
 def put_sums(
     _: Any, out: Any, at: Any, start: Any, factors: Any, first: Any, stride: Any, x: Any, begin: Any, width: Any,
     count: Any,
@@ -145,8 +205,8 @@ def put_cubic(_: Any, out: Any, at: Any, factor: Any, d: Any, table: Any, begin:
     return _signature(out, at, factor, d, table, begin, stride), generate
 
 
-def _signature(*arguments: Any) -> Any:
-    """The signature of a function of these types without a result.
+def _signature(*arguments: Any, gives: Any = types.void) -> Any:
+    """The signature of a function of these types.
 
     Raises TypingError for an array that is not contiguous, of another type than the others, or neither of float64 nor
     of float32: its memory would be taken for another's.
@@ -156,7 +216,7 @@ def _signature(*arguments: Any) -> Any:
     for kind in arrays:
         if kind.layout != "C" or kind.dtype != number or number not in (types.float64, types.float32):
             raise TypingError(f"several numbers at a time need contiguous arrays of one type of float, not {kind}")
-    return types.void(*[number if isinstance(kind, types.Float) else kind for kind in arguments])
+    return gives(*[number if isinstance(kind, types.Float) else kind for kind in arguments])
 
 
 def _lanes(kind: Any) -> int:
@@ -202,6 +262,30 @@ def _cubic(context: Any, builder: Any, d: Any, kind: Any, table: Any, index: Any
     for each in reversed(coefficients):
         value = builder.fadd(each, builder.fmul(distance, value, flags=_FUSED), flags=_FUSED)
     return value
+
+
+def _cubic_slope(context: Any, builder: Any, d: Any, kind: Any, table: Any, index: Any, stride: Any) -> Any:
+    """Derivatives by d of the polynomials of `_cubic`."""
+    distance, coefficients = _broadcast(builder, d, _lanes(kind)), []
+    for k in (1, 2, 3):
+        index = builder.add(index, stride)
+        value = _load(context, builder, kind, table, index)
+        factor = ir.Constant(value.type.element, float(k))
+        coefficients.append(builder.fmul(value, _broadcast(builder, factor, _lanes(kind))))
+    value = coefficients.pop()
+    for each in reversed(coefficients):
+        value = builder.fadd(each, builder.fmul(distance, value, flags=_FUSED), flags=_FUSED)
+    return value
+
+
+def _sum(builder: Any, values: Any) -> Any:
+    """Sum of the numbers of a vector, by halves."""
+    while values.type.count > 1:
+        half = values.type.count // 2
+        places = [ir.Constant(ir.VectorType(ir.IntType(32), half), list(range(k, k + half))) for k in (0, half)]
+        low, high = (builder.shuffle_vector(values, values, each) for each in places)
+        values = builder.fadd(low, high)
+    return builder.extract_element(values, ir.IntType(32)(0))
 
 
 def _add(builder: Any, place: Any, factor: Any, values: Any) -> None:

@@ -30,6 +30,7 @@ from scipy import special
 from aolink.estimation.compiled import mixtures as compiled_mixtures
 from aolink.estimation.pixels.gaussian_mixture import GaussianMixture, joined, log_sum, stacked_axes, with_noise
 from aolink.estimation.pixels.likelihood import PixelView
+from aolink.estimation.pixels.moves import Metropolis
 from aolink.estimation.pixels.tempering import fitted, tempered_points
 from aolink.numerics.arrays import BoolArray, FloatArray
 
@@ -128,7 +129,7 @@ class Tempered(NamedTuple):
 
 def tempered(view: PixelView, prior: GaussianMixture, count: int, number: int) -> Tempered:
     """A number of tempered points, in the exposure of this number."""
-    points, _ = tempered_points(view, prior, count, [(number, axis) for axis in view.axes.tolist()])
+    points, _ = tempered_points(view, prior, count, [(number, axis) for axis in view.axes.tolist()], Metropolis)
     rows = view.reduced.end_rows
     fit = stacked_axes([fitted(each, rows, _COMPONENTS, 0) for each in points])
     return Tempered(points, with_noise(prior, points) + view.log_likelihoods(points), fit)

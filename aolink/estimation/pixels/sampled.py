@@ -16,6 +16,7 @@ from aolink.estimation.pixels.filter import MixtureUpdate
 from aolink.estimation.pixels.gaussian_mixture import GaussianMixture, stacked_axes
 from aolink.estimation.pixels.likelihood import PixelView, Reduction, reduction
 from aolink.estimation.pixels.modes import find_modes, innovation, whitened, with_reversals, without_repeats
+from aolink.estimation.pixels.moves import Hamiltonian
 from aolink.estimation.pixels.tempering import Particles, fitted, tempered_points
 from aolink.estimation.pixels.updates import has_several
 from aolink.numerics import batched
@@ -25,6 +26,8 @@ from aolink.optics.sensor import BaseSensor
 # Rms of the path that is left out, in standard deviations of the kernel.
 _LEFT_OUT = 0.05
 _COMPONENTS = 8
+# Searches for modes start at the means of so many, the heaviest.
+_SEARCHED = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,7 +35,7 @@ class TemperedUpdater:
     """An updater that draws the particles of one axis after another; a mixture of Gaussians is fitted to their end
     states."""
 
-    particles: int = 2000
+    particles: int = 500
     seed: int = 0
 
     def remarks(self, several: BoolArray, poor: BoolArray, reduced: Reduction) -> tuple[()]:
@@ -50,7 +53,7 @@ class TemperedUpdater:
         after = Gaussian(mean, batched.matmul(batched.transpose(away), away) / (t.shape[1] - 1))
         fit = stacked_axes([fitted(points, reduced.end_rows, _COMPONENTS, self.seed) for points in t])
         # With one Gaussian as the prior: components of a mixture that overlap would count as modes of their own.
-        found = find_modes(view, before, whitened(before, fit.mean))
+        found = find_modes(view, before, whitened(before, fit.ordered(_SEARCHED).mean))
         modes = without_repeats(with_reversals(view, before, found))
         new = innovation(view, before, modes)
         end = Gaussian(fit.mean, fit.covariance).mapped(reduced.end_rows, reduced.end_remainder)
@@ -63,4 +66,4 @@ class TemperedUpdater:
         With the estimator's seed and the axis, the exposure's ``number`` seeds the random numbers.
         """
         keys = [(self.seed, number, axis) for axis in view.axes.tolist()]
-        return tempered_points(view, prior, self.particles, keys)
+        return tempered_points(view.rough(), prior, self.particles, keys, Hamiltonian)

@@ -1,9 +1,8 @@
 """Tempered sequential Monte Carlo: particles of a posterior that no Gaussian mixture describes.
 
 Particles are drawn from the prior and weighted with the pixels' likelihood, raised to a power that grows from zero to
-one, each time so far that the effective sample size falls to one half. They are then resampled and moved by Metropolis'
-rule: by differences of two others (differential evolution MCMC: ter Braak, Stat. Comput. 16 (2006)), which go from mode
-to mode, and by random walks with the particles' own covariance.
+one, each time so far that the effective sample size falls to one half. They are then resampled and moved
+(`aolink.estimation.pixels.moves`).
 
 Del Moral, Doucet, Jasra, Sequential Monte Carlo samplers, J. R. Stat. Soc. B 68 (2006), section 3.
 """
@@ -17,18 +16,16 @@ from typing import NamedTuple
 import numpy as np
 from scipy import optimize
 
-from aolink.estimation.pixels.gaussian_mixture import GaussianMixture, log_sum, with_noise
+from aolink.estimation.pixels.gaussian_mixture import GaussianMixture, log_sum
 from aolink.estimation.pixels.likelihood import PixelView
+from aolink.estimation.pixels.moves import Hamiltonian, Metropolis
 from aolink.numerics.arrays import FloatArray, Indices
 from aolink.numerics.covariance import cholesky
 
-_MOVES = 16
 _EFFECTIVE = 0.5
 _EM_PASSES = 25
 # Least covariance of a component of the fit, as a share of that of all particles.
 _LEAST_SPREAD = 1e-3
-# Every fourth move takes the full difference of two particles, which leads from one mode to another.
-_WHOLE = 4
 
 
 class Particles(NamedTuple):
@@ -41,50 +38,35 @@ class Particles(NamedTuple):
     the sum over the steps of the power of the log of the points' mean weight."""
 
 
-def tempered_points(view: PixelView, prior: GaussianMixture, count: int, keys: Sequence[tuple[int, ...]]) -> Particles:
+def tempered_points(
+    view: PixelView, prior: GaussianMixture, count: int, keys: Sequence[tuple[int, ...]],
+    moves: type[Metropolis] | type[Hamiltonian],
+) -> Particles:  # fmt: skip
     """Points of the posterior; the same key, the seed of an axis, gives the same points.
 
     ``prior`` is that of the start state; the noise coefficients have N(0, I).
     """
     each = (np.array([axis]) for axis in range(len(keys)))
-    found = [_of_axis(view.part(a), prior.part(a), count, key) for a, key in zip(each, keys, strict=True)]
+    found = [_of_axis(view.part(a), prior.part(a), count, key, moves) for a, key in zip(each, keys, strict=True)]
     return Particles(np.stack([points for points, _ in found]), np.array([evidence for _, evidence in found]))
 
 
-def _of_axis(view: PixelView, prior: GaussianMixture, count: int, key: tuple[int, ...]) -> tuple[FloatArray, float]:
+def _of_axis(
+    view: PixelView, prior: GaussianMixture, count: int, key: tuple[int, ...],
+    moves: type[Metropolis] | type[Hamiltonian],
+) -> tuple[FloatArray, float]:  # fmt: skip
     """`tempered_points` of one axis: points (count, n) and the log-evidence."""
-    rng, n = np.random.default_rng(key), view.reduced.size
-    t = _drawn(prior, rng, count, n)
-    log_prior, log_likelihood = with_noise(prior, t[None])[0], view.log_likelihoods(t[None])[0]
-    power, walk, difference, evidence = 0.0, 1.0, 1.0, 0.0
+    rng = np.random.default_rng(key)
+    moved = moves(view, prior, _drawn(prior, rng, count, view.reduced.size), rng)
+    power, evidence = 0.0, 0.0
     while power < 1.0:
-        power, before = _next_power(log_likelihood, power), power
-        most = log_likelihood.max()
-        weights = np.exp((power - before) * (log_likelihood - most))
+        power, before = _next_power(moved.log_likelihood, power), power
+        most = moved.log_likelihood.max()
+        weights = np.exp((power - before) * (moved.log_likelihood - most))
         evidence += (power - before) * float(most) + math.log(weights.mean())
-        chosen = _resampled(weights, rng)
-        t, log_prior, log_likelihood = t[chosen], log_prior[chosen], log_likelihood[chosen]
-        root = cholesky(np.cov(t, rowvar=False).reshape(n, n))
-        for move in range(_MOVES):
-            if move % 2:
-                step = 2.38 / math.sqrt(n) * walk * rng.standard_normal((count, n)) @ root.T
-            else:
-                first, second = rng.integers(0, count, (2, count))
-                length = 1.0 if move % _WHOLE == 0 else 2.38 / math.sqrt(2 * n) * difference
-                step = length * (t[first] - t[second]) + 0.01 * walk * rng.standard_normal((count, n)) @ root.T
-            there = t + step
-            its_prior, its_likelihood = with_noise(prior, there[None])[0], view.log_likelihoods(there[None])[0]
-            gain = its_prior - log_prior + power * (its_likelihood - log_likelihood)
-            taken = np.log(rng.random(count)) < gain
-            t[taken], log_prior[taken], log_likelihood[taken] = there[taken], its_prior[taken], its_likelihood[taken]
-            # Towards an acceptance rate of one quarter. The step sizes are kept: the next power needs hardly smaller
-            # ones.
-            change = math.exp(2 * (taken.mean() - 0.25))
-            if move % 2:
-                walk *= change
-            elif move % _WHOLE:
-                difference *= change
-    return t, evidence
+        moved.resample(_resampled(weights, rng))
+        moved.move(power)
+    return moved.points, evidence
 
 
 def fitted(points: FloatArray, rows: FloatArray, components: int, seed: int) -> GaussianMixture:

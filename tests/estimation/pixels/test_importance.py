@@ -11,6 +11,7 @@ from aolink.estimation.moments.lines import WindowedMoments
 from aolink.estimation.pixels.gaussian_mixture import GaussianMixture, single
 from aolink.estimation.pixels.importance import Tempered, with_missed
 from aolink.estimation.pixels.likelihood import PixelView, reduction
+from aolink.estimation.pixels.moves import Metropolis
 from aolink.estimation.pixels.tempering import tempered_points
 from aolink.estimation.pixels.updates import PROFILE
 from aolink.simulation.model import simulate
@@ -89,5 +90,5 @@ def test_profile_has_density_where_tempered_points_of_another_chance_lie():
     view = PixelView(rig.sensor, model, model.response(exposure.inputs), measured, seen)
     state = Gaussian(np.zeros((1, 2)), rig.plant.initial_covariance[None])
     update = PROFILE.within(None, 1.0, too_sure=False, stay_lost=True).update(view, single(state), state, 0)
-    points, _ = tempered_points(view, single(state), 2000, [(7, 0)])
+    points, _ = tempered_points(view, single(state), 2000, [(7, 0)], Metropolis)
     assert GaussianMixture(*update.posterior).log_density(points).mean() > -16.0

@@ -1,0 +1,152 @@
+"""Markov chain moves that leave a tempered posterior unchanged: prior times a power of the pixels' likelihood.
+
+`Metropolis` needs likelihoods only; `Hamiltonian` needs their gradients, two to three times the work a point, and is
+worth it: where a bright spot swings, the posterior is a thin shell or several, of which the points' covariance says
+little. There random walks take steps of a twentieth of the posterior's width, and hardly leave where they began.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from aolink.estimation.pixels.gaussian_mixture import GaussianMixture, with_noise, with_noise_and_gradient
+from aolink.estimation.pixels.likelihood import PixelView
+from aolink.numerics.arrays import BoolArray, FloatArray, Indices
+from aolink.numerics.covariance import cholesky
+
+_MOVES = 16
+# Every fourth move takes the full difference of two particles, which leads from one mode to another.
+_WHOLE = 4
+# Trajectories after each step of the power; how long they are, in standard deviations of the points, as far as so many
+# steps lead there (on a plane, where a step takes several times as long, fewer); and which share is to be accepted.
+_TRAJECTORIES = 2
+_LENGTH = 1.5
+_MOST_STEPS, _MOST_ON_A_PLANE = 16, 8
+_ACCEPTED = 0.7
+# Steps of different points differ by up to this share, so that no trajectory ends where it began.
+_JITTER = 0.3
+_FIRST_STEP, _LARGEST_STEP = 0.5, 1.2
+
+
+class Metropolis:
+    """Points of one axis that are moved by Metropolis' rule: in turn with differences of two other points (differential
+    evolution MCMC: ter Braak, Stat. Comput. 16 (2006)), which go from mode to mode, and with random walks by the
+    points' own covariance."""
+
+    def __init__(
+        self, view: PixelView, prior: GaussianMixture, points: FloatArray, rng: np.random.Generator
+    ) -> None:  # fmt: skip
+        self._view, self._prior, self._rng, self.points = view, prior, rng, points
+        self._log_prior, self.log_likelihood = self._at(points)
+        self._walk = self._difference = 1.0
+
+    def _at(self, t: FloatArray) -> tuple[FloatArray, FloatArray]:
+        return with_noise(self._prior, t[None])[0], self._view.log_likelihoods(t[None])[0]
+
+    def resample(self, chosen: Indices) -> None:
+        """Take these points in place of all, (count,)."""
+        self.points = self.points[chosen]
+        self._log_prior, self.log_likelihood = self._log_prior[chosen], self.log_likelihood[chosen]
+
+    def move(self, power: float) -> None:
+        """Move the points so that their distribution, with the likelihood raised to a power, stays."""
+        rng, t, (count, n) = self._rng, self.points, self.points.shape
+        root = _root(t)
+        for move in range(_MOVES):
+            if move % 2:
+                step = 2.38 / math.sqrt(n) * self._walk * rng.standard_normal((count, n)) @ root.T
+            else:
+                first, second = rng.integers(0, count, (2, count))
+                length = 1.0 if move % _WHOLE == 0 else 2.38 / math.sqrt(2 * n) * self._difference
+                step = length * (t[first] - t[second]) + 0.01 * self._walk * rng.standard_normal((count, n)) @ root.T
+            there = t + step
+            its_prior, its_likelihood = self._at(there)
+            gain = its_prior - self._log_prior + power * (its_likelihood - self.log_likelihood)
+            taken = np.log(rng.random(count)) < gain
+            t[taken], self._log_prior[taken] = there[taken], its_prior[taken]
+            self.log_likelihood[taken] = its_likelihood[taken]
+            # Towards an acceptance rate of one quarter. The step sizes are kept: the next power needs hardly smaller
+            # ones.
+            change = math.exp(2 * (taken.mean() - 0.25))
+            if move % 2:
+                self._walk *= change
+            elif move % _WHOLE:
+                self._difference *= change
+
+
+class Hamiltonian:
+    """Points of one axis that are moved by Hamiltonian Monte Carlo with their covariance as the inverse mass (Neal,
+    MCMC using Hamiltonian dynamics, Handbook of Markov Chain Monte Carlo (2011), section 5.3), and once by the
+    difference of two other points, which may lead to another mode."""
+
+    def __init__(
+        self, view: PixelView, prior: GaussianMixture, points: FloatArray, rng: np.random.Generator
+    ) -> None:  # fmt: skip
+        self._view, self._prior, self._rng, self.points = view, prior, rng, points
+        self._step, self._most_steps = _FIRST_STEP, _MOST_STEPS if view.on_line else _MOST_ON_A_PLANE
+        self._log_prior, self.log_likelihood, self._prior_slope, self._slope = self._at(points)
+
+    def _at(self, t: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Logarithms of prior and likelihood at points and their gradients."""
+        log_prior, prior_slope = with_noise_and_gradient(self._prior, t[None])
+        log_likelihood, slope = self._view.log_likelihoods_and_gradients(t[None])
+        return log_prior[0], log_likelihood[0], prior_slope[0], slope[0]
+
+    def resample(self, chosen: Indices) -> None:
+        """As `Metropolis.resample`."""
+        self.points, self._log_prior, self.log_likelihood = (
+            each[chosen] for each in (self.points, self._log_prior, self.log_likelihood)
+        )
+        self._prior_slope, self._slope = self._prior_slope[chosen], self._slope[chosen]
+
+    def move(self, power: float) -> None:
+        """As `Metropolis.move`."""
+        root, count = _root(self.points), len(self.points)
+        for _ in range(_TRAJECTORIES):
+            taken = self._follow(power, root)
+            self._step = min(_LARGEST_STEP, self._step * math.exp(taken.mean() - _ACCEPTED))
+        first, second = self._rng.integers(0, count, (2, count))
+        there = self.points + self.points[first] - self.points[second]
+        self._take(power, there, self._at(there), np.zeros(count))
+
+    def _follow(self, power: float, root: FloatArray) -> BoolArray:
+        """Follow one trajectory from each point, by leapfrog steps, to a point that may be taken."""
+        rng, there, shape = self._rng, self.points, self.points.shape
+        momentum = rng.standard_normal(shape)
+        energy = 0.5 * np.add.reduce(momentum * momentum, axis=1)
+        step = self._step * rng.uniform(1 - _JITTER, 1 + _JITTER, (len(there), 1))
+        steps = min(self._most_steps, math.ceil(_LENGTH / self._step))
+        force = self._prior_slope + power * self._slope
+        its = None
+        for k in range(steps):
+            momentum = momentum + (0.5 if k == 0 else 1.0) * step * (force @ root)
+            there = there + step * (momentum @ root.T)
+            its = self._at(there)
+            force = its[2] + power * its[3]
+        assert its is not None
+        momentum = momentum + 0.5 * step * (force @ root)
+        return self._take(power, there, its, energy - 0.5 * np.add.reduce(momentum * momentum, axis=1))
+
+    def _take(
+        self, power: float, there: FloatArray, its: tuple[FloatArray, FloatArray, FloatArray, FloatArray],
+        more: FloatArray,
+    ) -> BoolArray:  # fmt: skip
+        """Take new points by Metropolis' rule; ``more`` is what the log of the ratio is besides the posterior's. Gives
+        where they were taken, (count,)."""
+        log_prior, log_likelihood, prior_slope, slope = its
+        gain = log_prior - self._log_prior + power * (log_likelihood - self.log_likelihood) + more
+        taken = np.log(self._rng.random(len(there))) < gain  # not where a trajectory has left all numbers
+        for old, new in (
+            (self.points, there), (self._log_prior, log_prior), (self.log_likelihood, log_likelihood),
+            (self._prior_slope, prior_slope), (self._slope, slope),
+        ):  # fmt: skip
+            old[taken] = new[taken]
+        return np.asarray(taken)
+
+
+def _root(points: FloatArray) -> FloatArray:
+    """Root of the covariance of points (count, n)."""
+    n = points.shape[1]
+    return cholesky(np.cov(points, rowvar=False).reshape(n, n))
