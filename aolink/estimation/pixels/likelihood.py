@@ -322,18 +322,20 @@ class PixelView:
         return Line(
             y=self._array(self.y), usable=np.ascontiguousarray(self.mask), inputs=self._array(nodes.inputs[:, 0]),
             basis=self._array(nodes.basis[0].T), weights=self._array(nodes.weights),
-            table=_light_table(float(self.kernel[0, 0]), pixel, 0, self._reach, self._number),
+            table=_light_table(float(self.kernel[0, 0]), pixel, 0, self._reach, 1.0, self._number),
             low=float(self.optics.profile.edges[0]), per_unit=1 / pixel, read_noise=self.read_noise, gain=self.gain,
         )  # fmt: skip
 
     @property
     def _plane(self) -> Plane:
         """The frame of spots for compiled code."""
-        profile, nodes, terms = self.optics.profile, self.nodes, mehler_series(self.kernel)
+        profile, nodes, terms = self.optics.profile, self.nodes, np.array(mehler_series(self.kernel))
+        # In single precision, high derivatives are too large and their factors too small for it.
+        scale = np.sqrt(np.abs(terms)) if self._number == np.float32 else np.ones_like(terms)
         across, down = (
             np.stack([
-                _light_table(float(self.kernel[d, d]), profile.pixel_size, j, self._reach, self._number)
-                for j in range(len(terms))
+                _light_table(float(self.kernel[d, d]), profile.pixel_size, j, self._reach, each, self._number)
+                for j, each in enumerate(scale.tolist())
             ])
             for d in (0, 1)
         )  # fmt: skip
@@ -341,7 +343,7 @@ class PixelView:
         return Plane(
             y=self._array(self.y).reshape(windows), usable=np.ascontiguousarray(self.mask).reshape(windows),
             inputs=self._array(nodes.inputs), basis=self._array(batched.transpose(nodes.basis)),
-            weights=self._array(nodes.weights), across=across, down=down, terms=self._array(terms),
+            weights=self._array(nodes.weights), across=across, down=down, terms=self._array(terms / scale**2),
             low=float(profile.edges[0]), per_unit=1 / profile.pixel_size, read_noise=self.read_noise, gain=self.gain,
         )  # fmt: skip
 
@@ -386,18 +388,20 @@ class PixelView:
 
 
 @lru_cache(maxsize=_SIDE_BY_SIDE)
-def _light_table(variance: float, pixel: float, order: int, reach: float, number: np.dtype[Any]) -> FloatArray:
+def _light_table(
+    variance: float, pixel: float, order: int, reach: float, scale: float, number: np.dtype[Any]
+) -> FloatArray:
     """Taylor coefficients of the densities of pixels about a spot, for points in its own pixel, (points, 4, pixels).
 
     They are those of powers of its distance from the point, in pixels; of the derivative of this ``order`` by the
-    spot's position. ``reach`` is in standard deviations. The bytes of a row are rounded up to a multiple of `BYTES`;
-    the pixels added get no light.
+    spot's position, times ``scale``. ``reach`` is in standard deviations. The bytes of a row are rounded up to a
+    multiple of `BYTES`; the pixels added get no light.
     """
     points = math.ceil(_POINTS * pixel / math.sqrt(variance))
     half = math.ceil(reach * math.sqrt(variance) / pixel) + 1
     places = (np.arange(points) + 0.5) * pixel / points
     masses = pixel_masses(variance, pixel * np.arange(-half, half + 1.0), places, order + 3)[order:]
     table = np.stack([mass * pixel ** (k - 1) / math.factorial(k) for k, mass in enumerate(masses)], axis=1)
-    table = table.astype(number)
+    table = (scale * table).astype(number)
     beyond = (-half) % (BYTES // table.itemsize // 2)
     return np.pad(table, [(0, 0), (0, 0), (beyond, beyond)])
