@@ -10,7 +10,7 @@ from aolink.estimation.pixels.gaussian_mixture import GaussianMixture, with_nois
 from aolink.estimation.pixels.likelihood import PixelView
 from aolink.estimation.pixels.moves import Hamiltonian, Metropolis
 
-COUNT, SIZE, RADIUS, WIDTH = 1500, 20, 2.0, 0.1
+COUNT, SIZE, RADIUS, WIDTH = 4000, 20, 2.0, 0.1
 STANDARD = GaussianMixture(np.zeros((1, 1)), np.zeros((1, 1, 2)), np.eye(2)[None, None])
 
 
@@ -47,7 +47,7 @@ def on_the_ring(rng, power):
 
 
 def moved(kind, view, t, power, times):
-    moves = kind(cast(PixelView, view), STANDARD, t.copy(), np.random.default_rng(3))
+    moves = kind(cast(PixelView, view), STANDARD, t.copy(), np.random.default_rng(5))
     for _ in range(times):
         moves.move(power)
     return moves.points
