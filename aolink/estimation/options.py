@@ -50,8 +50,9 @@ class Options:
     work as well; it does not count where tempered points are weighed. With 5 an exposure takes a sixth of the time, the
     estimates have larger errors, and the log-evidence, which is not from these points, still tells models that differ
     much apart."""
-    particles: int = 500
-    """Number of particles of `sampled`."""
+    particles: int | None = None
+    """Number of particles of `sampled`. None: 500 to 2000, fewer where the pixels and coefficients of a rig make each
+    more work, so that an exposure takes about a second at most."""
     seed: int = 0
     """Seed of `sampled`: the same one gives the same estimates, bit for bit."""
 

@@ -47,7 +47,7 @@ class Size:
     """Runs, the first ones, for `profile` and `mixture`."""
     limit_runs: int = 3
     """Runs, the first ones, for `sampled`."""
-    particles: int = 500
+    particles: int | None = None
     smoothed: bool = False
     """Whether smoothed estimates are scored, which all later exposures of their run have corrected."""
 

@@ -149,7 +149,7 @@ class MadeFilm:
 
 
 def made_film(
-    kind: Kind, names: Sequence[str], seeds: Sequence[int], exposures: int, particles: int = 500,
+    kind: Kind, names: Sequence[str], seeds: Sequence[int], exposures: int, particles: int | None = None,
 ) -> MadeFilm:  # fmt: skip
     """Estimators and centroids on a film of each seed; ``particles`` are those of `sampled`."""
     skip = _SKIP_SHAKE if kind.periods else _SKIP_WALK

@@ -57,7 +57,7 @@ class Effort:
     fitted_exposures: int = 24
     family: Plan | None = None
     """What is judged over the family; the rows that the repository keeps if None."""
-    particles: int = 500
+    particles: int | None = None
     """Particles of the sampler."""
     offsets: tuple[float, ...] = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5)
     densities: tuple[float, ...] = (0.1, 0.03, 0.01, 0.003, 0.001)

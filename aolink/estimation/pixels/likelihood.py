@@ -274,6 +274,13 @@ class PixelView:
         return float(np.linalg.eigvalsh(self.kernel)[0])
 
     @property
+    def work(self) -> int:
+        """Products that the log-likelihood of a point takes, about."""
+        each = [2 * _half(float(v), self.optics.profile.pixel_size, self._reach) for v in np.diag(self.kernel)]
+        lit = each[0] if self.on_line else math.prod(each) * self.outputs // 2
+        return len(self.nodes.weights) * (self.outputs * self.reduced.size + lit)
+
+    @property
     def rows(self) -> FloatArray:
         """Path at the nodes of the coefficients, (n_outputs * nodes, n)."""
         return self.nodes.basis.reshape(-1, self.reduced.size)
@@ -398,10 +405,15 @@ def _light_table(
     multiple of `BYTES`; the pixels added get no light.
     """
     points = math.ceil(_POINTS * pixel / math.sqrt(variance))
-    half = math.ceil(reach * math.sqrt(variance) / pixel) + 1
+    half = _half(variance, pixel, reach)
     places = (np.arange(points) + 0.5) * pixel / points
     masses = pixel_masses(variance, pixel * np.arange(-half, half + 1.0), places, order + 3)[order:]
     table = np.stack([mass * pixel ** (k - 1) / math.factorial(k) for k, mass in enumerate(masses)], axis=1)
     table = (scale * table).astype(number)
     beyond = (-half) % (BYTES // table.itemsize // 2)
     return np.pad(table, [(0, 0), (0, 0), (beyond, beyond)])
+
+
+def _half(variance: float, pixel: float, reach: float) -> int:
+    """Pixels on either side of a spot that it lights."""
+    return math.ceil(reach * math.sqrt(variance) / pixel) + 1

@@ -28,6 +28,20 @@ _ACCEPTED = 0.7
 # Steps of different points differ by up to this share, so that no trajectory ends where it began.
 _JITTER = 0.3
 _FIRST_STEP, _LARGEST_STEP = 0.5, 1.2
+# Products in the trajectories after each step of the power; how many more a point takes besides its light; and the
+# numbers of points among which this budget decides.
+_BUDGET, _BESIDES = 1.2e8, 2000
+_FEWEST, _MOST = 500, 2000
+
+
+def affordable(view: PixelView) -> int:
+    """Number of points that `Hamiltonian` moves within its budget of work."""
+    a_point = _TRAJECTORIES * _most_steps(view) * (view.work + _BESIDES)
+    return int(np.clip(_BUDGET / a_point, _FEWEST, _MOST))
+
+
+def _most_steps(view: PixelView) -> int:
+    return _MOST_STEPS if view.on_line else _MOST_ON_A_PLANE
 
 
 class Metropolis:
@@ -85,7 +99,7 @@ class Hamiltonian:
         self, view: PixelView, prior: GaussianMixture, points: FloatArray, rng: np.random.Generator
     ) -> None:  # fmt: skip
         self._view, self._prior, self._rng, self.points = view, prior, rng, points
-        self._step, self._most_steps = _FIRST_STEP, _MOST_STEPS if view.on_line else _MOST_ON_A_PLANE
+        self._step, self._most_steps = _FIRST_STEP, _most_steps(view)
         self._log_prior, self.log_likelihood, self._prior_slope, self._slope = self._at(points)
 
     def _at(self, t: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:

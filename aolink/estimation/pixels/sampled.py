@@ -16,7 +16,7 @@ from aolink.estimation.pixels.filter import MixtureUpdate
 from aolink.estimation.pixels.gaussian_mixture import GaussianMixture, stacked_axes
 from aolink.estimation.pixels.likelihood import PixelView, Reduction, reduction
 from aolink.estimation.pixels.modes import find_modes, innovation, whitened, with_reversals, without_repeats
-from aolink.estimation.pixels.moves import Hamiltonian
+from aolink.estimation.pixels.moves import Hamiltonian, affordable
 from aolink.estimation.pixels.tempering import Particles, fitted, tempered_points
 from aolink.estimation.pixels.updates import has_several
 from aolink.numerics import batched
@@ -35,7 +35,7 @@ class TemperedUpdater:
     """An updater that draws the particles of one axis after another; a mixture of Gaussians is fitted to their end
     states."""
 
-    particles: int = 500
+    particles: int | None = None
     seed: int = 0
 
     def remarks(self, several: BoolArray, poor: BoolArray, reduced: Reduction) -> tuple[()]:
@@ -66,4 +66,5 @@ class TemperedUpdater:
         With the estimator's seed and the axis, the exposure's ``number`` seeds the random numbers.
         """
         keys = [(self.seed, number, axis) for axis in view.axes.tolist()]
-        return tempered_points(view.rough(), prior, self.particles, keys, Hamiltonian)
+        rough = view.rough()
+        return tempered_points(rough, prior, self.particles or affordable(rough), keys, Hamiltonian)
