@@ -230,6 +230,47 @@ def log_densities(
 
 
 @compiled
+def log_densities_and_gradients(
+    log_weight: FloatArray, mean: FloatArray, covariance: FloatArray, points: FloatArray, out: FloatArray,
+    gradients: FloatArray,
+) -> None:  # fmt: skip
+    """As `log_densities`, with their gradients by the points, (axes, points, n)."""
+    axes, count, n = mean.shape
+    many = points.shape[1]
+    root, inverse, constant = np.empty((count, n, n)), np.empty((count, n, n)), np.empty(count)
+    t, white, logs = np.empty((n, many)), np.empty((n, many)), np.empty((count, many))
+    share, pulled = np.empty(many), np.empty((n, many))
+    for axis in range(axes):
+        w, m = log_weight[axis], mean[axis]
+        for k in range(many):
+            for i in range(n):
+                t[i, k] = points[axis, k, i]
+        _roots(w, covariance[axis], root, inverse, constant)
+        _log_densities(w, m, inverse, constant, t, 0, many, share, logs, out[axis])
+        pulled[:] = 0.0
+        for c in range(count):
+            if w[c] == -math.inf:
+                continue
+            for k in range(many):
+                share[k] = math.exp(logs[c, k] - out[axis, k])
+            for i in range(n):
+                for k in range(many):
+                    white[i, k] = 0.0
+                for j in range(i + 1):
+                    x, middle = inverse[c, i, j], m[c, j]
+                    for k in range(many):
+                        white[i, k] += x * (t[j, k] - middle)
+            for i in range(n):
+                for j in range(i, n):
+                    x = inverse[c, j, i]
+                    for k in range(many):
+                        pulled[i, k] -= share[k] * x * white[j, k]
+        for k in range(many):
+            for i in range(n):
+                gradients[axis, k, i] = pulled[i, k]
+
+
+@compiled
 def correct_by_importance(
     seen: Line | Plane, prior_weight: FloatArray, prior_mean: FloatArray, prior_covariance: FloatArray,
     log_weight: FloatArray, mean: FloatArray, covariance: FloatArray, uniform: FloatArray, normal: FloatArray,

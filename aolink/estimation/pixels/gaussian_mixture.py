@@ -64,19 +64,13 @@ class GaussianMixture(NamedTuple):
 
     def component_log_densities(self, points: FloatArray) -> FloatArray:
         """The log-density of each component times its weight, (axes, components, points)."""
-        return self._whitened(points)[0]
-
-    def _whitened(self, points: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """`component_log_densities`; the points in each component's coordinates, (axes, components, points, n); and the
-        matrices that lead there."""
         n = points.shape[-1]
         root = cholesky(self.covariance)
-        inverse = lower_inverse(root)
         away = points[:, None] - self.mean[:, :, None]
-        white = batched.long_matmul(away, batched.transpose(inverse))
+        white = batched.long_matmul(away, batched.transpose(lower_inverse(root)))
         log_root = np.add.reduce(np.log(np.einsum("...ii->...i", root)), axis=-1)
         constant = self.log_weight - log_root - 0.5 * n * math.log(2 * math.pi)
-        return np.asarray(constant[..., None] - 0.5 * np.add.reduce(white * white, axis=-1)), white, inverse
+        return np.asarray(constant[..., None] - 0.5 * np.add.reduce(white * white, axis=-1))
 
     @property
     def contiguous(self) -> list[FloatArray]:
@@ -147,21 +141,23 @@ def stacked_axes(mixtures: Sequence[GaussianMixture]) -> GaussianMixture:
 def with_noise(prior: GaussianMixture, t: FloatArray) -> FloatArray:
     """Log-densities of t = (start state, standard normal noise coefficients), (axes, points, n) -> (axes, points)."""
     states = prior.mean.shape[2]
-    rest = t[..., states:]
-    noise = -0.5 * np.add.reduce(rest * rest, axis=-1) - 0.5 * rest.shape[-1] * math.log(2 * math.pi)
-    return np.asarray(prior.log_density(t[..., :states]) + noise)
+    return np.asarray(prior.log_density(t[..., :states]) + _of_noise(t[..., states:]))
 
 
 def with_noise_and_gradient(prior: GaussianMixture, t: FloatArray) -> tuple[FloatArray, FloatArray]:
     """The log-densities of `with_noise` and their gradients by t, (axes, points, n)."""
-    states = prior.mean.shape[2]
-    x, rest = t[..., :states], t[..., states:]
-    logs, white, inverse = prior._whitened(x)
-    density = log_sum(logs, axis=1)
-    share = np.exp(logs - density[:, None])
-    pulled = -np.add.reduce(share[..., None] * batched.long_matmul(white, inverse), axis=1)
-    noise = -0.5 * np.add.reduce(rest * rest, axis=-1) - 0.5 * rest.shape[-1] * math.log(2 * math.pi)
-    return density + noise, np.concatenate([pulled, -rest], axis=-1)
+    states, gradient = prior.mean.shape[2], -t
+    density, pulled = np.empty(t.shape[:2]), np.empty((*t.shape[:2], states))
+    compiled_mixtures.log_densities_and_gradients(
+        *prior.contiguous, np.ascontiguousarray(t[..., :states]), density, pulled
+    )
+    gradient[..., :states] = pulled
+    return density + _of_noise(t[..., states:]), gradient
+
+
+def _of_noise(rest: FloatArray) -> FloatArray:
+    """Log-densities of standard normal numbers along the last axis."""
+    return np.asarray(-0.5 * np.add.reduce(rest * rest, axis=-1) - 0.5 * rest.shape[-1] * math.log(2 * math.pi))
 
 
 def log_sum(values: FloatArray, axis: int) -> FloatArray:
