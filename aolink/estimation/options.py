@@ -104,6 +104,8 @@ def checked_options(**options: Any) -> Options:
         raise EstimatorError(
             f"tempered = {chosen.tempered}: use at least {_FEWEST_TEMPERED} points, or 0 for no tempering"
         )
+    if chosen.particles is not None and chosen.particles < _FEWEST_TEMPERED:
+        raise EstimatorError(f"particles = {chosen.particles}: use at least {_FEWEST_TEMPERED}")
     if not 1 <= chosen.draws <= _MOST_DRAWS:
         raise EstimatorError(f"draws = {chosen.draws}: use 1 to {_MOST_DRAWS} per cent of the usual points")
     if chosen.second_order and chosen.engine == "filterpy":

@@ -60,6 +60,7 @@ def test_options_may_follow_the_name():
         ("o3:", "no estimator 'o3:': after the colon"),
         ("o3:second_order=maybe", "second_order = 'maybe', expected true or false"),
         ("sampled:particles=many", "particles = 'many', expected a whole number"),
+        ("sampled:particles=5", "particles = 5: use at least 100"),
         ("moments:orders=0-2", "orders = '0-2', expected digits, such as 012"),
         ("o3:flux=some", "flux = 'some' is not known"),
         ("o4:second_order", "no estimator 'o4': use one of open-loop, o1"),
