@@ -20,6 +20,8 @@ from tests.needs import needed
 
 needed("matplotlib")
 
+pytestmark = pytest.mark.long
+
 TOOLS = Path(__file__).parents[2] / "tools"
 FIGURES = (
     "figure-4.png", "figure-5.png", "figure-6.png", "figure-7.png", "remarks.png", "map.png", "limit.png", "family.png"
