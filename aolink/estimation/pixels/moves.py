@@ -8,6 +8,7 @@ little. There random walks take steps of a twentieth of the posterior's width, a
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -90,6 +91,19 @@ class Metropolis:
                 self._difference *= change
 
 
+class _Place(NamedTuple):
+    points: FloatArray
+    """(count, n)"""
+    log_prior: FloatArray
+    """(count,)"""
+    log_likelihood: FloatArray
+    """(count,)"""
+    prior_slope: FloatArray
+    """Gradient of ``log_prior``, (count, n)."""
+    slope: FloatArray
+    """Gradient of ``log_likelihood``, (count, n)."""
+
+
 class Hamiltonian:
     """Points of one axis that are moved by Hamiltonian Monte Carlo with their covariance as the inverse mass (Neal,
     MCMC using Hamiltonian dynamics, Handbook of Markov Chain Monte Carlo (2011), section 5.3), and once by the
@@ -98,22 +112,28 @@ class Hamiltonian:
     def __init__(
         self, view: PixelView, prior: GaussianMixture, points: FloatArray, rng: np.random.Generator
     ) -> None:  # fmt: skip
-        self._view, self._prior, self._rng, self.points = view, prior, rng, points
+        self._view, self._prior, self._rng = view, prior, rng
         self._step, self._most_steps = _FIRST_STEP, _most_steps(view)
-        self._log_prior, self.log_likelihood, self._prior_slope, self._slope = self._at(points)
+        self._now = self._at(points)
 
-    def _at(self, t: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Logarithms of prior and likelihood at points and their gradients."""
+    @property
+    def points(self) -> FloatArray:
+        """(count, n)"""
+        return self._now.points
+
+    @property
+    def log_likelihood(self) -> FloatArray:
+        """(count,)"""
+        return self._now.log_likelihood
+
+    def _at(self, t: FloatArray) -> _Place:
         log_prior, prior_slope = with_noise_and_gradient(self._prior, t[None])
         log_likelihood, slope = self._view.log_likelihoods_and_gradients(t[None])
-        return log_prior[0], log_likelihood[0], prior_slope[0], slope[0]
+        return _Place(t, log_prior[0], log_likelihood[0], prior_slope[0], slope[0])
 
     def resample(self, chosen: Indices) -> None:
         """As `Metropolis.resample`."""
-        self.points, self._log_prior, self.log_likelihood = (
-            each[chosen] for each in (self.points, self._log_prior, self.log_likelihood)
-        )
-        self._prior_slope, self._slope = self._prior_slope[chosen], self._slope[chosen]
+        self._now = _Place(*(each[chosen] for each in self._now))
 
     def move(self, power: float) -> None:
         """As `Metropolis.move`."""
@@ -122,40 +142,28 @@ class Hamiltonian:
             taken = self._follow(power, root)
             self._step = min(_LARGEST_STEP, self._step * math.exp(taken.mean() - _ACCEPTED))
         first, second = self._rng.integers(0, count, (2, count))
-        there = self.points + self.points[first] - self.points[second]
-        self._take(power, there, self._at(there), np.zeros(count))
+        self._take(power, self._at(self.points + self.points[first] - self.points[second]), np.zeros(count))
 
     def _follow(self, power: float, root: FloatArray) -> BoolArray:
         """Follow one trajectory from each point, by leapfrog steps, to a point that may be taken."""
-        rng, there, shape = self._rng, self.points, self.points.shape
-        momentum = rng.standard_normal(shape)
+        rng, place = self._rng, self._now
+        momentum = rng.standard_normal(place.points.shape)
         energy = 0.5 * np.add.reduce(momentum * momentum, axis=1)
-        step = self._step * rng.uniform(1 - _JITTER, 1 + _JITTER, (len(there), 1))
-        steps = min(self._most_steps, math.ceil(_LENGTH / self._step))
-        force = self._prior_slope + power * self._slope
-        its = None
-        for k in range(steps):
-            momentum = momentum + (0.5 if k == 0 else 1.0) * step * (force @ root)
-            there = there + step * (momentum @ root.T)
-            its = self._at(there)
-            force = its[2] + power * its[3]
-        assert its is not None
-        momentum = momentum + 0.5 * step * (force @ root)
-        return self._take(power, there, its, energy - 0.5 * np.add.reduce(momentum * momentum, axis=1))
+        step = self._step * rng.uniform(1 - _JITTER, 1 + _JITTER, (len(momentum), 1))
+        kick = 0.5 * step  # half a step at both ends
+        for _ in range(min(self._most_steps, math.ceil(_LENGTH / self._step))):
+            momentum = momentum + kick * ((place.prior_slope + power * place.slope) @ root)
+            place, kick = self._at(place.points + step * (momentum @ root.T)), step
+        momentum = momentum + 0.5 * step * ((place.prior_slope + power * place.slope) @ root)
+        return self._take(power, place, energy - 0.5 * np.add.reduce(momentum * momentum, axis=1))
 
-    def _take(
-        self, power: float, there: FloatArray, its: tuple[FloatArray, FloatArray, FloatArray, FloatArray],
-        more: FloatArray,
-    ) -> BoolArray:  # fmt: skip
+    def _take(self, power: float, there: _Place, more: FloatArray) -> BoolArray:
         """Take new points by Metropolis' rule; ``more`` is what the log of the ratio is besides the posterior's. Gives
         where they were taken, (count,)."""
-        log_prior, log_likelihood, prior_slope, slope = its
-        gain = log_prior - self._log_prior + power * (log_likelihood - self.log_likelihood) + more
-        taken = np.log(self._rng.random(len(there))) < gain  # not where a trajectory has left all numbers
-        for old, new in (
-            (self.points, there), (self._log_prior, log_prior), (self.log_likelihood, log_likelihood),
-            (self._prior_slope, prior_slope), (self._slope, slope),
-        ):  # fmt: skip
+        now = self._now
+        gain = there.log_prior - now.log_prior + power * (there.log_likelihood - now.log_likelihood) + more
+        taken = np.log(self._rng.random(len(gain))) < gain  # not where a trajectory has left all numbers
+        for old, new in zip(now, there, strict=True):
             old[taken] = new[taken]
         return np.asarray(taken)
 

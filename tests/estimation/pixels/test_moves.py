@@ -1,5 +1,8 @@
 """Moves leave the distribution as it is and lead through it: on a bright ring, whose likelihood is known."""
 
+import dataclasses
+from copy import copy
+from types import SimpleNamespace
 from typing import cast
 
 import numpy as np
@@ -8,7 +11,8 @@ from scipy import stats
 
 from aolink.estimation.pixels.gaussian_mixture import GaussianMixture, with_noise, with_noise_and_gradient
 from aolink.estimation.pixels.likelihood import PixelView
-from aolink.estimation.pixels.moves import Hamiltonian, Metropolis
+from aolink.estimation.pixels.moves import Hamiltonian, Metropolis, affordable
+from tests.estimation.compiled.test_pixels import looked_at, looked_at_plane
 
 COUNT, SIZE, RADIUS, WIDTH = 4000, 20, 2.0, 0.1
 STANDARD = GaussianMixture(np.zeros((1, 1)), np.zeros((1, 1, 2)), np.eye(2)[None, None])
@@ -103,3 +107,20 @@ def test_the_gradient_of_the_prior_is_its_slope():
         step = 1e-5 * np.eye(5)[i]
         slope = (with_noise(prior, t + step) - with_noise(prior, t - step)) / 2e-5
         np.testing.assert_allclose(gradient[..., i], slope, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("on_line", [True, False])
+def test_the_more_work_a_point_is_the_fewer_there_are(on_line):
+    counts = [affordable(cast(PixelView, SimpleNamespace(on_line=on_line, work=work))) for work in (10, 3000, 10**6)]
+    assert 1500 < counts[0] <= 2000
+    assert counts[0] > counts[1] > counts[2]
+    assert counts[2] == 500
+
+
+@pytest.mark.parametrize(("kind", "view"), [("lively", looked_at), ("round", looked_at_plane)])
+def test_the_work_of_a_point_grows_with_its_nodes_and_the_pixels_that_it_lights(kind, view):
+    exact = view(kind, 0)[0] if view is looked_at_plane else view(kind)[0]
+    assert 0 < exact.rough().work <= exact.work
+    more = copy(exact)
+    more.nodes = dataclasses.replace(exact.nodes, weights=np.repeat(exact.nodes.weights, 2) / 2)
+    assert more.work == 2 * exact.work
