@@ -70,7 +70,7 @@ FULL = Effort()
 QUICK = Effort(
     noise_frames=20_000, runs=16, exposures=14, cycle_exposures=20, skip=4, map_runs=16, shake_runs=6,
     limit_runs=2, limit_exposures=4, limit_skip=1, o1_runs=4, o1_exposures=4, particles=150,
-    film_frames=(8, 12), film_exposures=3, made_kinds=(3, 4), made_seeds=1, made_exposures=5, fitted_kinds=1,
+    film_exposures=3, made_kinds=(3, 4), made_seeds=1, made_exposures=5, fitted_kinds=1,
     fitted_seeds=1, fitted_exposures=5,
     family=Plan(
         scenes=4, pixel_scenes=2, limit_scenes=1,
