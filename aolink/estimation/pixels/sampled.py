@@ -21,6 +21,7 @@ from aolink.estimation.pixels.tempering import Particles, fitted, tempered_point
 from aolink.estimation.pixels.updates import has_several
 from aolink.numerics import batched
 from aolink.numerics.arrays import BoolArray
+from aolink.numerics.single_thread import by_one_thread
 from aolink.optics.sensor import BaseSensor
 
 # Rms of the path that is left out, in standard deviations of the kernel.
@@ -50,7 +51,8 @@ class TemperedUpdater:
         reduced, before = view.reduced, view.reduced.prior(prior.gaussian)
         mean = t.mean(axis=1)
         away = t - mean[:, None]
-        after = Gaussian(mean, batched.matmul(batched.transpose(away), away) / (t.shape[1] - 1))
+        with by_one_thread:
+            after = Gaussian(mean, batched.matmul(batched.transpose(away), away) / (t.shape[1] - 1))
         fit = stacked_axes([fitted(points, reduced.end_rows, _COMPONENTS, self.seed) for points in t])
         # With one Gaussian as the prior: components of a mixture that overlap would count as modes of their own.
         found = find_modes(view, before, whitened(before, fit.ordered(_SEARCHED).mean))

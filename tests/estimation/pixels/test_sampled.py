@@ -6,6 +6,7 @@ from typing import cast
 import numpy as np
 import pytest
 from scipy import stats
+from threadpoolctl import threadpool_limits
 
 from aolink.estimation import Profile, exposure_model, make_estimator
 from aolink.estimation.frames.measure import measure
@@ -150,3 +151,16 @@ def test_it_is_an_estimator_like_any_other():
     for e, x in zip(runs[0], exposures, strict=True):
         assert e.status.name == "OK"
         assert np.mean(np.abs(e.path - truth_of(x).path) < 3 * e.path_sd) > 0.9
+
+
+def test_no_bit_depends_on_how_many_threads_there_are():
+    """Of 10,000 numbers BLAS shares a scalar product among threads, of 30 coefficients a product of matrices."""
+    rng = np.random.default_rng(3)
+    points = rng.standard_normal((2500, 31))
+    (exposure,) = simulate(RIG, 1, seed=3)
+    view, prior, found = seen(RIG, exposure), single(PRIOR), []
+    for threads in (1, 2):
+        with threadpool_limits(threads):
+            drawn = TemperedUpdater(10_001).sample(view, prior, 0).points
+            found.append([drawn.tobytes(), *(each.tobytes() for each in fitted(points, np.eye(2, 31), 8, 0))])
+    assert found[0] == found[1]
