@@ -140,10 +140,8 @@ def put_cubic_slope(_: Any, out: Any, at: Any, factor: Any, d: Any, table: Any, 
     """out[at + p] = factor * (c1 + d (2 c2 + 3 d c3)) for p below `lanes_of`, with ck as in `add_cubic`."""
 
     def generate(context: Any, builder: Any, signature: Any, given: Any) -> Any:
-        factors = _broadcast(builder, given[2], _lanes(out))
-        value = builder.fmul(factors, _cubic_slope(context, builder, given[3], table, *given[4:]))
-        place = _several(context, builder, out, given[0], given[1])
-        builder.store(value, place, align=_alignment(value.type))
+        values = _cubic_slope(context, builder, given[3], table, *given[4:])
+        _put(builder, _several(context, builder, out, given[0], given[1]), given[2], values)
         return context.get_dummy_value()
 
     return _signature(out, at, factor, d, table, begin, stride), generate
@@ -196,10 +194,8 @@ def put_cubic(_: Any, out: Any, at: Any, factor: Any, d: Any, table: Any, begin:
     """As `add_cubic`, in place of what was there."""
 
     def generate(context: Any, builder: Any, signature: Any, given: Any) -> Any:
-        factors = _broadcast(builder, given[2], _lanes(out))
-        value = builder.fmul(factors, _cubic(context, builder, given[3], table, *given[4:]))
-        place = _several(context, builder, out, given[0], given[1])
-        builder.store(value, place, align=_alignment(value.type))
+        values = _cubic(context, builder, given[3], table, *given[4:])
+        _put(builder, _several(context, builder, out, given[0], given[1]), given[2], values)
         return context.get_dummy_value()
 
     return _signature(out, at, factor, d, table, begin, stride), generate
@@ -286,6 +282,12 @@ def _sum(builder: Any, values: Any) -> Any:
         low, high = (builder.shuffle_vector(values, values, each) for each in places)
         values = builder.fadd(low, high)
     return builder.extract_element(values, ir.IntType(32)(0))
+
+
+def _put(builder: Any, place: Any, factor: Any, values: Any) -> None:
+    """Products stored where a pointer points to."""
+    product = builder.fmul(_broadcast(builder, factor, values.type.count), values)
+    builder.store(product, place, align=_alignment(values.type))
 
 
 def _add(builder: Any, place: Any, factor: Any, values: Any) -> None:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from aolink.estimation.compiled.likelihoods import gradients_of_row, log_likelihoods_and_gradients
-from tests.estimation.compiled.test_pixels import KINDS, MANY, PLANES, looked_at, looked_at_plane
+from tests.estimation.compiled.test_pixels import KINDS, MANY, PLANES, looked_at, looked_at_plane, three_spots
 
 ALL = pytest.mark.parametrize("kind", [*KINDS, *PLANES])
 
@@ -54,19 +54,11 @@ def test_points_have_the_same_gradient_wherever_they_are_among_others(kind):
 def test_the_gradient_of_several_spots_is_the_sum_of_theirs():
     view, _, state = looked_at_plane("round", 9)
     one, t = view.seen, np.ascontiguousarray(drawn(view, state).transpose(0, 2, 1))
-    spots = [
-        one._replace(
-            y=one.y * (1 + spot), usable=np.roll(one.usable, spot, axis=3), inputs=one.inputs + 0.1 * spot,
-            basis=np.ascontiguousarray(one.basis[:: -1 if spot == 1 else 1]),
-        )
-        for spot in range(3)
-    ]  # fmt: skip
-    axes = (("y", 1), ("usable", 1), ("inputs", 1), ("basis", 0))
-    joined = {name: np.concatenate([getattr(spot, name) for spot in spots], axis=axis) for name, axis in axes}
+    spots, joined = three_spots(one)
     out, apart, together = np.empty((1, MANY)), np.zeros_like(t), np.zeros_like(t)
     for spot in spots:
         log_likelihoods_and_gradients(spot, t, out, apart)  # which adds them
-    log_likelihoods_and_gradients(one._replace(**joined), t, out, together)
+    log_likelihoods_and_gradients(joined, t, out, together)
     np.testing.assert_allclose(together, apart, rtol=1e-9, atol=1e-9 * np.abs(apart).max())
 
 

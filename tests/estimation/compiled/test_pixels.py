@@ -339,14 +339,8 @@ def test_the_likelihood_of_a_spot_on_a_plane_is_that_of_the_twin(kind, masked):
     assert masked == 0 or not np.allclose(theirs, looked_at_plane(kind, 0)[1].log_likelihoods(t))
 
 
-@pytest.mark.parametrize("gain", [0.0, 0.01])
-def test_the_likelihood_of_several_spots_is_the_product_of_theirs(gain):
-    view, _, state = looked_at_plane("round", 9)
-    one = view.seen._replace(gain=gain * view.seen.y.max())
-    t = np.random.default_rng(6).standard_normal((1, view.reduced.size, MANY)) * 0.3
-    t += view.reduced.prior(state).mean[:, :, None]
-    together, apart = np.empty((1, MANY)), np.empty((3, 1, MANY))
-    # Each spot has frame, path and bad pixels of its own.
+def three_spots(one):
+    """Three spots, each with a frame, a path and bad pixels of its own, made from one; and all of them together."""
     spots = [
         one._replace(
             y=one.y * (1 + spot), usable=np.roll(one.usable, spot, axis=3), inputs=one.inputs + 0.1 * spot,
@@ -354,13 +348,24 @@ def test_the_likelihood_of_several_spots_is_the_product_of_theirs(gain):
         )
         for spot in range(3)
     ]  # fmt: skip
-    for spot, out in zip(spots, apart, strict=True):
-        log_likelihoods(spot, t, out)
     joined = {
         name: np.concatenate([getattr(spot, name) for spot in spots], axis=axis)
         for name, axis in (("y", 1), ("usable", 1), ("inputs", 1), ("basis", 0))
     }
-    log_likelihoods(one._replace(**joined), t, together)
+    return spots, one._replace(**joined)
+
+
+@pytest.mark.parametrize("gain", [0.0, 0.01])
+def test_the_likelihood_of_several_spots_is_the_product_of_theirs(gain):
+    view, _, state = looked_at_plane("round", 9)
+    one = view.seen._replace(gain=gain * view.seen.y.max())
+    t = np.random.default_rng(6).standard_normal((1, view.reduced.size, MANY)) * 0.3
+    t += view.reduced.prior(state).mean[:, :, None]
+    together, apart = np.empty((1, MANY)), np.empty((3, 1, MANY))
+    spots, joined = three_spots(one)
+    for spot, out in zip(spots, apart, strict=True):
+        log_likelihoods(spot, t, out)
+    log_likelihoods(joined, t, together)
     np.testing.assert_allclose(together, apart.sum(axis=0), rtol=1e-12)
     assert len(np.unique(apart[:, 0, 0])) == 3
 
