@@ -171,7 +171,7 @@ def draw_intensity(
         axes.text(0.5, 0.5, "no pixel\narrived", ha="center", va="center", transform=axes.transAxes)
     for name, (path,) in paths_of(exposure, estimates, [output]).items():
         predicted = sensor.light_of(output) * exposure_density(line.kernel, line.edges, path)
-        width = 1.5 if name == "truth" else 1.0
+        width = 1.8 if name == "truth" else 1.3
         axes.stairs(predicted, line.edges, orientation=orientation, color=colour(name), linewidth=width, label=name)
 
 

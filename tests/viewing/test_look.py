@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from aolink.jobs.demo import simulated_rig
+from aolink.optics.kernel import exposure_density
 from aolink.recording.reader import Recording
 from aolink.recording.reestimate import write_reestimated
 from aolink.rig import load_rig
@@ -36,6 +37,37 @@ def test_one_exposure_has_every_step_of_its_paths_and_nothing_of_others(aolink: 
     layout = str(read_blueprint(tmp_path / "one.rrd"))
     assert "Path; time at a position; intensity" in layout
     assert "Latency" not in layout
+
+
+def test_a_layout_about_an_exposure_has_a_few_views_of_it_and_all_exposures_are_there(tmp_path: Path) -> None:
+    recording = Recording(RECORDINGS / "moving-scene.mcap")
+    path = save_rrd(recording, tmp_path / "about.rrd", look=Look(about=9))
+    entities, layout = read_rrd(path), read_blueprint(path)
+    assert len(entities["/camera/image"]["frame"]) == len(recording)
+    estimates = recording.estimates("o1")
+    np.testing.assert_array_equal(
+        scalars(entities["/path/o1/mean"])[:, 0], np.concatenate([e.path[0] for e in estimates])
+    )
+    assert "/profile/path/o1" not in entities
+    drawn = np.array(entities["/profile/predicted/o1"]["LineStrips2D:strips"][-len(recording) :][9][0])
+    kernel, sensor = recording.rig.sensor.profile.kernel, recording.rig.sensor.profile
+    expected = exposure_density(kernel, sensor.edges, estimates[9].path[0])
+    np.testing.assert_allclose(-drawn[:, 1] / -drawn[:, 1].min(), expected / expected.max(), atol=1e-3)
+    names = [str(name) for view in layout.values() for name in view.get("ViewBlueprint:display_name", [])]
+    assert sorted(names) == [
+        "['Camera: 8 exposures (pixels), paths in their blur']",
+        "['Intensity (1/slope unit) over slope: measured, and predicted']",
+        *[f"['Path, {name}, 95 % band (slope units)']" for name in ("moments", "o1", "o2", "o3", "open-loop")],
+        "['Scene as it came (pixels)']",
+        "['Scene at rest (truth) (pixels)']",
+    ]
+    truth = recording[9].truth
+    assert truth is not None
+    columns = (truth.path[0] - sensor.field[0]) / sensor.pixel_width
+    bounds = [each for view in layout.values() for row in view.get("VisualBounds2D:range", []) for each in row]
+    near = [each for each in bounds if each["y_range"] == [5.0, 13.0]]  # rows of the page
+    assert len(near) == 1
+    assert near[0]["x_range"][0] <= columns.min() < columns.max() <= near[0]["x_range"][1] < sensor.pixels
 
 
 def test_a_part_has_the_exposures_that_begin_in_it(aolink: Aolink, tmp_path: Path) -> None:

@@ -122,6 +122,20 @@ def test_a_screenshot_shows_the_layout(rrd: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.long
+def test_a_screenshot_is_of_the_time_that_is_asked_for(rrd: Path, tmp_path: Path) -> None:
+    """The camera's view, in the corner, has another exposure's row framed."""
+    try:
+        corners = [
+            pixels(screenshot(rrd, tmp_path / f"{k}.png", at_ns=at_ns).read_bytes())[:300, :400]
+            for k, at_ns in enumerate([100_000_000, 100_000_000, 900_000_000])
+        ]
+    except ViewerError as error:
+        needs_a_renderer(error)
+    np.testing.assert_array_equal(corners[0], corners[1])
+    assert (corners[0] != corners[2]).any()
+
+
+@pytest.mark.long
 def test_a_viewer_ends_with_its_block_whatever_happens_in_it(rrd: Path) -> None:
     viewers: list[psutil.Process] = []
 
