@@ -56,6 +56,8 @@ class EstimatorRow:
     """Engines that it can run on."""
     wanders: bool = False
     """Whether it follows a plant with ``plant.wandering``; it has to model the noise inside an exposure."""
+    loops: Callable[[Rig], tuple[str, ...]] = lambda rig: ()
+    """The groups of compiled loops (`compiled.GROUPS`) that it needs on a rig, beside those that all need."""
     in_demo: Callable[[Rig], bool] = lambda rig: True
     """Whether it is fast enough on a rig for `aolink demo`."""
 
@@ -94,6 +96,7 @@ def make_estimator(rig: Rig, name: str, **options: Any) -> Estimator:
         There is no such estimator or option, or it cannot work on this rig.
     """
     # Not before: whoever wants no more of a row than its colour and rank waits for none of these.
+    from aolink.estimation.compiled import make_ready
     from aolink.estimation.estimator import Estimator
     from aolink.estimation.model.exposure_model import exposure_model
     from aolink.estimation.options import checked_options, with_options
@@ -107,6 +110,8 @@ def make_estimator(rig: Rig, name: str, **options: Any) -> Estimator:
             f"engine {chosen.engine!r} runs {able} on a plant of one axis, this is {name} with"
             f" plant.axes = {rig.plant.axes}: use engine 'aolink'"
         )
+
+    make_ready(*_shared_loops(rig), *row.loops(rig))
 
     def made(rig: Rig) -> Estimator:
         # Code that the first exposure would load or compile is ready before the session.
@@ -154,6 +159,19 @@ def _pixels_refusal(name: str) -> Callable[[Rig], str | None]:
     return refusal
 
 
+def _shared_loops(rig: Rig) -> tuple[str, ...]:
+    if alike_systems(rig.plant) is not None:
+        return ("larger plants", "many spots")
+    small = (rig.plant.n_states, rig.plant.n_inputs, rig.plant.n_outputs) == (2, 1, 1)
+    return ("o1 to o3 and moments",) if small else ("o1 to o3 and moments", "larger plants")
+
+
+def _pixels_loops(rig: Rig) -> tuple[str, ...]:
+    if alike_systems(rig.plant) is not None:
+        return ()
+    return ("profile",) if rig.sensor.directions == 1 else ("profile of spots",)
+
+
 def _is_quick_for_mixture(rig: Rig) -> bool:
     """Whether `mixture` is quick enough for a demo: on a line sensor, where it does not temper points in nearly every
     exposure. For spots on a plane the filters that use every pixel are too slow."""
@@ -195,15 +213,15 @@ _OURS = {
         ),
         EstimatorRow(
             name="profile", rank=50, colour=(140, 210, 80), build=_built("profile"),
-            refusal=_pixels_refusal("profile"), wanders=True, in_demo=_is_quick_for_profile,
+            refusal=_pixels_refusal("profile"), loops=_pixels_loops, wanders=True, in_demo=_is_quick_for_profile,
         ),
         EstimatorRow(
             name="mixture", rank=60, colour=(240, 80, 140), build=_built("mixture"),
-            refusal=_pixels_refusal("mixture"), wanders=True, in_demo=_is_quick_for_mixture,
+            refusal=_pixels_refusal("mixture"), loops=_pixels_loops, wanders=True, in_demo=_is_quick_for_mixture,
         ),
         EstimatorRow(
             name="sampled", rank=70, colour=(190, 130, 80), build=_built("sampled"),
-            refusal=_pixels_refusal("sampled"), wanders=True, in_demo=lambda rig: False,
+            refusal=_pixels_refusal("sampled"), loops=_pixels_loops, wanders=True, in_demo=lambda rig: False,
         ),
     )
 }  # fmt: skip
