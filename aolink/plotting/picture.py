@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from aolink.errors import ExportError
+from aolink.extensions import install_command
 from aolink.files import writing
 from aolink.plotting.exposure import plot_exposure
 from aolink.plotting.overview import Overview, need_exposures, overview
@@ -45,7 +46,7 @@ def draw_session(series: Series, path: str | Path) -> Path:
         import matplotlib as mpl
         from matplotlib.figure import Figure
     except ImportError:
-        raise ExportError("a picture without the viewer needs matplotlib: pip install 'aolink[plot]'") from None
+        raise ExportError(f"a picture without the viewer needs matplotlib: {install_command('plot')}") from None
     view = overview(series)
     need_exposures(view)
     with mpl.rc_context(_STYLE):

@@ -13,6 +13,7 @@ from PIL import Image
 
 from aolink.colours import estimator_colour
 from aolink.errors import ExportError
+from aolink.extensions import install_command
 from aolink.plotting import draw_session
 from aolink.recording.reader import Recording
 from tests.needs import needed
@@ -98,4 +99,4 @@ def test_without_matplotlib_the_demo_says_what_to_install(tmp_path: Path) -> Non
     assert result.returncode == 0, result.stderr
     (line,) = [each for each in result.stdout.splitlines() if each.startswith("picture")]
     assert line.startswith("picture   none: this machine has no Vulkan driver")
-    assert line.endswith("a picture without the viewer needs matplotlib: pip install 'aolink[plot]'")
+    assert line.endswith(f"a picture without the viewer needs matplotlib: {install_command('plot')}")
