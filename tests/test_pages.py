@@ -173,7 +173,7 @@ def run(command: str, folder: Path, answers: str = "") -> subprocess.CompletedPr
     )
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("block", SHELL, ids=str)
 def test_a_block_of_commands_works(block: CodeBlock, laboratory: Path, tmp_path: Path) -> None:
     """Devices are simulated ones behind pseudo terminals; what a command writes is not there before it."""
@@ -202,7 +202,7 @@ def test_a_block_of_commands_works(block: CodeBlock, laboratory: Path, tmp_path:
             assert (folder / target[1]).exists(), command
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_block_of_signed_packets_works(tmp_path: Path) -> None:
     """On loopback: a test does not open a port to other machines."""
     (block,) = (block for block in BLOCKS if block.text.startswith("(umask"))
@@ -216,7 +216,7 @@ def test_the_block_of_signed_packets_works(tmp_path: Path) -> None:
     assert Recording(tmp_path / "signed.mcap").complete
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("block", PYTHON, ids=str)
 def test_a_block_of_python_works(block: CodeBlock, laboratory: Path, tmp_path: Path) -> None:
     """As a program of its own, in a folder that has a recording; a file that it writes is one that aolink takes."""
@@ -244,7 +244,7 @@ def test_a_block_of_toml_is_of_a_rig_file_or_of_the_example_package(block: CodeB
         parse_rig(f"{before}\n{block.text}")
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("block", [block for block in BLOCKS if block.language in ENGINES], ids=str)
 def test_a_block_for_an_engine_works(block: CodeBlock, laboratory: Path, tmp_path: Path) -> None:
     """Where the engine is installed; of Slurm only what a task is needs to be there. All recordings have side files."""

@@ -188,7 +188,7 @@ MIDST: dict[str, Callable[[Started], bool]] = {
 """What shows that a command is in the midst of its work; that of the others shows nowhere."""
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("command", MIDST)
 def test_a_signal_in_the_midst_leaves_nothing_half(tmp_path: Path, places: dict[str, str], command: str) -> None:
     for number in range(8):  # a short job may be done before the signal comes
@@ -209,7 +209,7 @@ def test_a_signal_in_the_midst_leaves_nothing_half(tmp_path: Path, places: dict[
     pytest.fail("it was done before the signal each time")
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_demo_that_ends_after_recording_says_where_the_recording_is(tmp_path: Path, places: dict[str, str]) -> None:
     with Started(tmp_path, COMMANDS["demo"]) as started:
         assert started.wait_until(lambda: MIDST["demo"](started))
@@ -221,7 +221,7 @@ def test_a_demo_that_ends_after_recording_says_where_the_recording_is(tmp_path: 
         started.assert_nothing_half_is_left()
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_batch_ends_in_good_order_with_its_processes(tmp_path: Path, places: dict[str, str]) -> None:
     models = ",".join(str(1 + k) for k in range(200))
     with Started(
@@ -256,7 +256,7 @@ def test_a_terminal_that_closes_ends_a_command(tmp_path: Path) -> None:
         assert process.wait(_PATIENCE_S) == 129
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_nohup_is_respected(tmp_path: Path, places: dict[str, str]) -> None:
     ignore = {"preexec_fn": lambda: signal.signal(signal.SIGHUP, signal.SIG_IGN)}
     with Started(tmp_path, COMMANDS["record"].format(**places), **ignore) as started:

@@ -63,7 +63,7 @@ def test_the_scene_is_the_one_that_is_drawn(tmp_path: Path) -> None:
     assert np.abs(made - there).mean() < 0.5
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_reference_recordings_can_be_made_anew(tmp_path: Path) -> None:
     done = run(TOOLS / "recordings", "--out", tmp_path, "--exposures", "2")
     assert done.returncode == 0, done.stderr
@@ -75,7 +75,7 @@ def test_the_reference_recordings_can_be_made_anew(tmp_path: Path) -> None:
         assert recording.estimators == there.estimators
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_bad_inputs_find_nothing() -> None:
     done = run(TOOLS / "fuzz", "--count", "20", "--from", "1000")
     assert done.returncode == 0, done.stdout + done.stderr
@@ -93,7 +93,7 @@ def test_a_kind_of_inputs_that_there_is_not_is_an_error() -> None:
 # The benchmark
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_row_that_fails_says_so_and_the_others_go_on() -> None:
     """Rows of restoration need scikit-image: without it they fail, and the row before and the one after do not."""
     code = (
@@ -111,7 +111,7 @@ def test_a_row_that_fails_says_so_and_the_others_go_on() -> None:
     assert "Traceback" in done.stderr
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_rows_that_work_end_well() -> None:
     done = run(TOOLS / "bench", "--short", "turbulence", "recording_rate")
     assert done.returncode == 0, done.stderr
@@ -160,7 +160,7 @@ def test_every_row_that_is_written_is_in_the_table(group: str, monkeypatch: pyte
     assert written == set(groups[group])
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["demo", "method", "scene", "pupil", "loop"])
 def test_pictures_are_made_and_are_those_of_the_pages(name: str, tmp_path: Path) -> None:
     """Short ones; README and the gallery show the repository's own, which are small."""
