@@ -18,7 +18,9 @@ _start = pytest.StashKey[float]()
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    parser.addoption("--slow-limit", type=float, metavar="SECONDS", help="what a case may take without being marked slow")
+    parser.addoption(
+        "--slow-limit", type=float, metavar="SECONDS", help="what a case may take without being marked slow"
+    )
     parser.addoption("--costs", type=Path, metavar="FILE", help="where to add a line for what each case takes")
 
 

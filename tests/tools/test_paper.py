@@ -191,7 +191,7 @@ def test_the_noise_of_an_exposure_is_that_of_its_steps(page: str, rig: Rig) -> N
     plant = rig.plant
     step = plant.B_w @ plant.process_noise @ plant.B_w.T
     powers = [np.linalg.matrix_power(plant.A, i) for i in range(rig.timing.exposure_steps)]
-    Q = sum(power @ step @ power.T for power in powers)
+    Q = np.sum([power @ step @ power.T for power in powers], axis=0)
     for state, printed in ((2, 2.5e-4), (1, 0.0)):
         cells = row(page, f"noise of one exposure, variance of x_{state}")
         expected = Q[state - 1, state - 1]
