@@ -347,13 +347,6 @@ def test_the_list_of_keys_is_that_of_the_keys_that_the_readers_ask_for() -> None
     assert asked == KEYS
 
 
-def test_the_page_names_every_key() -> None:
-    page = (Path(tables.__file__).parent / "README.md").read_text()
-    top = {"control", "drive", "lenslets", "mirror", "plant", "scene", "sensor", "simulation", "timing"}
-    named = set(re.findall(r"\b[A-Za-z_0-9]+\b", "".join(re.findall(r"`[^`]+`", page))))
-    assert named | top >= KEYS
-
-
 MODELS = {
     "resonance": 'kind = "resonance"\nfrequency_hz = 12.0\ndamping = 0.05\nsd = 0.2',
     "ornstein-uhlenbeck": 'kind = "ornstein-uhlenbeck"\ncorrelation_s = 0.1\nsd = 0.2',
