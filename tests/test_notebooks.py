@@ -31,7 +31,7 @@ def test_a_notebook_is_kept_without_outputs(notebook: Path) -> None:
     assert notebook.stat().st_size < 10_000
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("notebook", NOTEBOOKS, ids=lambda path: path.stem)
 def test_a_notebook_runs(notebook: Path, tmp_path: Path) -> None:
     """By nbclient, as `jupyter execute` does, in a folder of its own."""

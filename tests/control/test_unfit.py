@@ -78,7 +78,7 @@ def test_inputs_that_grow_beyond_numbers_are_an_unstable_loop(aolink: Run, with_
     assert "the loop of huge on loop is unstable: by the model a disturbance is inf times as large" in line
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_one_that_fails_in_a_session_parks_the_mirror_and_says_so(
     aolink: Run, with_unfit: dict[str, str], session: Path, tmp_path: Path
 ) -> None:

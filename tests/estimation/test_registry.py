@@ -71,7 +71,7 @@ def test_an_option_that_makes_no_sense_is_named(text, message):
         make_estimator(load_rig("section-vi-lively"), text)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_options_of_a_session_go_with_the_recording(aolink, tmp_path):
     """Beside the loop in real time; and all that reads the recording has the same estimator."""
     names = ("-e", "o3:second_order", "-e", "o3")
@@ -94,7 +94,7 @@ def test_the_demo_runs_what_is_fast_on_the_rig():
     assert possible_estimators(load_rig("tip-tilt")) == ("open-loop", "o1", "o2", "o3", "moments")
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_an_installed_package_adds_an_estimator(aolink, with_example, tmp_path):
     """In a session, when it is estimated again, in the list of all, and in the viewer's palette."""
     with simulated_rig("section-vi-lively") as (camera, mirror):
@@ -124,7 +124,7 @@ def test_an_installed_package_adds_an_estimator(aolink, with_example, tmp_path):
     assert "there is no estimator 'threshold'" in alone.stderr
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("value", "why"),
     [

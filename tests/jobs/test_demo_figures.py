@@ -44,7 +44,7 @@ def printed(tmp_path_factory: pytest.TempPathFactory) -> Rows:
     return table(done.stdout)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_demo_prints_what_readme_says(readme: Rows, printed: Rows) -> None:
     """To a unit of the last digit on x86-64, whatever its vector units are."""
     assert list(readme) == list(printed)

@@ -48,7 +48,7 @@ def test_every_part_shows_its_estimators(tmp_path: Path) -> None:
     assert coloured(session, estimator_colour("o1")).sum() == 0
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_without_a_truth_and_estimates_the_blur_is_drawn_and_errors_are_not(tmp_path: Path) -> None:
     bare = Recording(write_small(tmp_path / "bare.mcap", 3, rig="sh-4x4"))
     session, _, errors = parts(pixels(draw_session(bare, tmp_path / "a.png")))
@@ -63,7 +63,7 @@ def test_what_cannot_be_drawn_or_written_is_one_clear_error(tmp_path: Path) -> N
         draw_session(Recording(LIVELY), tmp_path / "absent" / "a.png")
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.usefixtures("without_vulkan")
 def test_the_demo_draws_it_and_names_the_package(
     aolink: Callable[..., subprocess.CompletedProcess[str]], tmp_path: Path
@@ -79,7 +79,7 @@ def test_the_demo_draws_it_and_names_the_package(
     assert coloured(pixels(folder / "session.png"), estimator_colour("moments")).sum() > 200
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.usefixtures("without_vulkan")
 def test_without_matplotlib_the_demo_says_what_to_install(tmp_path: Path) -> None:
     code = "import sys; sys.modules['matplotlib'] = None; from aolink.cli import main; main()"

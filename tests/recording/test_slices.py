@@ -135,7 +135,7 @@ def test_an_exposure_that_is_damaged_is_an_error_of_its_own(recorded: Session, t
         recording[11]
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_slice_reads_little_of_a_long_file(long_recording: Path) -> None:
     recording = aolink.read(long_recording)
     whole = bytes_read(lambda: list(recording))

@@ -111,7 +111,7 @@ def recorded(
         return None, str(error)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_dead_line_ends_the_session_and_the_mirror_stays_parked_until_it_is_told(
     rig_file: Path, tmp_path: Path, aolink: Callable[..., subprocess.CompletedProcess[str]]
 ) -> None:
@@ -134,7 +134,7 @@ def test_a_dead_line_ends_the_session_and_the_mirror_stays_parked_until_it_is_to
     assert (again.ended, again.rearmed) == ("complete", 1)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_line_that_comes_back_is_told_to_go_on_and_the_gap_is_recorded(rig_file: Path, tmp_path: Path) -> None:
     rig = load_rig(rig_file)
     with line_of(rig_file) as (camera, line):

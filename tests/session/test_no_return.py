@@ -30,7 +30,7 @@ def ports() -> Iterator[tuple[str, str]]:
         yield ports
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("seed", "why"),
     [
@@ -100,7 +100,7 @@ def test_a_session_is_interrupted_while_a_port_is_gone(ports: tuple[str, str], t
     assert Recording(path).complete
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_rig_whose_ports_vanish_by_its_rate(aolink: Run) -> None:
     with simulated_rig("section-vi", "--real-time", "--fault", "vanish=0.01", "--fault", "vanish_s=0.3") as ports:
         camera, mirror = ports

@@ -143,7 +143,7 @@ def first_session(rig, name, noise, exposures):
     return map(int, out.split())
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["profile", "mixture"])
 def test_nothing_is_compiled_in_a_session(name):
     before, after, several = first_session("section-vi-lively", name, 0.003, 30)
@@ -157,7 +157,7 @@ def test_nothing_is_compiled_in_a_session_of_moments(name):
     assert before == after > 1
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("rig", "name"), [("membrane-12x12", "profile"), ("membrane-12x12", "moments"), ("single-lenslet", "mixture")]
 )

@@ -72,7 +72,7 @@ def test_modes_stay_lost_whether_or_not_processes_can_be_told_apart():
     assert modes_stay_lost(dataclasses.replace(rig, plant=with_late_step(rig.plant)))
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_where_modes_stay_lost_more_of_the_windowed_moments_share_is_left():
     """With a quarter of it, and without the points that importance sampling misses, 95 % intervals held 0.92 of the
     path, and the end state's normalised error was 1.7."""
@@ -119,7 +119,7 @@ def test_a_spot_that_windowed_moments_find_is_not_tempered():
     assert not any("tempered" in estimator.step(exposure).reason for exposure in simulate(LIVELY, 4, seed=1))
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_several_vibrations_are_within_their_intervals():
     """With modes alone 95 % intervals held 80 % of the path, and the end state's normalised error was five.
 
@@ -282,7 +282,7 @@ def test_a_demo_leaves_profile_out_where_it_is_mixture():
     assert not in_demo(BRIGHT)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_intervals_hold_where_importance_sampling_is_too_sure():
     """If points are tempered only where their weights or the windowed moments show that it is needed, 95 % intervals
     hold 0.85 of the path, and the NEES is 1.74 times its expectation; if the windowed moments have the weights of the
