@@ -99,7 +99,7 @@ def code_blocks(page: Path) -> Iterator[CodeBlock]:
 BLOCKS = [block for page in PAGES for block in code_blocks(page)]
 NO_CODE = {
     "estimator   RMSE start": "test_demo_figures.py runs the demo and compares",
-    "errors, files, limits, signals": "test_the_architecture_names_what_there_is",
+    "errors, files, limits, signals": "the list of subpackages",
     "Copyright (c)": "a licence",
     "MIT License": "a licence",
     "(umask": "test_the_block_of_signed_packets_works",
@@ -265,22 +265,6 @@ def test_every_block_is_of_a_kind_that_is_tried() -> None:
     assert PYTHON
     for start in NO_CODE:
         assert any(block.text.startswith(start) for block in BLOCKS), f"no page has a block that begins with {start!r}"
-
-
-def test_the_architecture_names_what_there_is() -> None:
-    """The list of subpackages: each of its names is a module or a folder, and every one of them is in it."""
-    (block,) = [block for block in BLOCKS if block.text.startswith("errors, files, limits, signals")]
-    named = {name for line in block.text.splitlines() for name in re.split(r", ", re.split(r" {2,}", line)[0])}
-    there = {path.stem for path in (ROOT / "aolink").iterdir() if path.suffix == ".py" or path.is_dir()}
-    assert named == there - {"__init__", "__main__", "__pycache__"}
-
-
-@pytest.mark.parametrize("page", sorted(ROOT.glob("aolink/*/README.md")), ids=lambda page: page.parent.name)
-def test_the_page_of_a_package_names_each_of_its_modules(page: Path) -> None:
-    code = " ".join(re.findall(r"`([^`\n]+)`", page.read_text()))
-    named = {*re.findall(r"\w+", code), "__init__", "__main__"}
-    modules = {module.stem for module in page.parent.rglob("*.py")}
-    assert {name for name in modules if not name.endswith("_pb2")} <= named
 
 
 def test_commands_in_the_text_have_the_options_that_they_are_given() -> None:

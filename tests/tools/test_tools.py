@@ -27,20 +27,6 @@ def run(*command: str | Path, environment: dict[str, str] | None = None) -> subp
     return subprocess.run(arguments, capture_output=True, text=True, timeout=600, cwd=ROOT, env=environment)
 
 
-def test_every_program_is_run_somewhere() -> None:
-    """Whoever adds one decides here, or in .ci/run, where it is tried."""
-    programs = {each.name for each in TOOLS.iterdir() if each.is_file() and each.read_bytes()[:2] == b"#!"}
-    by_ci, here, by_their_own_tests = (
-        {"demo", "test", "bench", "fuzz"},
-        {"pictures", "protocol", "recordings", "scene"},
-        {"family", "paper"},
-    )
-    assert programs == by_ci | here | by_their_own_tests
-    ci = (ROOT / ".ci" / "run").read_text()
-    for name in by_ci:
-        assert f"tools/{name}" in ci
-
-
 def test_what_protocol_generates_is_what_is_there(tmp_path: Path) -> None:
     needed("grpc_tools")
     done = run(TOOLS / "protocol", "--out", tmp_path)
