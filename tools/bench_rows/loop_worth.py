@@ -125,7 +125,7 @@ class Size:
 
 FULL = Size()
 FRESH = Size(seeds=range(910, 914))
-"""Seeds on which nothing was tuned, and which nobody had looked at when the identification was built."""
+"""Other seeds than those with which the identification was built."""
 SHORT = Size(seeds=range(1, 3), past=64, exposures=6, settled=3, gains=GAINS[:1])
 
 
