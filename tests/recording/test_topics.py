@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ast
 import importlib
-import re
 from pathlib import Path
 
 import pytest
@@ -35,8 +34,6 @@ def test_every_function_that_shows_messages_of_devices_is_in_the_table() -> None
 def test_every_topic_is_shown_by_a_function_of_the_viewer(row: Topic) -> None:
     module, function = row.shown_by.split(".")
     assert callable(getattr(importlib.import_module(f"aolink.viewing.{module}"), function))
-    page = (PACKAGE / "viewing" / "README.md").read_text()
-    assert any(f"`{module}`" in line.split("|")[-2] for line in page.splitlines() if line.startswith("| `"))
 
 
 def test_nothing_shows_a_topic_that_is_not_in_the_table() -> None:
@@ -67,23 +64,6 @@ def test_topics_are_written_in_the_table_alone() -> None:
         texts = {each for each in found if isinstance(each, ast.Constant) and isinstance(each.value, str)}
         assert not {each.value for each in texts - {*parts}} & names, path
         assert not [each.value for each in texts if str(each.value).startswith(entities)], path
-
-
-def test_the_page_has_the_table() -> None:
-    def cell(text: str) -> str:
-        return f"`{text}`" if text else ""
-
-    page = (PACKAGE / "recording" / "README.md").read_text()
-    found = [re.sub(r" +", " ", line) for line in page.splitlines() if line.startswith("| `")]
-    assert found == [
-        re.sub(
-            r" +",
-            " ",
-            f"| {cell(row.name)} | `{row.message.DESCRIPTOR.name}` | {row.belongs_to} | {cell(row.after)}"
-            f" | {'yes' if row.repeatable else ''} | {cell(row.shown_by)} |",
-        )
-        for row in TOPICS
-    ]
 
 
 def test_the_page_for_other_software_names_every_topic() -> None:
