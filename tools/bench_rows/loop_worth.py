@@ -280,8 +280,8 @@ def _from_path(cell: Cell, whole: DisturbanceRun, past: int) -> ProcessSum:
 
 def worth_headline(effort: Effort) -> list[Row]:
     """Turbulence and a vibration of equal sd at 2.4 and 2.7 times the frame rate, which centroids cannot reach; in a
-    whole run on fresh seeds as well."""
-    fresh = [] if effort.share < 1 else _rows(HEADLINE, effort, FRESH, "fresh seeds")
+    whole run on other seeds as well."""
+    fresh = [] if effort.share < 1 else _rows(HEADLINE, effort, FRESH, "other seeds")
     return [*_rows(HEADLINE, effort), *fresh]
 
 
