@@ -144,7 +144,7 @@ def _pixels_refusal(name: str) -> Callable[[Rig], str | None]:
         if rig.plant.n_states > MANY_STATES:
             alike = " that does not consist of equal systems side by side" if name == "profile" else ""
             return (
-                f"{name} follows the posterior's modes for at most {MANY_STATES} states of one plant, {rig.name} has"
+                f"{name} takes at most {MANY_STATES} states of one plant, {rig.name} has"
                 f" {rig.plant.n_states}{alike}: use {'o3' if alike else 'profile or moments'}"
             )
         if reason := _many_spots_refusal(rig, name):  # its widest Gaussian is found by windowed moments

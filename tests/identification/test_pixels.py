@@ -72,7 +72,7 @@ def test_the_pixels_decide_whatever_the_likelihood_of_centroid_and_width_says(cy
 
 def test_without_evidence_the_order_stays():
     def refused(x):
-        raise EstimatorError("profile follows the posterior's modes for at most 24 states")
+        raise EstimatorError("profile takes at most 24 states")
 
     found = [candidate(2.6, 0.0), candidate(2.4, -1.0)]
     assert by_pixels(found, shaken, []) == found
@@ -107,7 +107,7 @@ def test_a_scan_finds_a_vibration_far_from_every_maximum():
 
 def test_nothing_is_scanned_where_one_vibration_is_alone_or_there_are_no_pixels():
     def refused(x):
-        raise EstimatorError("profile follows the posterior's modes for at most 24 states")
+        raise EstimatorError("profile takes at most 24 states")
 
     def unasked(x):
         raise AssertionError("no rig is wanted")
