@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from zipfile import ZipFile
 
 import pytest
 from hypothesis import settings
@@ -72,8 +73,10 @@ def aolink(tmp_path: Path, command_server: CommandServer) -> Callable[..., subpr
 def with_example(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     """The environment of a process in which tests/example_package is installed."""
     folder = tmp_path_factory.mktemp("installed")
-    command = [sys.executable, "-m", "pip", "install", "-q", "--no-deps", "--no-build-isolation", "--no-index"]
-    subprocess.run([*command, "--target", folder, Path(__file__).parent / "example_package"], check=True)
+    build = [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", folder]
+    subprocess.run(build, cwd=Path(__file__).parent / "example_package", capture_output=True, check=True)
+    (wheel,) = folder.glob("*.whl")
+    ZipFile(wheel).extractall(folder)
     return {**os.environ, "PYTHONPATH": os.pathsep.join([str(folder), str(Path(__file__).parents[1])])}
 
 
