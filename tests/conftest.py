@@ -6,7 +6,7 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,10 +15,9 @@ from zipfile import ZipFile
 import pytest
 from hypothesis import settings
 
-from aolink.jobs.demo import simulated_rig
 from aolink.rig import Rig, load_rig, parse_rig
 from aolink.session import Report, record
-from tests.commands import TIMEOUT_S, CommandServer
+from tests.commands import TIMEOUT_S, command_server, simulated_rig
 
 ESTIMATORS = ("open-loop", "o1", "o2", "o3")
 EXPOSURES = 12
@@ -48,21 +47,13 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Session:
     return Session(path, report)
 
 
-@pytest.fixture(scope="session")
-def command_server() -> Iterator[CommandServer]:
-    """Where the commands of all tests of this worker are run."""
-    server = CommandServer()
-    yield server
-    server.close()
-
-
 @pytest.fixture
-def aolink(tmp_path: Path, command_server: CommandServer) -> Callable[..., subprocess.CompletedProcess[str]]:
+def aolink(tmp_path: Path) -> Callable[..., subprocess.CompletedProcess[str]]:
     """Run the command line in an empty folder."""
 
     def run(*arguments: str | Path, **options: Any) -> subprocess.CompletedProcess[str]:
         if options.keys() <= {"input"}:
-            return command_server.run([*map(str, arguments)], tmp_path, **options)
+            return command_server().run([*map(str, arguments)], tmp_path, **options)
         command = [sys.executable, "-m", "aolink", *map(str, arguments)]
         return subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, timeout=TIMEOUT_S, **options)
 

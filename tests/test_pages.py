@@ -27,11 +27,11 @@ from PIL import Image
 from typer.core import TyperGroup
 
 from aolink.cli.common import app
-from aolink.jobs.demo import simulated_rig
 from aolink.recording.reader import Recording
 from aolink.rig import load_rig, parse_rig
 from aolink.session import record
 from aolink.simulation.model import simulate
+from tests.commands import simulated_rig
 from tests.kinds import must_be
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tools"))
