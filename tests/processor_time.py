@@ -56,11 +56,7 @@ def pytest_runtest_makereport(
 ) -> Generator[None, pytest.TestReport, pytest.TestReport]:
     report = yield
     if call.when == "teardown":
-        taken_s, limit_s, costs = (
-            _taken_s() - _spared_s - _begun_s,
-            item.config.option.slow_limit,
-            item.config.option.costs,
-        )
+        taken_s, option = _taken_s() - _spared_s - _begun_s, item.config.option
         marks = [each for each in ("slow", "rare") if item.get_closest_marker(each)]
         if option.costs:
             with option.costs.open("a") as file:
