@@ -64,7 +64,7 @@ def aolink(tmp_path: Path) -> Callable[..., subprocess.CompletedProcess[str]]:
 def with_example(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     """The environment of a process in which tests/example_package is installed."""
     folder = tmp_path_factory.mktemp("installed")
-    build = [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", folder]
+    build = [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(folder)]
     subprocess.run(build, cwd=Path(__file__).parent / "example_package", capture_output=True, check=True)
     (wheel,) = folder.glob("*.whl")
     ZipFile(wheel).extractall(folder)
