@@ -16,7 +16,7 @@ import socket
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
 from importlib import import_module
 from pathlib import Path
@@ -68,15 +68,17 @@ class CommandServer:
             )  # fmt: skip
             _received(self._socket, 1)
 
-    def start(self, arguments: Sequence[str], folder: Path, streams: Sequence[int], *, apart: bool = False) -> int:
-        """Start a command with these streams, if ``apart`` out of reach of a Ctrl-C; gives its process."""
-        return self._asked([apart, dict(os.environ), str(folder), *arguments], streams)
+    def start(self, arguments: Sequence[str], folder: Path, streams: Sequence[int]) -> int:
+        """Start a command with these streams, out of reach of a Ctrl-C; gives its process."""
+        return self._asked([True, dict(os.environ), str(folder), *arguments], streams)
 
     def wait(self, process: int) -> int:
         """The exit code of a command that was started."""
         return self._asked([process], [0, 1, 2])
 
-    def run(self, arguments: Sequence[str], folder: Path, input: str = "") -> subprocess.CompletedProcess[str]:
+    def run(
+        self, arguments: Sequence[str], folder: Path, input: str = "", environment: Mapping[str, str] = os.environ
+    ) -> subprocess.CompletedProcess[str]:
         """Run a command to its end, with ``input`` as its standard input."""
         with (
             tempfile.TemporaryFile("w+") as stdin,
@@ -85,7 +87,8 @@ class CommandServer:
         ):
             stdin.write(input)
             stdin.seek(0)
-            code = self.wait(self.start(arguments, folder, [each.fileno() for each in (stdin, stdout, stderr)]))
+            streams = [each.fileno() for each in (stdin, stdout, stderr)]
+            code = self.wait(self._asked([False, dict(environment), str(folder), *arguments], streams))
             stdout.seek(0)
             stderr.seek(0)
             return subprocess.CompletedProcess([*arguments], code, stdout.read(), stderr.read())
@@ -116,7 +119,7 @@ def simulated_rig(rig: str | Path, *options: str) -> Iterator[tuple[str, str]]:
     their_input, our_end = os.pipe()
     ours, their_output = os.pipe()
     arguments = ["rig", str(rig), "--json", "--tied", *options]
-    process = command_server().start(arguments, Path.cwd(), [their_input, their_output, 2], apart=True)
+    process = command_server().start(arguments, Path.cwd(), [their_input, their_output, 2])
     os.close(their_input)
     os.close(their_output)
     with open(ours) as said:
