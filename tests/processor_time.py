@@ -8,38 +8,46 @@ from __future__ import annotations
 
 import os
 import resource
-from collections.abc import Generator
+from collections.abc import Generator, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 
 _TICKS = os.sysconf("SC_CLK_TCK")
-_start = pytest.StashKey[float]()
+_spared_s = _begun_s = 0.0
+
+
+@contextmanager
+def spared() -> Iterator[None]:
+    """What is set up in here is not the cost of the case that happens to need it first."""
+    global _spared_s
+    before_s, taken_s = _spared_s, _taken_s()
+    try:
+        yield
+    finally:
+        _spared_s = before_s + _taken_s() - taken_s
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    parser.addoption(
-        "--slow-limit", type=float, metavar="SECONDS", help="what a case may take without being marked slow"
-    )
-    parser.addoption("--costs", type=Path, metavar="FILE", help="where to add a line for what each case takes")
+    limit = "seconds of processor time that a case which is not marked slow may take"
+    parser.addoption("--slow-limit", type=float, metavar="SECONDS", help=limit)
+    parser.addoption("--costs", type=Path, metavar="FILE", help="where to add a line with what each case takes")
 
 
 @pytest.hookimpl(wrapper=True, tryfirst=True)
-def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object]:
-    item.stash[_start] = _taken_s()
+def pytest_runtest_protocol() -> Generator[None, object, object]:
+    global _begun_s
+    _begun_s = _taken_s() - _spared_s
     return (yield)
 
 
 @pytest.hookimpl(wrapper=True)
-def pytest_fixture_setup(
-    fixturedef: pytest.FixtureDef[object], request: pytest.FixtureRequest
-) -> Generator[None, object, object]:
-    before = _taken_s()
-    try:
+def pytest_fixture_setup(fixturedef: pytest.FixtureDef[object]) -> Generator[None, object, object]:
+    if fixturedef.scope != "session":
         return (yield)
-    finally:
-        if fixturedef.scope == "session" and _start in request._pyfuncitem.stash:
-            request._pyfuncitem.stash[_start] += _taken_s() - before
+    with spared():
+        return (yield)
 
 
 @pytest.hookimpl(wrapper=True)
@@ -48,14 +56,14 @@ def pytest_runtest_makereport(
 ) -> Generator[None, pytest.TestReport, pytest.TestReport]:
     report = yield
     if call.when == "teardown":
-        taken, limit, costs = _taken_s() - item.stash[_start], item.config.option.slow_limit, item.config.option.costs
+        taken_s, option = _taken_s() - _spared_s - _begun_s, item.config.option
         marks = [each for each in ("slow", "rare") if item.get_closest_marker(each)]
-        if costs:
-            with costs.open("a") as file:
-                file.write(f"{taken:.3f} {','.join(marks) or '-'} {item.nodeid}\n")
-        if limit and taken > limit and not marks and report.passed:
+        if option.costs:
+            with option.costs.open("a") as file:
+                file.write(f"{taken_s:.3f} {','.join(marks) or '-'} {item.nodeid}\n")
+        if option.slow_limit and taken_s > option.slow_limit and not marks and report.passed:
             report.outcome = "failed"
-            report.longrepr = f"{item.nodeid} takes {taken:.1f} s of processor time: shorten it, or mark it slow"
+            report.longrepr = f"{item.nodeid} takes {taken_s:.1f} s of processor time: shorten it, or mark it slow"
     return report
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import gzip
 import os
 import re
+import shlex
 import shutil
 import subprocess
 import sys
@@ -27,11 +28,11 @@ from PIL import Image
 from typer.core import TyperGroup
 
 from aolink.cli.common import app
-from aolink.jobs.demo import simulated_rig
 from aolink.recording.reader import Recording
 from aolink.rig import load_rig, parse_rig
 from aolink.session import record
 from aolink.simulation.model import simulate
+from tests.commands import command_server, simulated_rig
 from tests.kinds import must_be
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tools"))
@@ -162,12 +163,17 @@ def laboratory(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def run(command: str, folder: Path, answers: str = "") -> subprocess.CompletedProcess[str]:
-    """Run a shell command in a folder, with this Python's own programs first on the path and without a screen."""
+    """Run a command in a folder, with this Python's own programs first on the path and without a screen.
+
+    One of aolink's that needs no shell does not wait for a process to load.
+    """
     environment = {name: value for name, value in os.environ.items() if name not in ("DISPLAY", "WAYLAND_DISPLAY")}
     environment |= {
         "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}",
         "PYTHONPATH": f"{ROOT}{os.pathsep}{os.environ.get('PYTHONPATH', '')}",
     }
+    if command.startswith("aolink ") and not set(command) & set("*?[&|><$"):
+        return command_server().run(shlex.split(command)[1:], folder, answers, environment)
     return subprocess.run(
         ["sh", "-c", command], cwd=folder, env=environment, input=answers, capture_output=True, text=True, timeout=600
     )

@@ -21,9 +21,9 @@ from typing import Any, Self
 import pytest
 
 from aolink.cli.common import app
-from aolink.jobs.demo import simulated_rig
 from aolink.recording.editing import cut
 from aolink.recording.reader import Recording
+from tests.commands import simulated_rig
 from tests.conftest import Session
 from tests.kinds import must_be
 

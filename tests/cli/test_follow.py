@@ -11,10 +11,9 @@ from pathlib import Path
 import pytest
 
 from aolink import files
-from aolink.jobs.demo import simulated_rig
 from aolink.rig import load_rig
 from aolink.session import record
-from tests.commands import TIMEOUT_S
+from tests.commands import TIMEOUT_S, simulated_rig
 
 REFERENCE = Path(__file__).parents[2] / "recordings"
 EXPOSURES = 64

@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 from aolink.errors import ControlError
-from aolink.jobs.demo import simulated_rig
 from aolink.recording.reader import Recording
+from tests.commands import simulated_rig
 from tests.control.rigs import DRIFT, small_rig
 
 Run = Callable[..., "subprocess.CompletedProcess[str]"]

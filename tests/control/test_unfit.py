@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from aolink.errors import ControlError
-from aolink.jobs.demo import simulated_rig
 from aolink.recording.reader import Recording
 from aolink.rig import load_rig
 from aolink.session import record
+from tests.commands import simulated_rig
 from tests.control.unfit import EXPOSURES, installed
 
 Run = Callable[..., "subprocess.CompletedProcess[str]"]

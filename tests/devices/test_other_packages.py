@@ -16,12 +16,12 @@ from aolink import estimate as estimate_exposures
 from aolink import extensions
 from aolink.errors import DeviceError
 from aolink.extensions import installed as installed_packages
-from aolink.jobs.demo import simulated_rig
 from aolink.recording import topics
 from aolink.recording.reader import Recording
 from aolink.rig import load_rig
 from aolink.session import Report, record
 from aolink.wire.messages_pb2 import Applied
+from tests.commands import simulated_rig
 from tests.kinds import messages_of
 
 Run = Callable[..., subprocess.CompletedProcess[str]]

@@ -12,9 +12,10 @@ from aolink.colours import by_rank, estimator_colour
 from aolink.errors import EstimatorError
 from aolink.estimation import ESTIMATOR_NAMES, estimator_rows, make_estimator
 from aolink.estimation.options import with_options
-from aolink.jobs.demo import possible_estimators, simulated_rig
+from aolink.jobs.demo import possible_estimators
 from aolink.rig import load_rig
 from aolink.simulation.model import simulate
+from tests.commands import simulated_rig
 
 
 def test_names_come_by_rank():

@@ -23,10 +23,10 @@ from aolink.identification import (
 )
 from aolink.identification.models import SensorFit
 from aolink.identification.simulate import simulated
-from aolink.jobs.demo import simulated_rig
 from aolink.recording.reader import Recording
 from aolink.session import record
 from aolink.session.excitation import excitation
+from tests.commands import simulated_rig
 
 
 def space(kinds, seen, rig, **more):

@@ -22,12 +22,12 @@ from numpy.typing import NDArray
 from aolink.calibration import Calibration, Frames, Kind, Measured, calibrate, calibrated_text
 from aolink.calibration.measure import pixel_statistics
 from aolink.errors import CalibrationError
-from aolink.jobs.demo import simulated_rig
 from aolink.optics.sensor import Kernel
 from aolink.recording.reader import Recording
 from aolink.rig import Rig, load_rig, parse_light, parse_rig
 from aolink.session import record
 from aolink.simulation.model import RigPhysics
+from tests.commands import simulated_rig
 
 Run = Callable[..., subprocess.CompletedProcess[str]]
 LIVELY = load_rig("section-vi-lively")

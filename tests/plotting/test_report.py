@@ -15,11 +15,11 @@ import pytest
 
 import aolink
 from aolink.errors import ExportError
-from aolink.jobs.demo import simulated_rig
 from aolink.plotting import FIGURES, save_figure, write_report
 from aolink.recording.reader import Recording
 from aolink.rig import load_rig
 from aolink.session import record
+from tests.commands import simulated_rig
 from tests.needs import needed
 from tests.recording.small import write_small
 

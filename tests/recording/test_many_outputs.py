@@ -13,7 +13,6 @@ import zstandard
 from aolink.estimation import run
 from aolink.estimation.estimate import as_recorded, motion
 from aolink.estimation.model.factored import FactoredModel
-from aolink.jobs.demo import simulated_rig
 from aolink.numerics.covariance import from_correlation_steps, in_correlation_steps, psd_root
 from aolink.recording import convert
 from aolink.recording.reader import Recording
@@ -22,6 +21,7 @@ from aolink.rig import load_rig
 from aolink.session import record
 from aolink.simulation.model import simulate
 from aolink.wire.truth import truth_message
+from tests.commands import simulated_rig
 from tests.conftest import Session
 from tests.kinds import must_be
 

@@ -15,13 +15,13 @@ import aolink
 from aolink.errors import DeviceError, RecordingError
 from aolink.estimation import Estimate
 from aolink.exposure import Exposure
-from aolink.jobs.demo import simulated_rig
 from aolink.recording import schemas_pb2 as pb
 from aolink.recording.editing import cut, merge
 from aolink.recording.estimate_pairs import EstimatePairs
 from aolink.recording.reader import Recording
 from aolink.rig import load_rig
 from aolink.session import record
+from tests.commands import simulated_rig
 from tests.conftest import Session
 from tests.recording.small import write_small
 

@@ -26,7 +26,6 @@ from aolink.errors import EstimatorError
 from aolink.estimation import Driver, Estimate, make_estimator
 from aolink.estimation.driver import SkippedInputs
 from aolink.exposure import Exposure
-from aolink.jobs.demo import simulated_rig
 from aolink.recording import schemas_pb2 as pb
 from aolink.recording import topics
 from aolink.recording.reader import Recording
@@ -38,6 +37,7 @@ from aolink.session.report import LatencyBook
 from aolink.session.waiting import Aside, Waiting, most_waiting
 from aolink.simulation.model import simulate
 from aolink.wire import messages_pb2 as wire
+from tests.commands import simulated_rig
 from tests.conftest import Session
 from tests.kinds import messages_of
 

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from aolink.devices.opening import signed
-from aolink.jobs.demo import simulated_rig
 from aolink.recording.reader import Recording
 from aolink.rig import Faults, load_rig, with_faults
 from aolink.session import Report, record
+from tests.commands import simulated_rig
 
 RIG = load_rig("section-vi")
 LINE = [

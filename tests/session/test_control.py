@@ -15,7 +15,6 @@ from aolink.devices.native import NativeCamera, NativeMirror
 from aolink.errors import ControlError
 from aolink.estimation import Status
 from aolink.jobs.closed_loop import closed_loop, replayed
-from aolink.jobs.demo import simulated_rig
 from aolink.recording import schemas_pb2 as pb
 from aolink.recording import topics
 from aolink.recording.reader import Recording
@@ -24,6 +23,7 @@ from aolink.rig import Rig, load_rig, parse_rig
 from aolink.session import Report, record
 from aolink.session.replay import would_command
 from aolink.wire import messages_pb2 as wire
+from tests.commands import simulated_rig
 from tests.control.rigs import DRIFT, VIBRATION, small_rig
 from tests.control.test_fall_back import played, vibration
 from tests.kinds import messages_of, must_be

@@ -16,7 +16,6 @@ import pytest
 from foxglove_schemas_protobuf.Log_pb2 import Log
 
 from aolink.errors import DeviceError
-from aolink.jobs.demo import simulated_rig
 from aolink.recording import topics
 from aolink.recording.reader import Recording
 from aolink.rig import Rig, load_rig
@@ -24,6 +23,7 @@ from aolink.session import Report, record
 from aolink.wire import messages_pb2 as pb
 from aolink.wire.packet import MessageDecoder, PacketDecoder
 from aolink.wire.port import SerialPort
+from tests.commands import simulated_rig
 from tests.kinds import messages_of
 
 

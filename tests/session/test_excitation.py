@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 
 from aolink.errors import DeviceError, RigError
-from aolink.jobs.demo import simulated_rig
 from aolink.recording import topics
 from aolink.recording.reader import Recording
 from aolink.rig import load_rig
 from aolink.session.excitation import excitation
 from aolink.wire import messages_pb2 as pb
+from tests.commands import simulated_rig
 from tests.kinds import messages_of
 
 RIG = load_rig("section-vi")

@@ -12,10 +12,10 @@ import pytest
 from google.protobuf.message import Message
 
 from aolink.errors import DeviceError, PortError, RigError
-from aolink.jobs.demo import simulated_rig
 from aolink.recording.reader import Recording
 from aolink.rig import load_rig
 from aolink.session import record
+from tests.commands import simulated_rig
 from tests.session.pulled_line import pulled_line
 from tests.session.test_reconnect import once_latched, pulling
 

@@ -12,13 +12,13 @@ from foxglove_schemas_protobuf.Log_pb2 import Log
 from google.protobuf.message import Message
 
 import aolink
-from aolink.jobs.demo import simulated_rig
 from aolink.recording import topics
 from aolink.recording.reader import Recording
 from aolink.recording.reestimate import first_difference, reestimate
 from aolink.rig import load_rig
 from aolink.session import Report, record
 from aolink.wire import messages_pb2 as pb
+from tests.commands import simulated_rig
 from tests.kinds import messages_of
 from tests.session.conftest import Ports
 from tests.session.pulled_line import PulledLine, pulled_line

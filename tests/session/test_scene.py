@@ -21,7 +21,6 @@ from aolink.cli.common import app
 from aolink.errors import DeviceError, EstimatorError, RecordingError, RestorationError
 from aolink.estimation.estimate import motion
 from aolink.exposure import Exposure, Picture
-from aolink.jobs.demo import simulated_rig
 from aolink.numerics.covariance import psd_root
 from aolink.optics.camera import to_density
 from aolink.optics.scene import SceneSensor, framed
@@ -39,6 +38,7 @@ from aolink.rig import load_rig
 from aolink.rig.scene_table import read_scene_picture
 from aolink.session import Report, record
 from aolink.viewing import LiveView, save_rrd
+from tests.commands import simulated_rig
 from tests.kinds import must_be, truth_of
 from tests.session.test_session import FAULTY
 from tests.viewing.rrd import read_rrd

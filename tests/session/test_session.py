@@ -14,7 +14,6 @@ import pytest
 
 import aolink
 from aolink.estimation import Driver, run, score
-from aolink.jobs.demo import simulated_rig
 from aolink.recording import topics
 from aolink.recording.compare import compare
 from aolink.recording.facts import recording_facts
@@ -28,6 +27,7 @@ from aolink.recording.reestimate import (
 )
 from aolink.rig import load_rig, parse_rig
 from aolink.session import record
+from tests.commands import simulated_rig
 from tests.conftest import ESTIMATORS, EXPOSURES, Session
 
 

@@ -12,11 +12,11 @@ import pytest
 import aolink
 from aolink.estimation.estimate import Status
 from aolink.estimation.score import score
-from aolink.jobs.demo import simulated_rig
 from aolink.recording.reader import Recording
 from aolink.recording.reestimate import first_difference, reestimate
 from aolink.rig import load_rig
 from aolink.session import record
+from tests.commands import simulated_rig
 from tests.conftest import Session
 from tests.session.test_session import FAULTY
 

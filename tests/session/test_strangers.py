@@ -19,10 +19,10 @@ from pathlib import Path
 import pytest
 
 from aolink.errors import DeviceError, PortError
-from aolink.jobs.demo import simulated_rig
 from aolink.rig import load_rig
 from aolink.wire import messages_pb2 as pb
 from aolink.wire.packet import PacketDecoder, encode_message
+from tests.commands import simulated_rig
 
 Run = Callable[..., subprocess.CompletedProcess[str]]
 

@@ -10,12 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from aolink.jobs.demo import simulated_rig
 from aolink.recording.reader import Recording
 from aolink.recording.reestimate import write_reestimated
 from aolink.rig import load_rig
 from aolink.session import record
 from aolink.viewing import Look, save_rrd
+from tests.commands import simulated_rig
 from tests.needs import needed
 from tests.viewing.rrd import read_blueprint, read_rrd, scalars
 
