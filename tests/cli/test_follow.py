@@ -38,7 +38,7 @@ def test_a_finished_recording_goes_through_once(aolink, steady, tmp_path):
     done = aolink("identify", steady, "--follow", "-o", "identified.toml")
     assert done.returncode == 0
     first, last = done.stdout.splitlines()
-    assert first.startswith("frame 60: the rig file's model fits: NIS ")
+    assert first.startswith("frame 60: the rig file's model fits: squared errors of prediction (NIS) ")
     assert last == f"{steady} ended after {EXPOSURES} exposures; offers: none"
     assert not list(tmp_path.iterdir())
 

@@ -20,7 +20,7 @@ from tests.needs import needed
 
 needed("matplotlib")
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.rare
 
 TOOLS = Path(__file__).parents[2] / "tools"
 FIGURES = (
@@ -112,7 +112,6 @@ def stationary(rig: Rig) -> NDArray[np.float64]:
 # Figures
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", FIGURES)
 def test_a_figure_is_there_and_not_blank(out: Path, name: str) -> None:
     image = needed("PIL.Image").open(out / name).convert("RGB")
