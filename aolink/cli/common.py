@@ -51,7 +51,7 @@ EstimatorOption = Annotated[
     typer.Option(
         "--estimator",
         "-e",
-        help="Estimator to run, such as o3, moments or, with options, o3:second_order; may be given several times.",
+        help="Estimator to run, such as moments, o1 or, with options, o3:second_order; may be given several times.",
     ),
 ]
 KeyOption = Annotated[

@@ -129,7 +129,8 @@ def rig(
             print(
                 f"rig {loaded.name}, {'real' if real_time else 'virtual'} time; to record 100 exposures from it:\n"
                 f"  {program()} record --camera {ports['camera']} --mirror {ports['mirror']} --rig {rig}"
-                f"{f' --key {key}' if key else ''} --estimator o3 --exposures 100 -o session.mcap\nCtrl-C stops it.",
+                f"{f' --key {key}' if key else ''} --estimator moments --exposures 100 -o session.mcap\n"
+                "Ctrl-C stops it.",
                 flush=True,
             )
         server.run(lambda: stop() or (tied and input_ended()))

@@ -29,11 +29,10 @@ if TYPE_CHECKING:
 
 GROUP = "aolink.estimators"
 """The entry points by which other packages add estimators."""
-DEFAULT_ESTIMATOR = "o3"
+DEFAULT_ESTIMATOR = "moments"
+"""The estimator where one is needed and none is named: also for a controller, as it takes milliseconds an exposure."""
 BASELINE_ESTIMATOR = "o1"
 """The estimator that others are compared with: it takes the centroid of a blurred spot alone."""
-LOOP_ESTIMATOR = "moments"
-"""The estimator that serves the controller of a demo, where it can work on the rig."""
 # Spots of one copy of the plant, by `moments`.
 _MOST_SPOTS = 128
 
@@ -58,8 +57,6 @@ class EstimatorRow:
     """Whether it follows a plant with ``plant.wandering``; it has to model the noise inside an exposure."""
     loops: Callable[[Rig], tuple[str, ...]] = lambda rig: ()
     """The groups of compiled loops (`compiled.GROUPS`) that it needs on a rig, beside those that all need."""
-    in_demo: Callable[[Rig], bool] = lambda rig: True
-    """Whether it is fast enough on a rig for `aolink demo`."""
 
 
 def estimator_row(name: str) -> EstimatorRow:
@@ -172,21 +169,6 @@ def _pixels_loops(rig: Rig) -> tuple[str, ...]:
     return ("profile",) if rig.sensor.directions == 1 else ("profile of spots",)
 
 
-def _is_quick_for_mixture(rig: Rig) -> bool:
-    """Whether `mixture` is quick enough for a demo: on a line sensor, where it does not temper points in nearly every
-    exposure. For spots on a plane the filters that use every pixel are too slow."""
-    from aolink.estimation.assumptions import importance_is_too_sure
-
-    return rig.sensor.directions == 1 and not importance_is_too_sure(rig)
-
-
-def _is_quick_for_profile(rig: Rig) -> bool:
-    """The same for `profile`, which hands over to `mixture` on fewer rigs."""
-    from aolink.estimation.assumptions import importance_is_too_sure, modes_stay_lost
-
-    return rig.sensor.directions == 1 and not (importance_is_too_sure(rig) and modes_stay_lost(rig))
-
-
 def _built(maker: str, *orders: int) -> Callable[[Rig, Options], Filter]:
     """The function of that name in `aolink.estimation.filters`, which is loaded when it is called."""
 
@@ -213,15 +195,15 @@ _OURS = {
         ),
         EstimatorRow(
             name="profile", rank=50, colour=(140, 210, 80), build=_built("profile"),
-            refusal=_pixels_refusal("profile"), loops=_pixels_loops, wanders=True, in_demo=_is_quick_for_profile,
+            refusal=_pixels_refusal("profile"), loops=_pixels_loops, wanders=True,
         ),
         EstimatorRow(
             name="mixture", rank=60, colour=(240, 80, 140), build=_built("mixture"),
-            refusal=_pixels_refusal("mixture"), loops=_pixels_loops, wanders=True, in_demo=_is_quick_for_mixture,
+            refusal=_pixels_refusal("mixture"), loops=_pixels_loops, wanders=True,
         ),
         EstimatorRow(
             name="sampled", rank=70, colour=(190, 130, 80), build=_built("sampled"),
-            refusal=_pixels_refusal("sampled"), loops=_pixels_loops, wanders=True, in_demo=lambda rig: False,
+            refusal=_pixels_refusal("sampled"), loops=_pixels_loops, wanders=True,
         ),
     )
 }  # fmt: skip

@@ -283,19 +283,30 @@ def test_a_controller_that_does_not_pay_is_left_and_the_recording_says_so(tmp_pa
 
 
 @pytest.mark.parametrize(
-    ("controller", "estimators", "rig", "message"),
+    ("controller", "rig", "message"),
     [
-        ("pid", [], small_rig(), "there is no controller 'pid'"),
-        ("lqg", [], small_rig(), "the controller lqg needs an estimator's state: give one, such as moments"),
-        ("integrator", [], small_rig(control="gain = 4.0"), "is unstable: .* close it all the same with --force"),
+        ("pid", small_rig(), "there is no controller 'pid'"),
+        ("integrator", small_rig(control="gain = 4.0"), "is unstable: .* close it all the same with --force"),
     ],
 )
 def test_a_loop_that_cannot_be_closed_is_refused_before_anything_is_opened(
-    tmp_path: Path, controller: str, estimators: list[str], rig: Rig, message: str
+    tmp_path: Path, controller: str, rig: Rig, message: str
 ) -> None:
     with pytest.raises(ControlError, match=message):
-        record(rig, "/dev/none", "/dev/none", tmp_path / "a.mcap", estimators=estimators, control=controller)
+        record(rig, "/dev/none", "/dev/none", tmp_path / "a.mcap", control=controller)
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(("controller", "estimators"), [("lqg", ["moments"]), ("integrator", [])])
+def test_a_controller_that_needs_an_estimator_has_the_default_one(
+    tmp_path: Path, controller: str, estimators: list[str]
+) -> None:
+    path = rig_file(tmp_path, small_rig(DRIFT))
+    with simulated_rig(path) as ports:
+        report = record(load_rig(path), *ports, tmp_path / "a.mcap", exposures=4, control=controller)
+    assert report.control is not None
+    assert report.control.estimator == "".join(estimators)
+    assert Recording(tmp_path / "a.mcap").estimators == estimators
 
 
 def test_an_unstable_loop_that_is_forced_stays_within_the_limits(tmp_path: Path) -> None:

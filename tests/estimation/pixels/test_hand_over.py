@@ -11,7 +11,6 @@ from aolink.errors import EstimatorError
 from aolink.estimation import make_estimator
 from aolink.estimation.assumptions import importance_is_too_sure, modes_stay_lost
 from aolink.estimation.pixels import updates
-from aolink.estimation.registry import estimator_row
 from aolink.rig import load_rig
 from aolink.rig.parts import Wandering
 from aolink.simulation.model import simulate
@@ -272,19 +271,6 @@ def test_copies_of_a_rig_whose_parameter_wanders_work_alike():
     _, reasons = errors_of(rig, "mixture", [1], 3)
     assert any("1200 others were sought" in reason for reason in reasons)
     assert not any("up to" in reason for reason in reasons)  # all of the share, as where modes stay lost
-
-
-def test_a_demo_leaves_mixture_out_where_it_tempers_in_nearly_every_exposure():
-    in_demo = estimator_row("mixture").in_demo
-    assert in_demo(LIVELY)
-    assert not in_demo(BRIGHT)
-    assert not in_demo(SLOWER)
-
-
-def test_a_demo_leaves_profile_out_where_it_is_mixture():
-    in_demo = estimator_row("profile").in_demo
-    assert in_demo(SLOWER)
-    assert not in_demo(BRIGHT)
 
 
 @pytest.mark.slow
