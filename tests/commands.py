@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import atexit
 import contextlib
+import gc
 import json
 import os
 import runpy
@@ -49,7 +50,7 @@ _MODULES = (
     "aolink.estimation.pixels.filter",
     "aolink.estimation.pixels.updates",
     "aolink.estimation.pixels.sampled",
-    "pydantic.type_adapter",  # with which typer reads options
+    "typer._adapters",  # with which it reads options
 )
 """What most commands load; nothing that starts threads."""
 
@@ -135,6 +136,7 @@ def serve(fileno: int) -> None:
     """Fork a process for each request, and answer with its exit code, until the other end is closed."""
     for name in _MODULES:
         import_module(name)
+    gc.freeze()  # a collection in a process that was forked would copy all of the memory
     with socket.socket(fileno=fileno) as requests:
         requests.sendall(b".")
         while True:
