@@ -172,7 +172,7 @@ def _status_reasons(posterior: Posterior) -> list[str]:
     words = {
         Status.GATED: "too far from the prediction, not used",
         Status.DIVERGED: "too far from the prediction several times in a row: it starts again",
-        Status.REINITIALISED: "started again from the plant's prior",
+        Status.REINITIALISED: "started again from the plant's own motion, without what earlier frames had shown",
     }
     counts = np.bincount(posterior.status, minlength=len(Status))
     axes = len(posterior.status)

@@ -55,6 +55,8 @@ class EstimatorRow:
     """Engines that it can run on."""
     wanders: bool = False
     """Whether it follows a plant with ``plant.wandering``; it has to model the noise inside an exposure."""
+    loops: Callable[[Rig], tuple[str, ...]] = lambda rig: ()
+    """The groups of compiled loops (`compiled.GROUPS`) that it needs on a rig, beside those that all need."""
 
 
 def estimator_row(name: str) -> EstimatorRow:
@@ -91,6 +93,7 @@ def make_estimator(rig: Rig, name: str, **options: Any) -> Estimator:
         There is no such estimator or option, or it cannot work on this rig.
     """
     # Not before: whoever wants no more of a row than its colour and rank waits for none of these.
+    from aolink.estimation.compiled import make_ready
     from aolink.estimation.estimator import Estimator
     from aolink.estimation.model.exposure_model import exposure_model
     from aolink.estimation.options import checked_options, with_options
@@ -104,6 +107,8 @@ def make_estimator(rig: Rig, name: str, **options: Any) -> Estimator:
             f"engine {chosen.engine!r} runs {able} on a plant of one axis, this is {name} with"
             f" plant.axes = {rig.plant.axes}: use engine 'aolink'"
         )
+
+    make_ready(*_shared_loops(rig), *row.loops(rig))
 
     def made(rig: Rig) -> Estimator:
         # Code that the first exposure would load or compile is ready before the session.
@@ -136,7 +141,7 @@ def _pixels_refusal(name: str) -> Callable[[Rig], str | None]:
         if rig.plant.n_states > MANY_STATES:
             alike = " that does not consist of equal systems side by side" if name == "profile" else ""
             return (
-                f"{name} follows the posterior's modes for at most {MANY_STATES} states of one plant, {rig.name} has"
+                f"{name} takes at most {MANY_STATES} states of one plant, {rig.name} has"
                 f" {rig.plant.n_states}{alike}: use {'o3' if alike else 'profile or moments'}"
             )
         if reason := _many_spots_refusal(rig, name):  # its widest Gaussian is found by windowed moments
@@ -149,6 +154,19 @@ def _pixels_refusal(name: str) -> Callable[[Rig], str | None]:
         return None
 
     return refusal
+
+
+def _shared_loops(rig: Rig) -> tuple[str, ...]:
+    if alike_systems(rig.plant) is not None:
+        return ("larger plants", "many spots")
+    small = (rig.plant.n_states, rig.plant.n_inputs, rig.plant.n_outputs) == (2, 1, 1)
+    return ("o1 to o3 and moments",) if small else ("o1 to o3 and moments", "larger plants")
+
+
+def _pixels_loops(rig: Rig) -> tuple[str, ...]:
+    if alike_systems(rig.plant) is not None:
+        return ()
+    return ("profile",) if rig.sensor.directions == 1 else ("profile of spots",)
 
 
 def _built(maker: str, *orders: int) -> Callable[[Rig, Options], Filter]:
@@ -177,15 +195,15 @@ _OURS = {
         ),
         EstimatorRow(
             name="profile", rank=50, colour=(140, 210, 80), build=_built("profile"),
-            refusal=_pixels_refusal("profile"), wanders=True,
+            refusal=_pixels_refusal("profile"), loops=_pixels_loops, wanders=True,
         ),
         EstimatorRow(
             name="mixture", rank=60, colour=(240, 80, 140), build=_built("mixture"),
-            refusal=_pixels_refusal("mixture"), wanders=True,
+            refusal=_pixels_refusal("mixture"), loops=_pixels_loops, wanders=True,
         ),
         EstimatorRow(
             name="sampled", rank=70, colour=(190, 130, 80), build=_built("sampled"),
-            refusal=_pixels_refusal("sampled"), wanders=True,
+            refusal=_pixels_refusal("sampled"), loops=_pixels_loops, wanders=True,
         ),
     )
 }  # fmt: skip

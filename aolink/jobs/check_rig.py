@@ -375,8 +375,11 @@ def _check_observability(rig: Rig) -> Iterator[Finding]:
             f"the centroid over {rig.timing.exposure_steps} fast steps loses {mode}, wholly or in part;"
             " the blur may still show it, another exposure time would",
         )
-    message = f"rank {report.rank} of {report.n_states} at the fast rate, {report.centroid_rank} by centroids"
-    yield _info("plant", f"{message}; o2 needs {report.o2_needs}")
+    yield _info(
+        "plant",
+        f"the outputs show {report.rank} of the plant's {report.n_states} states, and the centroids of exposures alone"
+        f" {report.centroid_rank}; o2 needs {report.o2_needs}",
+    )
 
 
 def _different_copies(rig: Rig) -> Rig:

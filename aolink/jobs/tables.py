@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from aolink.errors import AolinkError, RecordingError
+from aolink.extensions import install_command
 from aolink.files import writing
 
 COLUMNS = (
@@ -139,7 +140,7 @@ def parquet() -> tuple[Any, Any]:
         import pyarrow as pa
         import pyarrow.parquet as pq
     except ImportError:
-        raise AolinkError("Parquet needs pyarrow: pip install 'aolink[parquet]', or write .csv") from None
+        raise AolinkError(f"Parquet needs pyarrow: {install_command('parquet')}, or write .csv") from None
     return pa, pq
 
 

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from aolink.errors import ExportError
+from aolink.extensions import install_command
 from aolink.files import writing
 from aolink.plotting.exposure import draw_intensity, draw_paths, draw_spot, exposure_with_estimates, paths_of
 from aolink.plotting.overview import limits_of, need_exposures, overview
@@ -52,7 +53,7 @@ def draw_session(series: Series, path: str | Path) -> Path:
         import matplotlib as mpl
         from matplotlib.figure import Figure
     except ImportError:
-        raise ExportError("a picture without the viewer needs matplotlib: pip install 'aolink[plot]'") from None
+        raise ExportError(f"a picture without the viewer needs matplotlib: {install_command('plot')}") from None
     view = overview(series)
     need_exposures(view)
     number, why = next(iter(view.telling().items()))

@@ -11,14 +11,14 @@ from pathlib import Path
 import pytest
 
 from aolink.errors import ControlError
-from aolink.jobs.demo import simulated_rig
 from aolink.recording.reader import Recording
+from tests.commands import simulated_rig
 from tests.control.rigs import DRIFT, small_rig
 
 Run = Callable[..., "subprocess.CompletedProcess[str]"]
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_an_installed_package_adds_a_controller(aolink: Run, with_example: dict[str, str], tmp_path: Path) -> None:
     path = tmp_path / "rig.toml"
     path.write_text(small_rig(DRIFT).toml)

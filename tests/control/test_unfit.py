@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from aolink.errors import ControlError
-from aolink.jobs.demo import simulated_rig
 from aolink.recording.reader import Recording
 from aolink.rig import load_rig
 from aolink.session import record
+from tests.commands import simulated_rig
 from tests.control.unfit import EXPOSURES, installed
 
 Run = Callable[..., "subprocess.CompletedProcess[str]"]
@@ -78,7 +78,7 @@ def test_inputs_that_grow_beyond_numbers_are_an_unstable_loop(aolink: Run, with_
     assert "the loop of huge on loop is unstable: by the model a disturbance is inf times as large" in line
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_one_that_fails_in_a_session_parks_the_mirror_and_says_so(
     aolink: Run, with_unfit: dict[str, str], session: Path, tmp_path: Path
 ) -> None:

@@ -16,12 +16,12 @@ from aolink import estimate as estimate_exposures
 from aolink import extensions
 from aolink.errors import DeviceError
 from aolink.extensions import installed as installed_packages
-from aolink.jobs.demo import simulated_rig
 from aolink.recording import topics
 from aolink.recording.reader import Recording
 from aolink.rig import load_rig
 from aolink.session import Report, record
 from aolink.wire.messages_pb2 import Applied
+from tests.commands import simulated_rig
 from tests.kinds import messages_of
 
 Run = Callable[..., subprocess.CompletedProcess[str]]
@@ -49,7 +49,7 @@ def rig_file(folder: Path, camera: str = 'driver = "example"', mirror: str = 'dr
     return path
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_session_with_devices_of_another_package(aolink: Run, installed: dict[str, str], tmp_path: Path) -> None:
     rig = rig_file(tmp_path, 'driver = "example"\nclock_offset_s = 3.5')
     arguments = ("--rig", rig, "--estimator", "o1", "--exposures", "6", "-o", "a.mcap", "--json")
@@ -82,7 +82,7 @@ def test_a_session_with_devices_of_another_package(aolink: Run, installed: dict[
     assert (info.returncode, "example mirror" in info.stdout) == (0, True)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_camera_of_another_package_beside_a_native_mirror(
     aolink: Run, installed: dict[str, str], tmp_path: Path,
 ) -> None:  # fmt: skip
@@ -112,7 +112,7 @@ def test_a_camera_of_another_package_beside_a_native_mirror(
         assert "a native camera counts fast steps together with its own mirror" in refused.stderr
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_camera_alone_is_recorded(aolink: Run, installed: dict[str, str], tmp_path: Path) -> None:
     """Nothing is commanded; every exposure has the safe input, and is estimated as any other."""
     rig = rig_file(tmp_path, mirror="")
@@ -133,7 +133,7 @@ def test_a_camera_alone_is_recorded(aolink: Run, installed: dict[str, str], tmp_
     assert info.returncode == 0, info.stderr
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_native_camera_alone_is_recorded(aolink: Run, tmp_path: Path) -> None:
     """It counts the fast steps itself."""
     with simulated_rig("section-vi", "--real-time") as (camera, _):
@@ -238,7 +238,7 @@ def test_a_driver_that_is_not_there_is_one_line(
     assert not (tmp_path / "a.mcap").exists()
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_drivers_that_there_are_are_listed(aolink: Run, installed: dict[str, str]) -> None:
     found = {
         (each["kind"], each["name"]): each

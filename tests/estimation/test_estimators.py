@@ -339,7 +339,7 @@ def test_drivers_keep_the_order_of_their_names(rig, exposures):
     assert [e.estimator for e in driver.step(exposures[0])] == ["o3", "open-loop"]
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("flux", ["known", "measured"])
 @pytest.mark.parametrize("name", ["section-vi-lively", "sh-4x4"])
 def test_it_does_not_matter_how_many_exposures_are_handed_over_at_once(name, flux):

@@ -145,7 +145,7 @@ def test_frames_of_other_sizes_go_into_a_table_only(tmp_path: Path, recording_wi
         assert [row["n_steps"] for row in csv.DictReader(file)] == ["200", "200", "100"]
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_what_would_fill_the_memory_is_refused_before_it_is_read(tmp_path: Path) -> None:
     """A recording of 20,000 frames of 900 spots, as far as the check sees it: its pictures have one pixel each."""
     large = tmp_path / "large.mcap"

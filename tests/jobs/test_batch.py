@@ -220,7 +220,7 @@ def test_a_rig_of_another_camera_is_refused(recorded: Session, tmp_path: Path) -
         Recording(recorded.path, rig=load_rig("single-lenslet"))
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_command_on_two_processes(aolink: Run, recorded: Session, tmp_path: Path) -> None:
     """A bad file among good ones; the table is that of one process."""
     for name in ("a", "b"):
@@ -265,7 +265,7 @@ def test_values_are_drawn_in_the_order_of_the_table(aolink: Run, recorded: Sessi
     assert re.findall(r"process_noise=(\d+)", result.stdout) == ["5", "10", "20"]
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_one_file_and_one_model_need_no_folder(aolink: Run, recorded: Session, tmp_path: Path) -> None:
     """With --set or --rig as without: the table is printed, and is that of the batch."""
     shutil.copy(recorded.path, tmp_path / "s.mcap")

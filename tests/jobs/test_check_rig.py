@@ -118,6 +118,7 @@ def test_the_numbers_that_a_rig_comes_to_are_stated() -> None:
         in (info["sensor.noise_density"])
     )
     assert "blocks of 50 steps, 50 ms; the device queues 400 ms" in info["mirror"]
+    assert "the outputs show 2 of the plant's 2 states, and the centroids of exposures alone 2; o2" in info["plant"]
 
 
 @pytest.mark.parametrize("name", builtin_rigs())
@@ -129,4 +130,7 @@ def test_the_rigs_that_come_along_have_no_error(name: str) -> None:
     expected = {"membrane-12x12": ["plant.C"], "loop": ["sensor.noise_density"]}
     assert [f.key for f in findings if f.severity == "warning"] == expected.get(name, [])
     # A drift and a vibration move it.
-    assert any("compare both with moments" in f.message for f in findings) == (name == "loop")
+    assert any("intervals are often too narrow; mixture" in f.message for f in findings) == (name == "loop")
+    assert any("o2 needs a spot off centre" in f.message and "here they do not" in f.message for f in findings) == (
+        name in ("loop", "membrane-12x12", "sh-30x30", "sh-8x8")
+    )

@@ -59,7 +59,7 @@ def scene_psnrs(recording: Recording) -> tuple[float, float]:
     return float(np.mean(blurred)), float(np.mean(sharp))
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.usefixtures("without_vulkan")
 def test_the_demo_ends_with_what_its_recording_says(
     aolink: Callable[..., subprocess.CompletedProcess[str]], tmp_path: Path
@@ -91,7 +91,7 @@ def test_the_demo_ends_with_what_its_recording_says(
         assert never not in done.stdout
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.usefixtures("without_vulkan")
 def test_the_demo_runs_the_estimators_that_are_named(
     aolink: Callable[..., subprocess.CompletedProcess[str]], tmp_path: Path

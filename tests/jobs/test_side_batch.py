@@ -45,7 +45,7 @@ def test_thousands_of_names_are_no_matter_and_two_that_are_one_are_refused() -> 
         batch.side_jobs(["a/s.mcap", "b/s.mcap"], batch.models(None, []), ["o3"], Path("out"))
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_command_in_parts_and_then_as_a_whole(aolink: Run, tmp_path: Path) -> None:
     """A part has its own table; the run over all finds everything done, and gives the tables of all."""
     names = [write_small(tmp_path / f"s{k}.mcap", 3 + k).name for k in range(5)]

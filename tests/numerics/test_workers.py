@@ -45,7 +45,7 @@ def wait_for(true: Callable[[], object], process: subprocess.Popen[bytes]) -> No
         time.sleep(0.005)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_workers_of_a_killed_batch_end_and_the_next_run_does_it_all(
     aolink: Run, recorded: Session, tmp_path: Path
 ) -> None:
@@ -141,7 +141,7 @@ def test_a_pool_ends_with_calls_waiting_that_are_larger_than_a_pipe(tmp_path: Pa
     assert subprocess.run([sys.executable, "program.py"], cwd=tmp_path, timeout=_PATIENCE_S).returncode == 7
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP])
 def test_what_a_terminal_sends_to_all_is_for_the_parent_alone(
     recorded: Session, tmp_path: Path, number: signal.Signals
@@ -164,7 +164,7 @@ def test_what_a_terminal_sends_to_all_is_for_the_parent_alone(
     assert not [*tmp_path.glob("out/.*")]
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_simulated_rig_of_a_killed_demo_ends(tmp_path: Path) -> None:
     with started(tmp_path, "demo", "--rig", "tip-tilt", "--exposures", "100000") as process:
         wait_for(lambda: [*tmp_path.glob("demo-*/session.mcap")], process)

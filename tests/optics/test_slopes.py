@@ -207,7 +207,7 @@ def test_the_command_takes_a_hexagonal_sensor(aolink, tmp_path):
         assert says in refused.stderr
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_command_prints_and_writes(aolink, mmirs, tmp_path):
     reference = str(mmirs / "mmirs_camera2_ref.fits.gz")
     done = aolink(

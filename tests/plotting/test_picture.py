@@ -14,6 +14,7 @@ from PIL import Image
 
 from aolink.colours import estimator_colour
 from aolink.errors import ExportError
+from aolink.extensions import install_command
 from aolink.plotting import draw_session
 from aolink.recording.reader import Recording
 from tests.needs import needed
@@ -39,7 +40,7 @@ def panels(picture: np.ndarray, columns: tuple[float, ...]) -> list[np.ndarray]:
     return [picture[:, left:right] for left, right in pairwise(edges)]
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_every_panel_shows_its_paths(tmp_path: Path) -> None:
     """The blur has the best path; the intensity profile has all; a panel for each estimator has its own and the truth,
     from the top by rank."""
@@ -56,7 +57,7 @@ def test_every_panel_shows_its_paths(tmp_path: Path) -> None:
         assert coloured(panel, (0, 0, 0)).sum() > 500
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_scene_stands_beside_the_paths(tmp_path: Path) -> None:
     """As it came, and at rest below it, in the same greys."""
     recording = Recording(LIVELY.with_name("moving-scene.mcap"))
@@ -69,7 +70,7 @@ def test_the_scene_stands_beside_the_paths(tmp_path: Path) -> None:
     assert shown[1] == pytest.approx(lit, rel=0.5)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_without_a_truth_and_estimates_the_blur_is_drawn_alone(tmp_path: Path) -> None:
     bare = Recording(write_small(tmp_path / "bare.mcap", 3, rig="sh-4x4"))
     left, bands = panels(pixels(draw_session(bare, tmp_path / "a.png")), (0.0, 0.5))
@@ -84,7 +85,7 @@ def test_what_cannot_be_drawn_or_written_is_one_clear_error(tmp_path: Path) -> N
         draw_session(Recording(LIVELY), tmp_path / "absent" / "a.png")
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.usefixtures("without_vulkan")
 def test_the_demo_draws_it_and_names_the_package(
     aolink: Callable[..., subprocess.CompletedProcess[str]], tmp_path: Path
@@ -100,7 +101,7 @@ def test_the_demo_draws_it_and_names_the_package(
     assert coloured(pixels(folder / "session.png"), estimator_colour("moments")).sum() > 200
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.usefixtures("without_vulkan")
 def test_without_matplotlib_the_demo_says_what_to_install(tmp_path: Path) -> None:
     code = "import sys; sys.modules['matplotlib'] = None; from aolink.cli import main; main()"
@@ -120,4 +121,4 @@ def test_without_matplotlib_the_demo_says_what_to_install(tmp_path: Path) -> Non
     assert result.returncode == 0, result.stderr
     (line,) = [each for each in result.stdout.splitlines() if each.startswith("picture")]
     assert line.startswith("picture   none: this machine has no Vulkan driver")
-    assert line.endswith("a picture without the viewer needs matplotlib: pip install 'aolink[plot]'")
+    assert line.endswith(f"a picture without the viewer needs matplotlib: {install_command('plot')}")

@@ -110,7 +110,7 @@ def in_place_of_the_end(path: Path) -> tuple[bytes, int]:
     return data, data.rindex(struct.pack("<BQ", Opcode.DATA_END, 4))
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_small_file_with_millions_of_messages_is_refused_at_once(
     aolink: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -84,7 +84,7 @@ def test_a_damaged_recording_has_side_files_too(recorded: Session, tmp_path: Pat
         Recording(tmp_path / "whole.mcap", side=[side])
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_what_does_not_belong_together_is_one_clear_error(aolink: Run, tmp_path: Path) -> None:
     for name, exposures in (("a", 3), ("b", 4)):
         source = write_small(tmp_path / f"{name}.mcap", exposures)
@@ -106,7 +106,7 @@ def test_what_does_not_belong_together_is_one_clear_error(aolink: Run, tmp_path:
         assert not (tmp_path / "x.rrd").exists()
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_view_and_compare_take_a_recording_and_its_side_file(aolink: Run, recorded: Session, tmp_path: Path) -> None:
     shutil.copy(recorded.path, source := tmp_path / "s.mcap")
     for name, model in (("same", Model()), ("other", OTHER)):

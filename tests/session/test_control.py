@@ -15,7 +15,6 @@ from aolink.devices.native import NativeCamera, NativeMirror
 from aolink.errors import ControlError
 from aolink.estimation import Status
 from aolink.jobs.closed_loop import closed_loop, replayed
-from aolink.jobs.demo import simulated_rig
 from aolink.recording import schemas_pb2 as pb
 from aolink.recording import topics
 from aolink.recording.reader import Recording
@@ -24,6 +23,7 @@ from aolink.rig import Rig, load_rig, parse_rig
 from aolink.session import Report, record
 from aolink.session.replay import would_command
 from aolink.wire import messages_pb2 as wire
+from tests.commands import simulated_rig
 from tests.control.rigs import DRIFT, VIBRATION, small_rig
 from tests.control.test_fall_back import played, vibration
 from tests.kinds import messages_of, must_be
@@ -124,7 +124,7 @@ def test_estimates_of_a_closed_loop_are_the_same_offline(tmp_path: Path) -> None
     assert first_difference(recording.estimates("o1"), reestimate(recording, ["o1"])["o1"]) is None
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_faults_on_the_wire_leave_the_loop_closed_and_every_step_accounted_for(tmp_path: Path) -> None:
     """Frames are lost, commands and reports come again; and the same seed gives the same bytes."""
     path = rig_file(tmp_path, small_rig(VIBRATION), FAULTS)
@@ -143,7 +143,7 @@ def test_faults_on_the_wire_leave_the_loop_closed_and_every_step_accounted_for(t
     assert np.sqrt(np.mean([truth.path**2 for truth in truths if truth is not None])) < 0.07  # 0.1 in the open loop
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_in_real_time_every_step_is_accounted_for_and_within_limits(tmp_path: Path) -> None:
     """Nothing is said about how fast: only that each step ends once, and each exposure has its delay."""
     path = rig_file(tmp_path, small_rig(DRIFT))
@@ -169,7 +169,7 @@ def test_in_real_time_every_step_is_accounted_for_and_within_limits(tmp_path: Pa
     assert len(held) == report.steps_applied
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_an_estimator_that_is_too_slow_to_control_opens_the_loop_and_costs_nothing_else(tmp_path: Path) -> None:
     """`sampled` takes longer for an exposure than six of them last: the mirror holds, and the recording has it all."""
     path = rig_file(tmp_path, small_rig(DRIFT))
@@ -376,7 +376,7 @@ def test_with_a_queue_the_loop_is_as_good_as_its_delay(tmp_path: Path) -> None:
     assert report.steps_commanded == sum(getattr(report, f"steps_{end}") for end in ends)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_commands_that_are_lost_while_others_replace_them_are_accounted_for(tmp_path: Path) -> None:
     rig = parse_rig(
         small_rig(VIBRATION).toml + "[simulation.faults]\ncommand_loss_rate = 0.2\npacket_loss_rate = 0.05\n"

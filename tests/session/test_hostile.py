@@ -217,7 +217,7 @@ def flood(after: type[Message], begun: threading.Event) -> Lie:
     return lie
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("real_time", [False, True])
 def test_a_flood_ends_the_session_before_it_fills_the_memory(tmp_path: Path, real_time: bool) -> None:
     lies = {"camera": flood(pb.Ack, threading.Event())}
@@ -237,7 +237,7 @@ def test_a_stop_is_heard_in_a_flood(tmp_path: Path) -> None:
     assert Recording(tmp_path / "a.mcap").complete
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_clock_that_is_set_back_during_a_session(tmp_path: Path) -> None:
     """From the first stamp on the frames say that they are uncertain, until the new clock is known; nothing stops."""
     set_back_ns, path = -50_000_000, tmp_path / "a.mcap"

@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 
 from aolink.errors import RecordingError
-from aolink.jobs.demo import simulated_rig
 from aolink.recording import topics
 from aolink.recording.compare import compare
 from aolink.recording.reader import Recording
 from aolink.recording.reestimate import first_difference
 from aolink.session import record
 from aolink.session.replay import RecordedCommands, replay
+from tests.commands import simulated_rig
 from tests.conftest import ESTIMATORS, EXPOSURES, Session
 
 Run = Callable[..., subprocess.CompletedProcess[str]]

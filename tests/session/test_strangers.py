@@ -19,10 +19,10 @@ from pathlib import Path
 import pytest
 
 from aolink.errors import DeviceError, PortError
-from aolink.jobs.demo import simulated_rig
 from aolink.rig import load_rig
 from aolink.wire import messages_pb2 as pb
 from aolink.wire.packet import PacketDecoder, encode_message
+from tests.commands import simulated_rig
 
 Run = Callable[..., subprocess.CompletedProcess[str]]
 
@@ -86,7 +86,7 @@ class Listener:
         self._server.close()
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_signed_session_over_tcp_is_not_to_be_played_again(
     aolink: Run, keys: tuple[Path, Path], tmp_path: Path
 ) -> None:
@@ -110,7 +110,7 @@ def test_a_signed_session_over_tcp_is_not_to_be_played_again(
     assert not re.search(keys[0].read_text(), (tmp_path / "a.mcap").read_bytes().decode("latin-1"))
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_who_lacks_the_key_is_told_so(aolink: Run, keys: tuple[Path, Path], tmp_path: Path) -> None:
     good, other = (("--key", str(path)) for path in keys)
     ports = dict[tuple[str, ...], str]()

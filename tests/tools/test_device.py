@@ -31,7 +31,7 @@ def make(build: Path, *what: str) -> str:
     return done.stdout
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("compiler", ["cc", "clang"])
 def test_the_vectors_and_the_states_hold(compiler: str, tmp_path: Path) -> None:
     """Every good, broken and parted packet that aolink publishes is taken as the file says."""
@@ -41,14 +41,14 @@ def test_the_vectors_and_the_states_hold(compiler: str, tmp_path: Path) -> None:
     assert "checks hold" in said
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_random_bytes_and_packets_find_nothing(tmp_path: Path) -> None:
     make(tmp_path, f"{tmp_path}/fuzz")
     done = subprocess.run([tmp_path / "fuzz", "3", "7"], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_signed_session(tmp_path: Path) -> None:
     """Its signatures were written from the page; aolink's own take them, and it takes aolink's."""
     make(tmp_path, f"{tmp_path}/device")

@@ -10,13 +10,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from aolink.jobs.demo import simulated_rig
 from aolink.optics.kernel import exposure_density
 from aolink.recording.reader import Recording
 from aolink.recording.reestimate import write_reestimated
 from aolink.rig import load_rig
 from aolink.session import record
 from aolink.viewing import Look, save_rrd
+from tests.commands import simulated_rig
 from tests.needs import needed
 from tests.viewing.rrd import read_blueprint, read_rrd, scalars
 
@@ -79,7 +79,7 @@ def test_a_part_has_the_exposures_that_begin_in_it(aolink: Aolink, tmp_path: Pat
     assert entities["/camera/image"]["time"][0] == 0
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_lenslet_has_its_own_lines_as_x_and_y(tmp_path: Path, aolink: Aolink) -> None:
     recording = Recording(RECORDINGS / "tip-tilt.mcap")
     done = aolink("view", recording.path, "--lenslet", "0,0", "--save", "spot.rrd")
@@ -133,7 +133,7 @@ def test_what_is_not_there_is_one_clear_error(
     assert not (tmp_path / "x.rrd").exists()
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_side_files_are_drawn_and_reported(aolink: Aolink, tmp_path: Path) -> None:
     needed("matplotlib")
     shutil.copy(LIVELY, tmp_path / "a.mcap")

@@ -84,7 +84,7 @@ def spread_tabs(layout: dict[str, Any]) -> dict[str, Any]:
     return layout
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_every_view_shows_data(rrd: Path) -> None:
     try:
         with headless_viewer(rrd) as client:
@@ -108,7 +108,7 @@ def test_every_view_shows_data(rrd: Path) -> None:
     assert columns_with(path, estimator_colour("o3")) > 0.4
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_screenshot_shows_the_layout(rrd: Path, tmp_path: Path) -> None:
     try:
         screenshot(rrd, tmp_path / "session.png", size=(1600, 1000))
@@ -121,7 +121,7 @@ def test_a_screenshot_shows_the_layout(rrd: Path, tmp_path: Path) -> None:
     assert coloured_columns(picture) > 0.8
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_screenshot_is_of_the_time_that_is_asked_for(rrd: Path, tmp_path: Path) -> None:
     """The camera's view, in the corner, has another exposure's row framed."""
     try:
@@ -135,7 +135,7 @@ def test_a_screenshot_is_of_the_time_that_is_asked_for(rrd: Path, tmp_path: Path
     assert (corners[0] != corners[2]).any()
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_viewer_ends_with_its_block_whatever_happens_in_it(rrd: Path) -> None:
     viewers: list[psutil.Process] = []
 
@@ -237,7 +237,7 @@ def test_a_viewer_that_gets_the_data_over_the_network_shows_the_layout(rrd: Path
     assert {"Session", "Log", "Path, all (slope units)"} <= names
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_recording_is_served_while_it_is_read(
     tmp_path: Path, start_aolink: Callable[..., subprocess.Popen[str]]
 ) -> None:
@@ -306,7 +306,7 @@ def test_a_rerun_file_is_shown_as_it_is(rrd: Path, start_aolink: Callable[..., s
     assert serving.returncode == 130
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_what_is_no_rerun_file_is_one_clear_error(aolink: Callable[..., Any], rrd: Path, tmp_path: Path) -> None:
     (tmp_path / "text.rrd").write_text("hello")
     for name, message in (("text.rrd", "text.rrd is not a Rerun file"), ("none.rrd", "there is no file none.rrd")):

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from aolink.extensions import install_command
 from aolink.rig import load_rig
 
 WITHOUT = """
@@ -24,5 +25,5 @@ def test_a_missing_library_is_named_with_what_to_install(driver: str, module: st
     command = [sys.executable, "-c", WITHOUT.format(module=module), "record", "--rig", "my.toml", "-o", "a.mcap"]
     done = subprocess.run([*command, "--exposures", "3"], cwd=tmp_path, capture_output=True, text=True)
     assert (done.returncode, done.stdout) == (4, "")
-    assert done.stderr == f"aolink: this needs {module}: pip install 'aolink[{driver}]'\n"
+    assert done.stderr == f"aolink: this needs {module}: {install_command(driver)}\n"
     assert not (tmp_path / "a.mcap").exists()

@@ -14,6 +14,7 @@ import pytest
 from aolink import estimate
 from aolink.devices.mirrors.microscope import MicroscopeMirror
 from aolink.errors import DeviceError, RigError
+from aolink.extensions import install_command
 from aolink.recording.reader import Recording
 from aolink.rig import Rig, load_rig
 from aolink.session import Report, record
@@ -62,7 +63,7 @@ def test_what_is_wrong_is_one_line(keys: dict[str, Any], error: type[Exception],
 
 def test_without_the_library_the_error_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "microscope.abc", None)
-    with pytest.raises(DeviceError, match=re.escape("pip install 'aolink[microscope]'")):
+    with pytest.raises(DeviceError, match=re.escape(install_command("microscope"))):
         opened()
 
 

@@ -15,6 +15,7 @@ import pytest
 from aolink import estimate
 from aolink.devices.mirrors.thorlabs import ThorlabsAligner, ThorlabsPiezo
 from aolink.errors import AolinkError, DeviceError, RigError
+from aolink.extensions import install_command
 from aolink.recording.reader import Recording
 from aolink.rig import Rig, load_rig, parse_rig
 from aolink.session import Report, record
@@ -179,7 +180,7 @@ def test_an_aligner_is_parked_after_an_answer_that_was_garbled() -> None:
 
 def test_without_the_codec_the_error_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "thorlabs_apt_protocol", None)
-    with Aligner() as device, pytest.raises(DeviceError, match=re.escape("pip install 'aolink[thorlabs]'")):
+    with Aligner() as device, pytest.raises(DeviceError, match=re.escape(install_command("thorlabs"))):
         ThorlabsAligner(rig_with(), port=device.port)
 
 

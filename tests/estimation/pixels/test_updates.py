@@ -371,7 +371,7 @@ def test_what_commands_left_in_the_state_is_foreseen(name):
     assert error < 0.01
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("name", PIXEL_ESTIMATORS)
 def test_a_lost_mode_is_found_again(name):
     """Two exposures after a filter was made sure of the opposite; without doubt it takes four."""
@@ -432,7 +432,7 @@ def test_the_posterior_of_a_single_coefficient_is_an_integral_over_a_line(update
     assert np.sqrt(update.coefficients.covariance[0, 0, 0]) == pytest.approx(sd, rel=0.25)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("name", PIXEL_ESTIMATORS)
 def test_an_unstable_plant_does_not_end_in_infinity(name):
     """What it would be without a camera grows without end; what the camera says of it does not."""
