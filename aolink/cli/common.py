@@ -58,7 +58,7 @@ EstimatorOption = Annotated[
 
 def _no_signing(option: typer.CallbackParam, value: str | bool | None) -> None:
     if value not in (None, False):
-        from aolink.devices.identity import NO_SIGNING
+        from aolink.wire.packet import NO_SIGNING
 
         raise PortError(f"{'/'.join(option.opts)}: {NO_SIGNING}")
 

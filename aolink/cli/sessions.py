@@ -251,10 +251,10 @@ def replay(
     if to_rig:
         if control:
             raise typer.BadParameter("--to-rig sends the recorded commands: `aolink record --control` closes a loop")
-        driven = recording.rig.devices
-        if not (output and (camera or "camera" in driven) and (mirror or "mirror" in driven)):
+        if not (output and camera and mirror):
             raise typer.BadParameter(
-                "--to-rig needs -o FILE, --camera PORT and --mirror PORT, or [devices] in its rig file"
+                "--to-rig needs -o FILE, --camera PORT and --mirror PORT, because no device that a recording names is"
+                f" opened; with drivers use `aolink record --rig RIG.toml --input {file} -o FILE`"
             )
         _replay_to_rig(recording, names, camera, mirror, output, overwrite=overwrite, as_json=as_json)
         return

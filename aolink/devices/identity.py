@@ -10,15 +10,9 @@ from aolink.rig import Rig
 from aolink.wire import messages_pb2 as pb
 from aolink.wire.hub import Hub
 from aolink.wire.link import Link
-from aolink.wire.packet import PROTOCOL_VERSION, schema_hash
+from aolink.wire.packet import NO_SIGNING, PROTOCOL_VERSION, SIGNED_VERSION, schema_hash
 
 _LONGEST_NAME = 200
-_SIGNED_VERSION = 2
-"""Protocol version of signed packets, which there were once."""
-NO_SIGNING = (
-    "packets are no longer signed, and a simulated rig serves its own machine only: use no key at either end, and let"
-    " other machines in through a tunnel, such as ssh -N -L 5000:127.0.0.1:5000 -L 5001:127.0.0.1:5001 USER@MACHINE"
-)
 
 
 def new_nonce() -> int:
@@ -58,7 +52,7 @@ def identify(hub: Hub, link: Link, nonce: int) -> pb.Identity:
         update = f"update the {'device' if found < PROTOCOL_VERSION else 'host'}"
         raise DeviceError(
             f"the device on the {link.name} port speaks protocol version {found}, this aolink speaks"
-            f" {PROTOCOL_VERSION}: {NO_SIGNING if found == _SIGNED_VERSION else update}"
+            f" {PROTOCOL_VERSION}: {NO_SIGNING if found == SIGNED_VERSION else update}"
         )
     if identity.schema_hash != schema_hash():
         raise DeviceError(

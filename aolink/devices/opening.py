@@ -10,10 +10,10 @@ from typing import Any
 
 from aolink.devices.adapted_camera import AdaptedCamera
 from aolink.devices.adapted_mirror import AdaptedMirror
-from aolink.devices.drivers import KINDS, NATIVE, DeviceKind, calling, driver_names, open_driver
+from aolink.devices.drivers import KINDS, NATIVE, DeviceKind, calling, driver_names, native_port, open_driver
 from aolink.devices.gate import Gate
 from aolink.devices.host import Host
-from aolink.devices.identity import NO_SIGNING, check_against_rig, check_kind, identify, new_nonce
+from aolink.devices.identity import check_against_rig, check_kind, identify, new_nonce
 from aolink.devices.interfaces import Mirror, Opened
 from aolink.devices.native import NativeCamera, NativeMirror
 from aolink.devices.no_mirror import NoMirror
@@ -70,7 +70,7 @@ def open_devices(
     host = Host(stop)
     with ExitStack() as stack:
         stack.callback(host.close)
-        ports = {kind: _port_of(kind, table) for kind, table in tables.items() if table.driver == NATIVE}
+        ports = {kind: native_port(kind, table) for kind, table in tables.items() if table.driver == NATIVE}
         native_camera, native_mirror, warnings = _open_native(rig, host, ports, stop)
         if reconnect_s:
             _allow_return(host, stop, reconnect_s)
@@ -145,18 +145,6 @@ def _closing_what_fails(kind: DeviceKind, close: Callable[[], None]) -> Iterator
         with suppress(Exception):  # it may lack ``close`` as well
             close()
         raise
-
-
-def _port_of(kind: DeviceKind, table: DeviceTable) -> str:
-    if "key" in table.options:
-        raise RigError(f"devices.{kind}.key: {NO_SIGNING}")
-    port = table.options.get("port")
-    if not isinstance(port, str) or len(table.options) > 1 or table.delay:
-        raise RigError(
-            f"devices.{kind}: the driver {NATIVE} takes port, a text; found {table.options}"
-            f"{' and a delay' if table.delay else ''}"
-        )
-    return port
 
 
 def _open_native(
