@@ -130,7 +130,6 @@ def record(
         if not 0 < periods <= MOST_EXPOSURES:
             raise typer.BadParameter(f"--duration {duration:g} is not a number of seconds above zero")
         exposures = math.ceil(periods)
-    loaded, camera, mirror = common.with_key(loaded, camera, mirror, key)
     played = None
     if inputs:
         from aolink.session.excitation import excitation
@@ -255,16 +254,15 @@ def replay(
     if to_rig:
         if control:
             raise typer.BadParameter("--to-rig sends the recorded commands: `aolink record --control` closes a loop")
-        driven = recording.rig.devices
-        if not (output and (camera or "camera" in driven) and (mirror or "mirror" in driven)):
+        if not (output and camera and mirror):
             raise typer.BadParameter(
-                "--to-rig needs -o FILE, --camera PORT and --mirror PORT, or [devices] in its rig file"
+                "--to-rig needs -o FILE, --camera PORT and --mirror PORT, because no device that a recording names is"
+                f" opened; with drivers use `aolink record --rig RIG.toml --input {file} -o FILE`"
             )
-        to = common.with_key(recording.rig, camera, mirror, key)
-        _replay_to_rig(recording, names, *to, output, overwrite=overwrite, as_json=as_json)
+        _replay_to_rig(recording, names, camera, mirror, output, overwrite=overwrite, as_json=as_json)
         return
-    if camera or mirror or key or output:
-        raise typer.BadParameter("--camera, --mirror, --key and -o are for --to-rig")
+    if camera or mirror or output:
+        raise typer.BadParameter("--camera, --mirror and -o are for --to-rig")
     if control:
         if view or rate or start or end is not None:
             raise typer.BadParameter("--control takes the whole recording at once: leave out --view, --rate and times")
@@ -311,8 +309,8 @@ def _replay_control(recording: "Recording", controller: str, estimator: str, *, 
 
 
 def _replay_to_rig(
-    recording: "Recording", names: list[str], rig: "Rig", camera: str | None, mirror: str | None, output: Path, *,
-    overwrite: bool, as_json: bool,
+    recording: "Recording", names: list[str], camera: str | None, mirror: str | None, output: Path, *, overwrite: bool,
+    as_json: bool,
 ) -> None:  # fmt: skip
     from aolink import session
     from aolink.cli.tables import recordings as tables
@@ -325,7 +323,7 @@ def _replay_to_rig(
     commands = RecordedCommands(recording)
     with StopRequest().installed() as stop, progress("exposures", commands.exposures) as tell:
         report = session.record(
-            rig, camera, mirror, output, estimators=names, exposures=commands.exposures,
+            recording.rig, camera, mirror, output, estimators=names, exposures=commands.exposures,
             inputs=commands.inputs, note=f"commands of {recording.path.name}", overwrite=overwrite, stop=stop,
             progress=tell,
         )  # fmt: skip

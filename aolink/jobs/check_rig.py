@@ -11,7 +11,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from aolink.devices.drivers import KINDS, NATIVE, check_driver
+from aolink.devices.drivers import KINDS, NATIVE, check_driver, native_port
 from aolink.devices.interfaces import lacks_of
 from aolink.errors import AolinkError
 from aolink.estimation.assumptions import broken_assumptions, narrow_intervals, peak_snr
@@ -91,16 +91,15 @@ def check_devices(rig: Rig) -> Iterator[Finding]:
         if table is None:
             continue
         key = f"devices.{kind}"
-        if table.driver != NATIVE:
-            try:
-                driver = check_driver(kind, table, rig)
-            except AolinkError as error:
-                yield _error(key, str(error))
+        try:
+            if table.driver == NATIVE:
+                native_port(kind, table)
                 continue
-            lacks = "; ".join(lacks_of(driver)) or "nothing"
-            yield _info(key, f"the driver {table.driver}; what its device lacks: {lacks}")
-        elif table.delay is not None:
-            yield _error(key, f"the driver {NATIVE} reports its time: delay_s and delay_sd_s are for others")
+            lacks = "; ".join(lacks_of(check_driver(kind, table, rig))) or "nothing"
+        except AolinkError as error:
+            yield _error(key, str(error))
+            continue
+        yield _info(key, f"the driver {table.driver}; what its device lacks: {lacks}")
     if rig.devices and "mirror" not in rig.devices:
         yield _info("devices.mirror", "no mirror is named: without --mirror the camera is recorded alone")
 

@@ -76,7 +76,7 @@ def simulated_rig(rig: str | Path, *options: str) -> Iterator[tuple[str, str]]:
     DeviceError
         The process does not start.
     """
-    command = [sys.executable, "-m", "aolink", "rig", str(rig), "--json", "--tied", *options]
+    command = [sys.executable, "-P", "-m", "aolink", "rig", str(rig), "--json", "--tied", *options]
     # It has a process group of its own: Ctrl-C goes to the session, which still has to park the mirror.
     # Its input is a pipe that ends with this process, however that ends, and the rig ends with the pipe.
     started = False

@@ -201,9 +201,9 @@ class EstimatorProcess:
         self._to_send: deque[memoryview] = deque()
         self._received = bytearray()
         self._connection, theirs = socket.socketpair()
-        # It imports modules from where this process has found them. Its linear algebra has one thread, as
-        # in all processes of a pool: the cores are for the loop as well.
-        environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+        # It imports modules from where this process has found them, except the current folder. Its linear algebra has
+        # one thread, as in all processes of a pool: the cores are for the loop as well.
+        environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(os.path.isabs, sys.path))}
         environment |= dict.fromkeys(THREAD_VARIABLES, "1")
         main = f"from aolink.session.estimator_process import main; main({theirs.fileno()}, {os.getpid()}, {niceness})"
         with theirs:

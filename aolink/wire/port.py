@@ -1,4 +1,4 @@
-"""Ports: everything that pyserial opens, behind five methods. No other module uses pyserial."""
+"""Ports: device paths and plain addresses that pyserial opens, behind five methods. No other module uses pyserial."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ class SerialPort:
     def __init__(self, url: str, baud_rate: int = BAUD_RATE, *, stop: Callable[[], bool] = lambda: False) -> None:
         self.url = url
         self._stop = stop
-        _check_address(url)
+        check_address(url)
         try:
             self._serial = serial.serial_for_url(
                 url, baudrate=baud_rate, timeout=0, write_timeout=_WRITE_TIMEOUT_S, exclusive=True
@@ -197,11 +197,14 @@ def is_local(transport: Transport) -> bool:
     return False
 
 
+_SCHEMES = ("socket", "rfc2217")
+"""The others of pyserial write files, search for devices, or import code."""
 _FORMS = "a port is a device path such as /dev/ttyACM0, or an address such as socket://192.168.1.5:5000"
 
 
-def _check_address(url: str) -> None:
-    """Raise PortError for a text that cannot be a port: an address without host or number, a folder, a file of data."""
+def check_address(url: str) -> None:
+    """Raise PortError for a text that cannot be a port: a folder, a file of data, an address of another kind, one
+    without host or number, or one with options, by which pyserial can be made to write files."""
     scheme, slashes, _ = url.partition("://")
     if not slashes:
         try:
@@ -212,16 +215,17 @@ def _check_address(url: str) -> None:
             what = "a folder" if stat.S_ISDIR(mode) else "a file, not a device"
             raise PortError(f"{url} is {what}: `aolink devices` lists the ports of this machine; {_FORMS}")
         return
-    if scheme not in ("socket", "rfc2217"):
-        return
+    if scheme.lower() not in _SCHEMES:
+        raise PortError(f"{url!r} is not a port that aolink opens: {_FORMS}")
     try:
         parts = urlsplit(url)
-        host, number = parts.hostname, parts.port
+        host, number, more = parts.hostname, parts.port, parts.path.strip("/") + parts.query + parts.fragment
     except ValueError:  # a number that is none, or above 65535
-        host, number = "", None
-    if not host or not number:
+        host, number, more = "", None, ""
+    if not host or not number or more:
         raise PortError(
-            f"{url} is not an address: expected {scheme}://HOST:PORT with a number from 1 to 65535; {_FORMS}"
+            f"{url!r} is not an address: expected {scheme.lower()}://HOST:PORT with a number from 1 to 65535 and"
+            f" nothing behind it; {_FORMS}"
         )
 
 
@@ -244,8 +248,6 @@ def _open_error(url: str, error: Exception) -> PortError:
         return PortError(f"no permission to open {url}: on Debian, add yourself to the group dialout and log in again")
     if number == errno.ECONNREFUSED or "refused" in str(error):
         return PortError(f"nothing listens at {url}: start the device or its server first")
-    if "://" in url and number is None:
-        return PortError(f"{url} is not an address that pyserial can open ({_plain(error)}); {_FORMS}")
     return PortError(f"cannot open {url}: {_plain(error)}")
 
 

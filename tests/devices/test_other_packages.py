@@ -75,7 +75,10 @@ def test_a_session_with_devices_of_another_package(aolink: Run, installed: dict[
     for exposure, estimate in zip(exposures, estimate_exposures(tmp_path / "a.mcap", "o1"), strict=True):
         assert exposure.truth is not None
         assert np.abs(estimate.path - exposure.truth.path).max() < 0.02  # its frames have no noise
-    again = aolink("replay", "a.mcap", "--to-rig", "-o", "b.mcap", env=installed)  # the recording has the rig file
+    refused = aolink("replay", "a.mcap", "--to-rig", "-o", "b.mcap", env=installed)
+    assert refused.returncode == 2
+    assert not (tmp_path / "b.mcap").exists()
+    again = aolink("record", "--rig", rig, "--input", "a.mcap", "-o", "b.mcap", env=installed)
     assert again.returncode == 0, again.stderr
     assert "b.mcap: 6 exposures, complete" in again.stdout
     info = aolink("info", "a.mcap")
@@ -223,7 +226,7 @@ def test_a_driver_that_fails_ends_the_session_in_good_order(
             4,
             "the driver of the camera failed when it was opened: TypeError",
         ),
-        ('driver = "native"\nbaud = 9600', 2, "devices.camera: the driver native takes port, a text, and key"),
+        ('driver = "native"\nbaud = 9600', 2, "devices.camera: the driver native takes port, a text"),
         ("port = 3", 2, "devices.camera.driver is missing"),
     ],
 )

@@ -8,6 +8,7 @@ import os
 import pty
 import re
 import resource
+import shutil
 import signal
 import socket
 import subprocess
@@ -42,6 +43,7 @@ from tests.session.native import open_native
 
 Run = Callable[..., subprocess.CompletedProcess[str]]
 Start = Callable[..., "subprocess.Popen[str]"]
+RECORDING = Path(__file__).parents[2] / "recordings" / "section-vi.mcap"
 
 
 def record_arguments(
@@ -125,6 +127,11 @@ def test_another_protocol_version_is_refused(aolink: Run) -> None:
         result = aolink("devices", port)
     assert result.returncode == 4
     assert "speaks protocol version 3, this aolink speaks 1: update the host" in result.stderr
+    with fake_device(lambda packet: encode_packet(Packet(2, 2, packet.sequence, b"\x08\x01" + bytes(13)))) as port:
+        result = aolink("devices", port)
+    assert result.returncode == 4
+    assert "speaks protocol version 2, this aolink speaks 1: packets are no longer signed" in result.stderr
+    assert result.stderr.count("\n") == 1
 
 
 def test_another_schema_is_refused(aolink: Run) -> None:
@@ -422,10 +429,29 @@ def test_numbers_that_make_no_sense(aolink: Run, tmp_path: Path, arguments: list
     assert not (tmp_path / "a.mcap").exists()
 
 
-def test_a_port_that_cannot_be_waited_on(aolink: Run) -> None:
-    result = aolink("devices", "loop://")
-    assert result.returncode == 3
-    assert "loop:// is a port that cannot be waited on: use a device path or socket://host:port" in result.stderr
+@pytest.mark.parametrize("where", ["devices", "record", "rig file", "check", "replay"])
+def test_a_port_that_would_write_a_file_is_refused_before_it_does(aolink: Run, tmp_path: Path, where: str) -> None:
+    (precious := tmp_path / "precious").write_text("precious")
+    master, slave = pty.openpty()
+    port = f"spy://{os.ttyname(slave)}?file={precious}"
+    text = load_rig("section-vi").toml + f'\n[devices]\nmirror = {{ driver = "native", port = "{port}" }}\n'
+    (tmp_path / "my.toml").write_text(text)
+    shutil.copy(RECORDING, tmp_path / "old.mcap")
+    command = {
+        "devices": ["devices", port],
+        "record": ["record", "--camera", os.ttyname(slave), "--mirror", port, "--rig", "section-vi", "-o", "a.mcap"],
+        "rig file": ["record", "--camera", os.ttyname(slave), "--rig", "my.toml", "-o", "a.mcap"],
+        "check": ["rig", "my.toml", "--check"],
+        "replay": ["replay", "old.mcap", "--to-rig", "--camera", port, "--mirror", port, "-o", "a.mcap"],
+    }[where]
+    result = aolink(*command)
+    os.close(master)
+    os.close(slave)
+    assert precious.read_text() == "precious"
+    assert result.returncode == (2 if where == "check" else 3)
+    said = result.stdout if where == "check" else result.stderr
+    assert f"{port!r} is not a port that aolink opens: a port is a device path" in said
+    assert "Traceback" not in said
 
 
 @pytest.mark.parametrize(
@@ -437,11 +463,25 @@ def test_a_port_that_cannot_be_waited_on(aolink: Run) -> None:
         ("socket://127.0.0.1:99999", "is not an address: expected socket://HOST:PORT"),
         ("socket://127.0.0.1:-5", "is not an address: expected socket://HOST:PORT"),
         ("socket://[::1:5", "is not an address: expected socket://HOST:PORT"),
-        ("socket://127.0.0.1:5?speed=1", "is not an address that pyserial can open"),
+        ("socket://127.0.0.1:5?logging=debug", "number from 1 to 65535 and nothing behind it"),
+        ("socket://127.0.0.1:5/debug", "number from 1 to 65535 and nothing behind it"),
         ("rfc2217://", "is not an address: expected rfc2217://HOST:PORT"),
-        ("hwgrep://[", "is not an address that pyserial can open"),
-        ("spy://", "there is no port spy://"),
-        ("nonsense://1", "there is no port nonsense://1"),
+        ("rfc2217://127.0.0.1:5?ign_set_control&timeout=9", "number from 1 to 65535 and nothing behind it"),
+        ("RFC2217://127.0.0.1:5#logging", "number from 1 to 65535 and nothing behind it"),
+        *(
+            (f"{scheme}://{rest}", "is not a port that aolink opens")
+            for scheme, rest in [
+                ("spy", "loop://?file=a"),
+                ("SPY", "loop://"),
+                (" spy", "loop://"),
+                ("alt", "/dev/null?class=Serial"),
+                ("loop", "?logging=debug"),
+                ("hwgrep", "["),
+                ("cp2110", ""),
+                ("nonsense", "1"),
+                ("", "x"),
+            ]
+        ),
         ("", "there is no port without a name"),
         ("/dev/null", "/dev/null is a device, but no serial port"),
         (".", r"\. is a folder"),

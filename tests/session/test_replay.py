@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 from collections.abc import Callable
 from pathlib import Path
@@ -15,10 +16,12 @@ from aolink.recording import topics
 from aolink.recording.compare import compare
 from aolink.recording.reader import Recording
 from aolink.recording.reestimate import first_difference
+from aolink.rig import load_rig
 from aolink.session import record
 from aolink.session.replay import RecordedCommands, replay
 from tests.commands import simulated_rig
 from tests.conftest import ESTIMATORS, EXPOSURES, Session
+from tests.recording.small import write_small
 
 Run = Callable[..., subprocess.CompletedProcess[str]]
 
@@ -129,3 +132,16 @@ def test_the_command_plays_a_part_and_says_what_a_rig_needs(aolink: Run, recorde
     wrong = aolink("replay", recorded.path, "--to-rig")
     assert wrong.returncode == 2
     assert "--to-rig needs" in wrong.stderr
+
+
+def test_no_device_that_a_recording_names_is_opened(aolink: Run, tmp_path: Path) -> None:
+    """Neither a driver nor a port: a recording may come from anywhere."""
+    native = 'driver = "native", port = "/dev/ttyACM0"'
+    (rig := tmp_path / "my.toml").write_text(
+        f"{load_rig('section-vi').toml}\n[devices]\ncamera = {{ {native} }}\nmirror = {{ {native} }}\n"
+    )
+    write_small(tmp_path / "a.mcap", 2, rig=str(rig))
+    for given in ((), ("--camera", "/dev/ttyACM0"), ("--mirror", "/dev/ttyACM0")):
+        wrong = aolink("replay", "a.mcap", "--to-rig", "-o", "b.mcap", *given)
+        assert wrong.returncode == 2
+        assert "no device that a recording names is opened" in " ".join(re.sub("│", "", wrong.stderr).split())

@@ -116,7 +116,7 @@ def test_a_port_that_is_pulled_is_one_clear_error(peer: Peer, link: Link) -> Non
 def test_a_port_that_is_not_there_is_refused() -> None:
     with pytest.raises(PortError, match=r"there is no port /dev/nowhere: `aolink devices` lists"):
         SerialPort("/dev/nowhere")
-    with pytest.raises(PortError, match="there is no port nonsense://"):
+    with pytest.raises(PortError, match="nonsense://x' is not a port that aolink opens"):
         SerialPort("nonsense://x")
 
 

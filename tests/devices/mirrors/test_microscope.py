@@ -22,8 +22,18 @@ from tests.devices.mirrors import bench
 from tests.devices.simulators import spot_camera
 from tests.devices.simulators.deformable import WatchedMirror
 
-DEVICE = "tests.devices.simulators.deformable.WatchedMirror"
+DEVICE = "watched"
 RIG = load_rig("tip-tilt")
+
+
+@pytest.fixture(autouse=True)
+def drivers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    bench.install(
+        monkeypatch, tmp_path,
+        microscope="aolink.devices.mirrors.microscope:MicroscopeMirror\n[aolink.microscope]\n"
+        f"{DEVICE} = tests.devices.simulators.deformable:WatchedMirror\n"
+        "other = tests.devices.simulators.spot_camera:SpotCamera",
+    )  # fmt: skip
 
 
 def opened(**keys: Any) -> MicroscopeMirror:
@@ -51,14 +61,27 @@ def test_inputs_are_parts_of_the_range_of_each_actuator() -> None:
         ({"unit": "a"}, RigError, "devices.mirror.unit: expected a finite number"),
         ({"device": "microscope.simulators.SimulatedCamera"}, RigError, "is no deformable mirror of python-microscope"),
         ({"device": "microscope.mirror.alpao.AlpaoDeformableMirror"}, DeviceError, "cannot be had .LibraryLoadError.*"),
-        ({"device": "nowhere.Mirror"}, DeviceError, "nowhere.Mirror cannot be had .ModuleNotFoundError.*right"),
-        ({"device": "Mirror"}, DeviceError, "Mirror cannot be had"),
+        ({"device": "microscope.nowhere.Mirror"}, DeviceError, "Mirror cannot be had .ModuleNotFoundError.*right"),
+        ({"device": "microscope.mirror"}, RigError, "microscope.mirror is no class of python-microscope"),
+        ({"device": "other"}, RigError, "is no deformable mirror of python-microscope"),
+        ({"device": "nowhere"}, RigError, "no installed package offers a device of this name"),
         ({"device": 3}, RigError, "devices.mirror.device: expected a text, found 3"),
     ],
 )
 def test_what_is_wrong_is_one_line(keys: dict[str, Any], error: type[Exception], what: str) -> None:
     with pytest.raises(error, match=what):
         opened(**keys)
+
+
+@pytest.mark.parametrize("device", ["payload.Mirror", "microscope_extra.Mirror", "microscope.payload.Mirror"])
+def test_no_other_module_is_imported(device: str, tmp_path: Path) -> None:
+    """Whatever lies on the path: a rig file may come from anywhere."""
+    for name in ("payload", "microscope_extra"):
+        (tmp_path / f"{name}.py").write_text("raise SystemExit('it has run')")
+    (tmp_path / "microscope").mkdir()
+    (tmp_path / "microscope" / "payload.py").write_text("raise SystemExit('it has run')")
+    with pytest.raises((RigError, DeviceError), match=r"no class of python-microscope|cannot be had"):
+        opened(device=device)
 
 
 def test_without_the_library_the_error_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -80,8 +103,7 @@ def session_rig(settings: str = "") -> Rig:
     )
 
 
-def test_a_whole_session(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    bench.install(monkeypatch, tmp_path, microscope="aolink.devices.mirrors.microscope:MicroscopeMirror")
+def test_a_whole_session(tmp_path: Path) -> None:
     spot_camera.mirror.held = held
     report = record(session_rig(), None, None, tmp_path / "a.mcap", estimators=["o1"], exposures=10)
     assert report.ended == "complete"
@@ -101,10 +123,9 @@ def test_a_whole_session(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
     ("settings", "parked"), [(", fails = [30, 31]", True), (", fails = [30, inf], keeps_on = true", False)]
 )
 def test_a_device_that_fails_in_a_session_is_parked_where_it_can_be_and_shut_down(
-    settings: str, parked: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    settings: str, parked: bool, tmp_path: Path
 ) -> None:
     """The first thing that went wrong is said, not what could not be done about it."""
-    bench.install(monkeypatch, tmp_path, microscope="aolink.devices.mirrors.microscope:MicroscopeMirror")
     spot_camera.mirror.held = held
     what = r"the driver of the mirror failed .*RuntimeError\(.*no answer from the electronics"
     with pytest.raises(DeviceError, match=what):
@@ -114,10 +135,7 @@ def test_a_device_that_fails_in_a_session_is_parked_where_it_can_be_and_shut_dow
     bench.check_ended(report, tmp_path / "a.mcap")
 
 
-def test_a_device_that_cannot_be_shut_down_is_one_line_after_a_session(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    bench.install(monkeypatch, tmp_path, microscope="aolink.devices.mirrors.microscope:MicroscopeMirror")
+def test_a_device_that_cannot_be_shut_down_is_one_line_after_a_session(tmp_path: Path) -> None:
     spot_camera.mirror.held = held
     what = r"the driver of the mirror failed when it was closed: RuntimeError\(.*cannot be shut down"
     with pytest.raises(DeviceError, match=what):
