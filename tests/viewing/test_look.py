@@ -39,6 +39,7 @@ def test_one_exposure_has_every_step_of_its_paths_and_nothing_of_others(aolink: 
     assert "Latency" not in layout
 
 
+@pytest.mark.slow
 def test_a_layout_about_an_exposure_has_a_few_views_of_it_and_all_exposures_are_there(tmp_path: Path) -> None:
     recording = Recording(RECORDINGS / "moving-scene.mcap")
     path = save_rrd(recording, tmp_path / "about.rrd", look=Look(about=9))
