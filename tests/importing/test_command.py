@@ -34,6 +34,7 @@ def test_a_film_of_every_kind_becomes_a_recording(kind, aolink, rig, tmp_path):
     np.testing.assert_array_equal(pixels, FRAMES.astype(int) * 256)
 
 
+@pytest.mark.slow
 def test_the_recording_is_one_like_any_other(aolink, rig, tmp_path):
     source = others.written_npy(tmp_path, FRAMES)
     start = ["--start", "2026-09-21T10:30:00.25"]

@@ -120,7 +120,9 @@ def test_the_numbers_that_a_rig_comes_to_are_stated() -> None:
     assert "blocks of 50 steps, 50 ms; the device queues 400 ms" in info["mirror"]
 
 
-@pytest.mark.parametrize("name", builtin_rigs())
+@pytest.mark.parametrize(
+    "name", [pytest.param(each, marks=[pytest.mark.slow] if "x" in each else []) for each in builtin_rigs()]
+)
 def test_the_rigs_that_come_along_have_no_error(name: str) -> None:
     findings = check_rig(load_rig(name))
     assert not [f for f in findings if f.severity == "error"]

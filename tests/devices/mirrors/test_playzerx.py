@@ -240,6 +240,7 @@ def session_rig(device: simulators.PlayzerX) -> Rig:
     return parse_rig(rig.toml.replace("dac_bits = 16", "dac_bits = 12\nqueue_steps = 150"))
 
 
+@pytest.mark.slow
 def test_a_whole_session(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     bench.install(monkeypatch, tmp_path, playzerx=NAMED)
     with simulators.PlayzerX(rate_error=-50e-6) as device:

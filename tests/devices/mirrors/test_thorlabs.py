@@ -191,6 +191,7 @@ def session_rig(devices: list[str]) -> Rig:
     return parse_rig(rig.toml.replace("dac_bits = 16", "dac_bits = 12"))
 
 
+@pytest.mark.slow
 def test_a_whole_session(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     bench.install(monkeypatch, tmp_path, thorlabs_piezo="aolink.devices.mirrors.thorlabs:ThorlabsPiezo")
     with Piezo("BPC303", bays=2) as device:
