@@ -120,8 +120,11 @@ def test_the_numbers_that_a_rig_comes_to_are_stated() -> None:
     assert "blocks of 50 steps, 50 ms; the device queues 400 ms" in info["mirror"]
 
 
+LARGE = ("membrane-12x12", "sh-30x30")
+
+
 @pytest.mark.parametrize(
-    "name", [pytest.param(each, marks=[pytest.mark.slow] if "x" in each else []) for each in builtin_rigs()]
+    "name", [pytest.param(each, marks=[pytest.mark.slow] if each in LARGE else []) for each in builtin_rigs()]
 )
 def test_the_rigs_that_come_along_have_no_error(name: str) -> None:
     findings = check_rig(load_rig(name))
