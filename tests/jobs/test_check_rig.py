@@ -121,7 +121,12 @@ def test_the_numbers_that_a_rig_comes_to_are_stated() -> None:
     assert "the outputs show 2 of the plant's 2 states, and the centroids of exposures alone 2; o2" in info["plant"]
 
 
-@pytest.mark.parametrize("name", builtin_rigs())
+LARGE = ("membrane-12x12", "sh-30x30")
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(each, marks=[pytest.mark.slow] if each in LARGE else []) for each in builtin_rigs()]
+)
 def test_the_rigs_that_come_along_have_no_error(name: str) -> None:
     findings = check_rig(load_rig(name))
     assert not [f for f in findings if f.severity == "error"]

@@ -566,6 +566,7 @@ def test_a_file_that_is_not_a_recording(aolink: Run, tmp_path: Path, content: by
     assert_refused(aolink("info", "missing.mcap"), 5, "cannot read missing.mcap: no such file or directory")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "unwanted"),
     [
