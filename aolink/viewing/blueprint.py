@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -134,7 +135,7 @@ def _part_of_page(contents: Contents) -> tuple[range, range]:
         return range(HISTORY), range(line.pixels)
     first = min(max(0, contents.about - _ROWS // 2), HISTORY - _ROWS)
     low, high = ((end - line.field[0]) / line.pixel_width for end in near)
-    return range(first, first + _ROWS), range(round(low), round(high))
+    return range(first, first + _ROWS), range(math.floor(low), math.ceil(high))
 
 
 def _tabs(contents: Sequence[rrb.Container | rrb.View]) -> rrb.Container | rrb.View:

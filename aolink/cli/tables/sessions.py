@@ -103,13 +103,14 @@ def _counted(counts: Iterable[tuple[int, str]]) -> list[str]:
 def _control(report: ControlReport) -> str:
     served = f" with {report.estimator}" if report.estimator else ""
     text = f"{report.controller}{served}: {report.exposures} exposures taken, slopes {report.slope_rms:.4g} rms"
-    if counts := report.counts().get("delay_ms"):
-        text += f"; delay p50 {counts:.3g} ms, longest {report.counts()['longest_delay_ms']:.3g} ms"
-    return (
-        f"{text}, {report.late_exposures} later than control.delay_s; loop open for {report.open_exposures} exposures,"
-        f" model off for {report.misfit_exposures}, fallen back for {report.fall_back_exposures}; limits changed"
-        f" {report.clipped_steps} steps"
-    )
+    if delay := report.counts().get("delay_ms"):
+        text += f"; delay p50 {delay:.3g} ms, longest {report.counts()['longest_delay_ms']:.3g} ms"
+    counts = (
+        (report.late_exposures, "later than control.delay_s"), (report.open_exposures, "with the loop open"),
+        (report.misfit_exposures, "while the model did not fit"), (report.fall_back_exposures, "fallen back"),
+        (report.clipped_steps, "steps changed by the limits"),
+    )  # fmt: skip
+    return ", ".join([text, *_counted(counts)])
 
 
 def _estimation(report: EstimatorReport) -> str:
