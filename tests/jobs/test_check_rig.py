@@ -39,7 +39,7 @@ def found(severity: str, **values: str) -> dict[str, str]:
         ({"counts_per_density": "0.01"}, "sensor.counts_per_density", "the read-out rounds it away"),
         ({"process_noise": "1e6"}, "plant.process_noise", "more than the field is wide"),
         ({"amplitude": "0.04"}, "drive.amplitude", "lower drive.amplitude or widen sensor.field"),
-        ({"counts_per_density": "1e-300"}, "rig", "too large or too small to compute with"),
+        ({"C": "[[1e-300, 0.0]]"}, "rig", "too large or too small to compute with"),
     ],
 )
 def test_what_cannot_work_is_an_error(values: dict[str, str], key: str, message: str) -> None:
