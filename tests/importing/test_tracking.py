@@ -284,6 +284,7 @@ def test_saturated_pixels_do_not_widen_the_kernel(walkers: SpotFilm) -> None:
     assert not first_rig(array_film(walkers.frames, "film"), SETTINGS, "film").notes
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 def test_a_motion_that_is_none_of_them_is_said(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -328,6 +329,7 @@ def test_a_vibration_is_fitted_as_its_means_over_frames(period: float, lasts: fl
     assert found == pytest.approx(later, rel=1e-5, abs=1e-6)
 
 
+@pytest.mark.slow
 def test_a_drift_is_found_beside_a_walk_and_a_bound_motion() -> None:
     rng = np.random.default_rng(8)
     walk = random_walk(rng, 400, 3, 0.3).mean(axis=1).reshape(400, 6)
@@ -394,6 +396,7 @@ def test_the_path_in_an_exposure_has_the_covariances_of_means_over_frames(forget
     assert next_ == pytest.approx(((1 - a) / rate) ** 2, abs=0.02)
 
 
+@pytest.mark.slow
 def test_a_lost_frame_is_no_step_of_the_motion() -> None:
     """Every fifth frame of a vibration is lost: the other frames are fitted with their own times."""
     rng = np.random.default_rng(14)

@@ -84,6 +84,7 @@ def outer():
 """
 
 
+@pytest.mark.slow
 def test_a_source_that_is_older_than_the_code_made_of_another_is_compiled_all_the_same(tmp_path):
     """Copies that keep time stamps (rsync -a, layers of images) bring changed sources with earlier dates."""
     for name, text in (("inner.py", INNER.format(1)), ("outer.py", OUTER)):
@@ -162,6 +163,7 @@ def test_nothing_is_compiled_in_a_session(name):
     assert several
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["moments", "moments:flux=measured,basis=fourier"])
 def test_nothing_is_compiled_in_a_session_of_moments(name):
     before, after, _ = first_session("section-vi-lively", name, 0.003, 4)

@@ -268,6 +268,7 @@ def test_a_rig_on_which_importance_sampling_is_too_sure_is_known_by_one_axis_of_
     assert importance_is_too_sure(dataclasses.replace(BRIGHT, plant=together))
 
 
+@pytest.mark.slow
 def test_copies_of_a_rig_whose_parameter_wanders_work_alike():
     wandering = Wandering(parameter="sensor_noise", rate_per_minute=0.1, largest=0.2)
     rig = dataclasses.replace(BRIGHT, plant=dataclasses.replace(BRIGHT.plant, wandering=wandering))
