@@ -28,8 +28,8 @@ def test_the_row_has_the_scores_that_estimate_prints(tmp_path: Path) -> None:
     row = estimate_file(source, tmp_path / "out.mcap")
     assert tuple(row) == COLUMNS
     recording = Recording(source)
-    scores, _ = scored_and_compared(recording, reestimated(recording, ["o3"]), ["o3"])
-    assert (row["path_rmse"], row["nis"]) == (scores["o3"].path_rmse, scores["o3"].nis.mean)
+    scores, _ = scored_and_compared(recording, reestimated(recording, ["moments"]), ["moments"])
+    assert (row["path_rmse"], row["nis"]) == (scores["moments"].path_rmse, scores["moments"].nis.mean)
     assert (row["recording"], row["output"], row["error"]) == (str(source), "out.mcap", None)
 
 
@@ -42,7 +42,7 @@ def test_the_table_of_exposures_has_a_row_for_each(tmp_path: Path) -> None:
     found = table.to_pydict()
     for key in ("path_rmse", "start_rmse", "end_rmse"):
         assert np.sqrt(np.mean(np.square(found[key]))) == pytest.approx(row[key])
-    estimates = Recording(source, side=[tmp_path / "out.mcap"]).estimates("o3")
+    estimates = Recording(source, side=[tmp_path / "out.mcap"]).estimates("moments")
     assert found["frame_id"] == [each.frame_id for each in estimates] == [1, 2, 3, 4, 5, 6]
     assert found["nis"] == [pytest.approx(each.nis.sum()) for each in estimates]
     assert found["time_ns"] == [1_700_000_000_000_000_000 + k * 200_000_000 for k in range(6)]
