@@ -16,8 +16,8 @@ from tests.needs import needed
 
 needed("pyrtc")
 sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
-from bench_rows.identification import DisturbanceChange, changed
-from bench_rows.loop_worth import Cell
+from bench_rows.identification import DisturbanceChange, changed  # noqa: E402 # where that is installed
+from bench_rows.loop_worth import Cell  # noqa: E402
 
 
 @pytest.mark.slow

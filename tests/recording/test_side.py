@@ -110,7 +110,7 @@ def test_what_does_not_belong_together_is_one_clear_error(aolink: Run, tmp_path:
 def test_view_and_compare_take_a_recording_and_its_side_file(aolink: Run, recorded: Session, tmp_path: Path) -> None:
     shutil.copy(recorded.path, source := tmp_path / "s.mcap")
     for name, model in (("same", Model()), ("other", OTHER)):
-        estimate_file(source, tmp_path / f"{name}.mcap", Settings("o3", model))
+        estimate_file(source, tmp_path / f"{name}.mcap", Settings(estimator="o3", model=model))
     same = aolink("compare", "s.mcap", "same.mcap", "--json")
     assert same.returncode == 0, same.stdout
     assert list(json.loads(same.stdout)["topics"]) == ["/estimate/o3"]
