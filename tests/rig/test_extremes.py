@@ -56,7 +56,7 @@ def test_a_damping_that_leaves_nothing_to_compute_is_one_error() -> None:
         parse_rig(text.replace("damping = 0.2", "damping = 1e-29"))
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize(("old", "new"), [("0.05]]", "1e29]]"), ("sigma = 0.05", "sigma = 1e-9")])
 def test_an_estimator_refuses_what_it_cannot_compute_with(old: str, new: str) -> None:
     """A table of light would take more memory than there is."""
@@ -80,7 +80,7 @@ def changed(text: str) -> Iterator[str]:
                 yield text[: found.start()] + value + text[found.end() :]
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_no_number_ends_in_anything_but_an_error_of_ours() -> None:
     errors = list[str]()
     for text in changed(TEXT):
