@@ -14,6 +14,8 @@ from pathlib import Path
 
 import pytest
 
+# A worker has a core: threads of BLAS would wait for each other there, busily. This is read when NumPy is loaded.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 _TICKS = os.sysconf("SC_CLK_TCK")
 _spared_s = _begun_s = 0.0
 

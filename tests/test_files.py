@@ -353,6 +353,7 @@ def test_a_read_only_file_system_is_one_clear_line(
     assert re.fullmatch(rf"aolink: cannot write {words[-1]}: {why}\n", refused.stderr), refused.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "words", [["demo", "--rig", "tip-tilt", "--out", "ro"], ["estimate", "{0}", "-e", "o1", "-o", "ro/out/"]]
 )

@@ -238,6 +238,7 @@ def test_a_batch_ends_in_good_order_with_its_processes(tmp_path: Path, places: d
         assert {path.with_suffix(".json") for path in results} == {*started.folder.glob("out/*.json")}
 
 
+@pytest.mark.slow
 def test_a_terminal_that_closes_ends_a_command(tmp_path: Path) -> None:
     """Its output fails from then on; the exit code tells all the same."""
     master, slave = pty.openpty()

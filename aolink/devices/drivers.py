@@ -12,6 +12,7 @@ from aolink.errors import AolinkError, DeviceError, RigError
 from aolink.extensions import installed, loaded
 from aolink.rig import Rig
 from aolink.rig.device_tables import DeviceTable
+from aolink.rig.toml_table import shown
 from aolink.wire.packet import NO_SIGNING
 from aolink.wire.port import check_address
 
@@ -59,7 +60,7 @@ def native_port(kind: DeviceKind, table: DeviceTable) -> str:
     port = table.options.get("port")
     if not isinstance(port, str) or len(table.options) > 1 or table.delay:
         raise RigError(
-            f"devices.{kind}: the driver {NATIVE} takes port, a text; found {table.options}"
+            f"devices.{kind}: the driver {NATIVE} takes port, a text; found {shown(table.options)}"
             f"{' and a delay, though it reports its time' if table.delay else ''}"
         )
     check_address(port)

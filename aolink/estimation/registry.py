@@ -113,8 +113,13 @@ def make_estimator(rig: Rig, name: str, **options: Any) -> Estimator:
     def made(rig: Rig) -> Estimator:
         # Code that the first exposure would load or compile is ready before the session.
         steps = rig.timing.exposure_steps
-        exposure_model(rig.plant, steps, rig.timing.exposure_offset).response(np.ones((steps, rig.n_inputs)))
-        return Estimator(rig, name, row.build(rig, chosen))
+        try:
+            exposure_model(rig.plant, steps, rig.timing.exposure_offset).response(np.ones((steps, rig.n_inputs)))
+            return Estimator(rig, name, row.build(rig, chosen))
+        except (ArithmeticError, ValueError) as error:  # a LinAlgError is a ValueError
+            raise EstimatorError(
+                f"{name} cannot compute with this rig: {error}; are its numbers too large or too small?"
+            ) from error
 
     if rig.plant.wandering is None or not row.wanders:
         return made(rig)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import select
 import subprocess
 import sys
 import time
@@ -20,6 +19,7 @@ from aolink.estimation import Score, estimator_row
 from aolink.estimation.registry import BASELINE_ESTIMATOR, DEFAULT_ESTIMATOR
 from aolink.exposure import residual_rms
 from aolink.files import writing
+from aolink.polling import wait_readable
 from aolink.recording.deblur import RestoredCounts, write_deblurred
 from aolink.recording.reader import Recording
 from aolink.recording.reestimate import first_difference, reestimate, scored
@@ -83,8 +83,7 @@ def simulated_rig(rig: str | Path, *options: str) -> Iterator[tuple[str, str]]:
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stdin=subprocess.PIPE, start_new_session=True)
     try:
         assert process.stdout is not None
-        ready, _, _ = select.select([process.stdout], [], [], _RIG_START_S)
-        line = process.stdout.readline() if ready else b""
+        line = process.stdout.readline() if wait_readable([process.stdout], _RIG_START_S) else b""
         if not line:
             raise DeviceError(f"the simulated rig did not start; try it by hand: {' '.join(command)}")
         ports, started = json.loads(line), True

@@ -8,7 +8,6 @@ and the same seed gives the same bytes however fast the host is.
 from __future__ import annotations
 
 import math
-import selectors
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
@@ -17,6 +16,7 @@ import numpy as np
 from google.protobuf.message import DecodeError, Message
 
 from aolink.errors import RigError
+from aolink.polling import wait_readable
 from aolink.rig import Faults, Rig
 from aolink.simulation.devices import LineName, Outgoing, SimulatedDevices
 from aolink.simulation.faults import Way
@@ -241,12 +241,9 @@ class RigServer:
         return min(max(due_ns / 1e9, 0.0), _IDLE_S)
 
     def _wait(self) -> None:
-        timeout = self.idle_s()
-        with selectors.DefaultSelector() as selector:
-            for line in [each for each in self._lines.values() if each.returns_ns is None]:
-                events = selectors.EVENT_READ | (selectors.EVENT_WRITE if line.unsent else 0)
-                selector.register(line.stream.fileno(), events)
-            idle = not selector.select(timeout)
+        here = [line for line in self._lines.values() if line.returns_ns is None]
+        unsent = [line.stream for line in here if line.unsent]
+        idle = not wait_readable([line.stream for line in here], self.idle_s(), unsent)
         if idle and not self._real_time:  # a delimiter was damaged on its way, and the host waits
             for line in self._lines.values():
                 line.take_undelimited()

@@ -234,7 +234,7 @@ def _nis(contents: Contents) -> list[rrb.View]:
     return [_lines(contents, f"NIS (no unit) with its {NIS_COVERAGE:.0%} bounds", shown)] if shown else []
 
 
-def _states(contents: Contents) -> list[rrb.Container]:
+def _states(contents: Contents) -> list[rrb.Container | rrb.View]:
     names = contents.estimators
     tabs = []
     for where in ("end", "start"):
@@ -313,7 +313,7 @@ def _devices(contents: Contents) -> list[rrb.Container | rrb.View]:
     return views
 
 
-def _texts(contents: Contents) -> rrb.Container:
+def _texts(contents: Contents) -> rrb.Container | rrb.View:
     texts: list[rrb.View] = [rrb.TextDocumentView(origin=entities.SESSION, name="Session")]
     if contents.warnings:
         texts.append(rrb.TextLogView(origin=entities.WARNINGS, name="Warnings"))

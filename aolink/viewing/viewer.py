@@ -84,9 +84,11 @@ def headless_viewer(rrd_path: str | Path, size: tuple[int, int] = PICTURE_SIZE) 
         The viewer ended because the machine has no driver to draw with.
     """
     path = existing(rrd_path)
-    port = free_port()
-    options = ["--headless", "--port", str(port), "--window-size", f"{size[0]}x{size[1]}", "--hide-welcome-screen"]
-    with tempfile.TemporaryFile() as said, running_rerun(options, said) as process:
+    more = ["--headless", "--window-size", f"{size[0]}x{size[1]}", "--hide-welcome-screen"]
+    with (
+        free_port() as port, tempfile.TemporaryFile() as said,
+        running_rerun([*more, "--port", str(port)], said) as process,
+    ):  # fmt: skip
         try:
             client = _connected(process, port, said)
             client.open(str(path))

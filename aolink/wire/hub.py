@@ -16,9 +16,10 @@ from typing import TypeVar
 from google.protobuf.message import Message
 
 from aolink.errors import DeviceError
+from aolink.polling import wait_readable
 from aolink.wire import messages_pb2 as pb
 from aolink.wire.link import Link, Received
-from aolink.wire.port import Served, Transport, is_local, wait_readable
+from aolink.wire.port import Served, Transport, is_local
 
 ANSWER_S = 1.0
 """How long an answer may take before a request is sent again, and the longest wait for an answer after a stop, s."""

@@ -43,6 +43,7 @@ def test_a_finished_recording_goes_through_once(aolink, steady, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 def test_a_session_of_another_process_is_followed_up_to_its_end(aolink, start_aolink, tmp_path):
     path = tmp_path / "session.mcap"
     with simulated_rig("loop") as (camera, mirror):
@@ -61,6 +62,7 @@ def test_a_session_of_another_process_is_followed_up_to_its_end(aolink, start_ao
     assert [each.name for each in tmp_path.iterdir()] == ["session.mcap"]
 
 
+@pytest.mark.slow
 def test_ctrl_c_ends_it_while_the_session_goes_on(start_aolink, steady, tmp_path):
     """The file stays locked and unfinished, as that of a session does."""
     data, descriptor = unfinished(steady), files.create(tmp_path / "session.mcap")

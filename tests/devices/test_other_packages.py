@@ -205,6 +205,7 @@ def test_a_driver_that_fails_ends_the_session_in_good_order(
     assert ended == report.steps_commanded > 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("camera", "code", "what"),
     [
@@ -258,6 +259,7 @@ def test_the_drivers_that_there_are_are_listed(aolink: Run, installed: dict[str,
     assert "mirror driver optotune" in text
 
 
+@pytest.mark.slow
 def test_the_drivers_of_a_rig_file_are_checked_before_anything_is_opened(
     aolink: Run, installed: dict[str, str], tmp_path: Path,
 ) -> None:  # fmt: skip

@@ -12,10 +12,12 @@ from aolink.identification.likelihood import Likelihood
 from aolink.identification.search import climb
 from aolink.jobs.closed_loop import closed_loop
 from aolink.rig import load_rig
+from tests.needs import needed
 
+needed("pyrtc")
 sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
-from bench_rows.identification import DisturbanceChange, changed
-from bench_rows.loop_worth import Cell
+from bench_rows.identification import DisturbanceChange, changed  # noqa: E402 # where that is installed
+from bench_rows.loop_worth import Cell  # noqa: E402
 
 
 @pytest.mark.slow

@@ -631,6 +631,7 @@ def two_sensors(tmp_path):
     return tmp_path / "a.fits", frames
 
 
+@pytest.mark.slow
 def test_of_two_wavefront_sensors_one_is_chosen(two_sensors):
     path, (low, high) = two_sensors
     first = open_film(path)

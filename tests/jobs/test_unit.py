@@ -113,6 +113,7 @@ def test_what_cannot_be_estimated_leaves_nothing(tmp_path: Path, settings: Setti
             estimate_file(tmp_path / missing, tmp_path / "out.mcap")
 
 
+@pytest.mark.slow
 def test_any_engine_can_call_it(tmp_path: Path) -> None:
     """Threads and processes of the standard library, on the same recordings, give the same files."""
     sources = [write_small(tmp_path / f"{k}.mcap", 3 + k) for k in range(4)]
@@ -131,6 +132,7 @@ def test_any_engine_can_call_it(tmp_path: Path) -> None:
     assert found[0] == found[1]
 
 
+@pytest.mark.slow
 def test_killed_in_the_middle_it_leaves_nothing_under_the_name(tmp_path: Path) -> None:
     """And the next call does it, and clears away what was left."""
     source = write_small(tmp_path / "s.mcap", 400)

@@ -50,6 +50,7 @@ def test_online_and_offline_estimates_agree_bit_for_bit(pupil: Session) -> None:
     assert estimate.innovation_covariance.shape == (1, 192)
 
 
+@pytest.mark.slow
 def test_the_attached_arrays_expand_the_recorded_coefficients(pupil: Session) -> None:
     recording = Recording(pupil.path)
     outputs, basis = (

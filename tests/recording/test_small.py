@@ -74,6 +74,7 @@ def test_a_recording_without_estimates_gets_the_default_ones(aolink: Run, tmp_pa
     assert again.keys() - {"differs_from_recorded"} == {"o1"}
 
 
+@pytest.mark.slow
 def test_the_reason_is_in_the_table_in_info_and_in_json(aolink: Run, tmp_path: Path) -> None:
     """Once for all exposures that have it, with what differs in it from the first."""
     write_small(tmp_path / "dark.mcap", 3, "below black")
@@ -91,6 +92,7 @@ def test_the_reason_is_in_the_table_in_info_and_in_json(aolink: Run, tmp_path: P
     assert (again["estimated"], again["measured"]) == (3, 0)
 
 
+@pytest.mark.slow
 def test_a_batch_in_which_nothing_was_measured_is_no_success(aolink: Run, tmp_path: Path) -> None:
     write_small(tmp_path / "dark.mcap", 2, "black")
     write_small(tmp_path / "lit.mcap", 2)

@@ -30,6 +30,7 @@ def with_packages(with_example: dict[str, str], tmp_path_factory: pytest.TempPat
     return with_example | {"PYTHONPATH": path, "COLUMNS": "200"}
 
 
+@pytest.mark.slow
 def test_a_method_of_another_package_restores_a_picture(
     aolink: Run, with_packages: dict[str, str], tmp_path: Path,
 ) -> None:  # fmt: skip
@@ -45,6 +46,7 @@ def test_a_method_of_another_package_restores_a_picture(
     assert psnr(restored[inside], scene[inside]) > psnr(image[inside], scene[inside]) + 3
 
 
+@pytest.mark.slow
 def test_the_help_names_the_methods_of_other_packages_and_what_is_wrong_with_one(
     aolink: Run, with_packages: dict[str, str],
 ) -> None:  # fmt: skip
@@ -57,6 +59,7 @@ def test_the_help_names_the_methods_of_other_packages_and_what_is_wrong_with_one
     assert "the restoration method gone of broken (no_such_module:method) cannot be loaded: ModuleNotFoundError" in text
 
 
+@pytest.mark.slow
 def test_a_method_that_cannot_be_loaded_is_one_line(
     aolink: Run, with_packages: dict[str, str], tmp_path: Path,
 ) -> None:  # fmt: skip

@@ -29,13 +29,14 @@ from typer.testing import CliRunner
 from aolink.cli.common import app
 from aolink.devices.interfaces import CommandAnswered
 from aolink.errors import DeviceError, PortError, RecordingError
+from aolink.polling import wait_readable
 from aolink.recording.reader import Recording
 from aolink.recording.writer import RecordingWriter
 from aolink.rig import load_rig
 from aolink.session import record
 from aolink.wire import messages_pb2 as pb
 from aolink.wire.packet import Packet, PacketDecoder, encode_message, encode_packet, schema_hash
-from aolink.wire.port import SerialPort, wait_readable
+from aolink.wire.port import SerialPort
 from tests.commands import simulated_rig
 from tests.conftest import Session
 from tests.hostile import lying_rig
@@ -566,6 +567,7 @@ def test_a_file_that_is_not_a_recording(aolink: Run, tmp_path: Path, content: by
     assert_refused(aolink("info", "missing.mcap"), 5, "cannot read missing.mcap: no such file or directory")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "unwanted"),
     [

@@ -86,6 +86,7 @@ def test_a_slow_estimator_costs_no_frame_and_no_command(loaded: Session) -> None
         assert recording.counts[topic] == EXPOSURES
 
 
+@pytest.mark.slow
 def test_what_it_had_no_time_for_is_counted_and_recorded(loaded: Session) -> None:
     recording, metadata = Recording(loaded.path), Recording(loaded.path).metadata
     for name in (slow(), "o3"):
@@ -173,6 +174,7 @@ def test_a_slow_estimator_makes_no_fast_one_skip(recorded: Session) -> None:
     assert all(each.message is None and "the session was over" in each.reason for each in rest)
 
 
+@pytest.mark.slow
 def test_an_estimate_from_beside_is_that_of_the_driver(recorded: Session) -> None:
     rig, exposures = load_rig("section-vi-lively"), exposures_of(recorded)
     ours = []
@@ -186,6 +188,7 @@ def test_an_estimate_from_beside_is_that_of_the_driver(recorded: Session) -> Non
     assert first_difference(ours, Recording(recorded.path).estimates("o3")) is None
 
 
+@pytest.mark.slow
 def test_an_estimator_that_cannot_work_ends_the_session_before_it_begins() -> None:
     why = "the estimator o9 does not start: there is no estimator 'o9'"
     with BesideTheLoop(load_rig("section-vi"), ["o9"]) as beside, pytest.raises(EstimatorError, match=why):

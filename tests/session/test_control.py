@@ -80,6 +80,7 @@ def test_on_virtual_time_the_session_is_the_loop_in_memory_bit_for_bit(
         )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["tip-tilt", "sh-4x4"])
 def test_spots_close_the_loop_over_the_wire_as_in_memory(tmp_path: Path, name: str) -> None:
     """Two slopes of one mirror; sixteen spots, each with a plant of its own."""

@@ -25,6 +25,7 @@ def ports() -> Iterator[tuple[str, ...]]:
         yield "--camera", camera, "--mirror", mirror
 
 
+@pytest.mark.slow
 def test_all_that_was_found_is_said(aolink: Run, ports: tuple[str, ...], tmp_path: Path) -> None:
     arguments = ("record", *ports, "--rig", "section-vi", "--dry-run", "-o", "a.mcap")
     played = aolink(*arguments, "--exposures", "20", "-e", "o3")

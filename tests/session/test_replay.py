@@ -126,6 +126,7 @@ def test_a_replay_that_waits_can_be_stopped(recorded: Session, rate: float) -> N
     assert 101.0 < clock.now < 101.2
 
 
+@pytest.mark.slow
 def test_the_command_plays_a_part_and_says_what_a_rig_needs(aolink: Run, recorded: Session) -> None:
     result = aolink("replay", recorded.path, "-e", "o1", "--start", "0.4", "--json")
     assert json.loads(result.stdout)["o1"]["exposures"] == EXPOSURES - 2
@@ -134,6 +135,7 @@ def test_the_command_plays_a_part_and_says_what_a_rig_needs(aolink: Run, recorde
     assert "--to-rig needs" in wrong.stderr
 
 
+@pytest.mark.slow
 def test_no_device_that_a_recording_names_is_opened(aolink: Run, tmp_path: Path) -> None:
     """Neither a driver nor a port: a recording may come from anywhere."""
     native = 'driver = "native", port = "/dev/ttyACM0"'

@@ -251,6 +251,7 @@ def test_the_truth_is_not_read(session: Path, sharp: Path, tmp_path: Path) -> No
     assert len(again) == 3 * EXPOSURES
 
 
+@pytest.mark.slow
 def test_recorded_estimates_are_used_and_old_results_replaced(session: Path, sharp: Path, tmp_path: Path) -> None:
     again, direct = tmp_path / "again.mcap", tmp_path / "direct.mcap"
     write_deblurred(Recording(sharp), again, estimator="o1")
@@ -405,6 +406,7 @@ def test_what_cannot_be_restored_says_why(session: Path, tmp_path: Path) -> None
         _ = Recording(broken).true_scene
 
 
+@pytest.mark.slow
 def test_the_command_deblurs_a_recording(aolink: Run, session: Path, tmp_path: Path) -> None:
     shutil.copy(session, tmp_path / "a.mcap")
     done = aolink("deblur", "a.mcap", "-e", "o1", "--method", "gauss_markov", "-o", "b.mcap", "--json")

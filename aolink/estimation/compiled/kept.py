@@ -21,9 +21,9 @@ from functools import cache
 from pathlib import Path
 
 HERE = Path(__file__).parent
-_ROOM = HERE.parents[1]
-SOURCES = (HERE, _ROOM / "numerics")
-"""Folders of all that is compiled: the loops, and what they take from `aolink.numerics`."""
+_PACKAGE = HERE.parents[1]
+SOURCES = (*sorted(HERE.glob("*.py")), _PACKAGE / "numerics" / "covariance.py", _PACKAGE / "numerics" / "entrywise.py")
+"""All that is compiled: the loops, and what they take from `aolink.numerics`."""
 _NEEDED_BYTES = 50_000_000
 # So long nothing is written while code is compiled.
 _SILENCE_S = 3.0
@@ -56,15 +56,14 @@ def folder() -> Path | None:
 
 
 def key(sources: Iterable[Path]) -> str:
-    """A name for the contents of all Python files of some folders, and for what makes machine code of them."""
+    """A name for the contents of some files, and for what makes machine code of them."""
     import numba
     from numba.core.registry import cpu_target
 
     made_by = sys.version, numba.__version__, cpu_target.target_context.codegen().magic_tuple()
     digest = hashlib.sha256(repr(made_by).encode())
-    for source in sources:
-        for path in sorted(source.glob("*.py")):
-            digest.update(f"\0{path.name}\0".encode() + path.read_bytes())
+    for path in sources:
+        digest.update(f"\0{path.name}\0".encode() + path.read_bytes())
     return digest.hexdigest()[:16]
 
 
@@ -85,7 +84,7 @@ def compile_once(groups: Sequence[str], program: Callable[[list[str]], str]) -> 
             return
         _say(f"aolink: compiling the loops of {', '.join(missing)} (once) ")
         start = time.monotonic()
-        text = f"import sys\nsys.path.insert(0, {str(_ROOM.parent)!r})\n{program(missing)}"
+        text = f"import sys\nsys.path.insert(0, {str(_PACKAGE.parent)!r})\n{program(missing)}"
         failure = _run(text)
         if failure is None:
             for each in missing:

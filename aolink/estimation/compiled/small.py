@@ -43,11 +43,12 @@ def _compiled(function: Callable[..., Any], freedom: set[str]) -> Any:
     options: Any = {"nogil": True, "error_model": "numpy", "fastmath": freedom}
     if (kept := folder()) is None:
         return numba.njit(**options)(function)
-    before, numba.config.CACHE_DIR = numba.config.CACHE_DIR, str(kept)  # Numba reads it when a function is decorated
+    settings: Any = numba.config
+    before, settings.CACHE_DIR = settings.CACHE_DIR, str(kept)  # Numba reads it when a function is decorated
     try:
         return numba.njit(cache=True, **options)(function)
     finally:
-        numba.config.CACHE_DIR = before
+        settings.CACHE_DIR = before
 
 
 # Most sweeps of Jacobi's method, which ends where the squares off the diagonal are this share of those on it.

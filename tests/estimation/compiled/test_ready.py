@@ -1,5 +1,6 @@
 """Machine code is made once, and nothing is left to compile in a session."""
 
+import ast
 import os
 import subprocess
 import sys
@@ -61,7 +62,7 @@ import sys
 from pathlib import Path
 from aolink.estimation.compiled import kept
 
-kept.SOURCES = (Path(sys.argv[1]),)
+kept.SOURCES = tuple(sorted(Path(sys.argv[1]).glob("*.py")))
 sys.path.insert(0, sys.argv[1])
 from outer import outer
 print(outer())
@@ -83,6 +84,7 @@ def outer():
 """
 
 
+@pytest.mark.slow
 def test_a_source_that_is_older_than_the_code_made_of_another_is_compiled_all_the_same(tmp_path):
     """Copies that keep time stamps (rsync -a, layers of images) bring changed sources with earlier dates."""
     for name, text in (("inner.py", INNER.format(1)), ("outer.py", OUTER)):
@@ -106,9 +108,19 @@ def test_the_name_of_the_folder_follows_from_what_the_sources_contain(tmp_path):
         place.mkdir()
         (place / "a.py").write_text("x = 1")
     os.utime(there / "a.py", (0, 0))
-    assert kept.key([here]) == kept.key([there])
+    assert kept.key([here / "a.py"]) == kept.key([there / "a.py"])
     (there / "a.py").write_text("x = 2")
-    assert kept.key([here]) != kept.key([there])
+    assert kept.key([here / "a.py"]) != kept.key([there / "a.py"])
+
+
+def test_what_is_compiled_comes_from_the_sources_that_the_name_follows_from():
+    """A constant or function of another module would be compiled in, and change unnoticed."""
+    names = {str(path.relative_to(kept.HERE.parents[2]).with_suffix("")).replace("/", ".") for path in kept.SOURCES}
+    for path in kept.HERE.glob("*.py"):
+        nodes = [each for each in ast.parse(path.read_text()).body if isinstance(each, ast.ImportFrom)]
+        imported = {each.module for each in nodes if each.module and each.module.startswith("aolink")}
+        # The first has only types, the second the package's own modules.
+        assert imported - {"aolink.numerics.arrays", "aolink.estimation.compiled"} <= names, path
 
 
 FIRST_SESSION = """
@@ -151,6 +163,7 @@ def test_nothing_is_compiled_in_a_session(name):
     assert several
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["moments", "moments:flux=measured,basis=fourier"])
 def test_nothing_is_compiled_in_a_session_of_moments(name):
     before, after, _ = first_session("section-vi-lively", name, 0.003, 4)

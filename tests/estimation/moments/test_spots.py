@@ -102,6 +102,7 @@ def at_prior(rig, observation, prior, model):
 # What is expected, by sampling
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kernel", [Kernel(shape="gaussian", sigma=0.1), TILTED])
 @pytest.mark.parametrize("basis", ["monomial", "fourier"])
 def test_regression_is_that_of_samples(kernel, basis):

@@ -46,6 +46,7 @@ def one_axis(seed):
     return rig, exposure
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "at_most"), [("profile", "up to "), ("mixture", "")])
 def test_several_vibrations_are_tempered_and_the_reason_says_so(name, at_most):
     """Modes stay lost on this rig: mixture leaves all of the windowed moments' share, profile less."""
@@ -56,6 +57,7 @@ def test_several_vibrations_are_tempered_and_the_reason_says_so(name, at_most):
     assert what in estimate.reason
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("changed", [{"frequencies_hz": (4.6,)}, {"frequencies_hz": (5.3,), "damping": 0.2}])
 def test_where_modes_do_not_stay_lost_the_reason_says_that_less_of_windowed_moments_may_be_left(changed):
     """A vibration of less than a swing in an exposure, and one that is over after a frame period."""
@@ -174,6 +176,7 @@ def errors_of(rig, name, seeds, exposures):
     return np.mean(errors, axis=0), reasons
 
 
+@pytest.mark.slow
 def test_where_importance_sampling_is_too_sure_mixture_tempers_all_that_have_several_modes():
     _, reasons = errors_of(BRIGHT, "mixture", [1], 4)
     said = "the usual search for paths is not enough on this rig: 1200 others were sought at length (tempered), and 14%"
@@ -190,6 +193,7 @@ def test_an_estimate_by_importance_sampling_says_there_that_its_intervals_may_be
     assert not any("up to" in reason for reason in reasons)  # tempered points are not weighed there
 
 
+@pytest.mark.slow
 def test_profile_is_mixture_where_importance_sampling_is_too_sure_and_modes_stay_lost():
     exposures = list(simulate(BRIGHT, 3, seed=1, inputs=np.zeros((3 * BRIGHT.timing.frame_period_steps, 1))))
     one, other = (make_estimator(BRIGHT, name) for name in ("profile", "mixture"))
@@ -200,6 +204,7 @@ def test_profile_is_mixture_where_importance_sampling_is_too_sure_and_modes_stay
         assert ours.reason == theirs.reason
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("points", "tempers"), [(300, False), (600, True)])
 def test_there_fewer_than_two_points_for_each_pair_of_coefficients_are_not_tempered(points, tempers):
     """BRIGHT has thirteen coefficients. Elsewhere 300 points for 169 pairs would be tempered."""
@@ -209,6 +214,7 @@ def test_there_fewer_than_two_points_for_each_pair_of_coefficients_are_not_tempe
         assert any("as wide as that of moments" in reason for reason in reasons)
 
 
+@pytest.mark.slow
 def test_profile_stays_itself_where_importance_sampling_is_too_sure_and_modes_are_found_again():
     assert importance_is_too_sure(SLOWER)
     assert not modes_stay_lost(SLOWER)
@@ -218,6 +224,7 @@ def test_profile_stays_itself_where_importance_sampling_is_too_sure_and_modes_ar
     assert not any("not enough on this rig" in reason for reason in reasons)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["profile", "mixture"])
 def test_there_tempered_points_are_not_weighed_by_importance_sampling(name, monkeypatch):
     def never(proposal, points):
@@ -235,6 +242,7 @@ def test_there_mixture_does_not_temper_points_that_are_too_few_for_most_of_a_pos
     assert not any("not enough on this rig" in reason for reason in reasons)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("changed", [{"noise_density": 0.002}, {"damping": 0.8}, {"frequencies_hz": (12.0,)}])
 def test_elsewhere_importance_sampling_is_not_doubted(changed):
     """A fainter spot; no vibration that lasts; one vibration alone."""
@@ -260,6 +268,7 @@ def test_a_rig_on_which_importance_sampling_is_too_sure_is_known_by_one_axis_of_
     assert importance_is_too_sure(dataclasses.replace(BRIGHT, plant=together))
 
 
+@pytest.mark.slow
 def test_copies_of_a_rig_whose_parameter_wanders_work_alike():
     wandering = Wandering(parameter="sensor_noise", rate_per_minute=0.1, largest=0.2)
     rig = dataclasses.replace(BRIGHT, plant=dataclasses.replace(BRIGHT.plant, wandering=wandering))
