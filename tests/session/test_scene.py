@@ -273,6 +273,7 @@ def test_recorded_estimates_are_used_and_old_results_replaced(session: Path, sha
     assert Recording(new).true_scene is not None
 
 
+@pytest.mark.slow
 def test_motion_and_its_covariance_are_those_of_the_path(session: Path) -> None:
     """For one output they are the estimate's own; for a mean of spots, what all of its coefficients say together."""
     estimate = reestimate(Recording(session), ["moments"])["moments"][-1]
@@ -473,6 +474,7 @@ def test_rerun_shows_blurred_restored_and_true(sharp: Path, tmp_path: Path) -> N
     assert len(entities["/restored/spot"]["frame"]) == EXPOSURES
 
 
+@pytest.mark.slow
 def test_a_live_view_shows_the_same(sharp: Path, tmp_path: Path) -> None:
     import rerun as rr
 

@@ -29,6 +29,7 @@ def test_filterpy_gives_our_estimates(rig, name, gain):
                 np.testing.assert_allclose(value, getattr(b, field.name), atol=1e-9, rtol=0, err_msg=field.name)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["o1", "o2", "o3"])
 @pytest.mark.parametrize("rig_name", ["tip-tilt", "sh-8x8"])
 def test_filterpy_gives_our_estimates_of_plants_that_move_whole_spots(rig_name, name):
