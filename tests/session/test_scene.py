@@ -415,6 +415,8 @@ def test_the_command_deblurs_a_recording(aolink: Run, session: Path, tmp_path: P
     printed = json.loads(done.stdout)
     assert (printed["exposures"], printed["scenes_restored"], printed["missing"]) == (EXPOSURES, EXPOSURES, {})
     assert printed["psnr_restored_db"] >= printed["psnr_restored_least_db"]
+    worse = aolink("deblur", "a.mcap", "-e", "o1", "--method", "predictor", "-o", "worse.mcap")
+    assert "predictor leaves more error than the blurred picture has, by its own model" in worse.stdout
     again = aolink("deblur", "a.mcap", "-e", "o1", "-o", "b.mcap")
     assert again.returncode == 5
     assert "b.mcap exists and is not overwritten" in again.stderr
