@@ -140,7 +140,7 @@ def laboratory(tmp_path_factory: pytest.TempPathFactory) -> Path:
         record(rig, *ports, folder / "session.mcap", estimators=["moments"], exposures=12)
         shutil.copy(folder / "session.mcap", folder / "again.mcap")
     with simulated_rig("jitter") as ports:
-        record(load_rig("jitter"), *ports, folder / "shaken.mcap", exposures=32)
+        record(load_rig("jitter"), *ports, folder / "shaken.mcap", exposures=24)
     with simulated_rig("loop") as ports:
         record(load_rig("loop"), *ports, folder / "running.mcap", exposures=62)
     for part in ("001", "002"):

@@ -94,7 +94,7 @@ def test_of_a_session_that_died_it_says_so_and_what_it_found(aolink, steady, tmp
     assert "cut.mcap ended after" in done.stdout
 
 
-@pytest.mark.slow
+@pytest.mark.rare  # a fit of both processes takes minutes
 def test_an_offer_is_written_into_a_rig_file_of_its_own_and_said(aolink, tmp_path):
     """The rig has its vibration at 14.4 Hz, and the session's rig file believes in 12 Hz."""
     believed, moved = load_rig("loop").toml, tmp_path / "moved.toml"

@@ -121,7 +121,7 @@ def test_a_film_too_short_to_find_hot_pixels_says_so(frames):
     assert ("8 frames are too few to find hot and dead pixels: 9 are needed" in notes) == (frames == 8)
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 def test_a_hot_pixel_is_masked_in_a_window_that_moves_over_it(tmp_path):
     """The window follows an object that goes by it; the places are as in the same film without hot pixels."""
     rng = np.random.default_rng(14)
