@@ -67,6 +67,8 @@ def session(report: Report) -> Table:
         f" clipped), {report.steps_superseded} superseded, {report.steps_late} late, {report.steps_refused} refused,"
         f" {report.steps_not_reported} not reported",
     )
+    for line in report.answers.lines():
+        table.add_row("answers", line)
     table.add_row(
         "mirror",
         f"parked in {report.steps_parked} steps of the session, re-armed {report.rearmed} times after its watchdog"
