@@ -35,6 +35,9 @@ _PATIENCE_WATCHDOGS = 2.0
 """A mirror that answers nothing for this many times its watchdog has parked itself, and the session ends."""
 _LEAST_TRIES = 5
 """Least tries before a mirror is given up: a host that was held up has not read the answers yet."""
+_PARK_ANSWER_S = 0.05
+_PARK_SILENT_S = 5.0
+"""A mirror of which nothing is heard for this long, or for twice its watchdog, is not asked to park any more."""
 _START_ANSWER_S = 0.05
 """Wait for the answer to a camera's start, which is at a near step: the next try must not be late."""
 _START_TRIES = 60
@@ -129,13 +132,14 @@ class _NativeDevice:
 
     def _request(
         self, message: pb.CameraControl | pb.Park | pb.Rearm, what: str, answer_s: float = ANSWER_S, tries: int = TRIES,
-        codes: Sequence[int] = (pb.OK,), *, insist: bool = False,
+        codes: Sequence[int] = (pb.OK,), *, insist_s: float = 0.0,
     ) -> pb.Ack:  # fmt: skip
         """Send a request until it is answered; gives the answer. Raises DeviceError if its code is not among
         ``codes``."""
         ack = self._hub.request(
-            self.link, message, pb.Ack, lambda ack, sequence: ack.sequence == sequence, answer_s, tries, insist=insist
-        )
+            self.link, message, pb.Ack, lambda ack, sequence: ack.sequence == sequence, answer_s, tries,
+            insist_s=insist_s,
+        )  # fmt: skip
         if ack is None:
             raise DeviceError(f"the {self.link.name} did not answer when asked to {what}: is it still connected?")
         self._gate.passes(self.link, ack, self._hub.now_ns())
@@ -373,7 +377,9 @@ class NativeMirror(_NativeDevice):
 
     def park(self) -> int:
         self.withdraw(0)  # a block that came again afterwards would move the mirror
-        return self._request(pb.Park(), "park", self._answer_s(), insist=True).step
+        answer_s = max(self._timeout_ns() / 1e9, _PARK_ANSWER_S)
+        silent_s = min(_PATIENCE_WATCHDOGS * self._watchdog_s, _PARK_SILENT_S)
+        return self._request(pb.Park(), "park", answer_s, insist_s=silent_s).step
 
     def last_answers(self) -> list[CommandAnswered]:
         self.withdraw(0)

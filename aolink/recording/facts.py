@@ -8,6 +8,8 @@ from dataclasses import asdict
 from datetime import UTC, datetime
 from typing import Any
 
+from google.protobuf.message import DecodeError
+
 from aolink.estimation import Status
 from aolink.estimation.score import UnusedCounter
 from aolink.recording import topics
@@ -87,10 +89,12 @@ def _gaps_estimates_answers(recording: Recording) -> tuple[dict[str, float], dic
     answers = AnswerCounter()
     of_mirror = (topics.ANSWER, topics.APPLIED) if topics.ANSWER in recording.counts else ()
     for raw in recording.raw_messages(topics.EXPOSURE, *of_mirror, *map(topics.estimate_topic, names)):
+        if topics.RUNS.get(raw.topic) == raw.schema:  # without looking at its inputs, which may be thousands
+            with contextlib.suppress(DecodeError):
+                answers.applied(Applied.FromString(raw.data))
+            continue
         message = recording.decoded(raw)
-        if isinstance(message, Applied):
-            answers.applied(message)
-        elif isinstance(message, CommandAnswer):
+        if isinstance(message, CommandAnswer):
             answers.answered(message)
         elif isinstance(message, ExposureInfo):
             if last is not None and message.first_step - last != period:

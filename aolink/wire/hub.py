@@ -33,7 +33,7 @@ _MESSAGE_BYTES = 512
 _MOST_HOST_NS = 1 << 62
 _CLOCK = getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC)
 """A steady clock that goes on while the computer sleeps, as the devices' clocks do."""
-_MOST_TRIES = 30
+_MOST_TRIES = 200
 """Most tries of a request that is insisted on, while anything at all is heard of the device."""
 _LAST_PATIENCE_S = 0.2
 """How long to wait for a device that has already delayed the session's end, s."""
@@ -134,23 +134,23 @@ class Hub:
 
     def request(
         self, link: Link, request: Message, answers: type[AnyMessage], is_it: Callable[[AnyMessage, int], bool],
-        answer_s: float = ANSWER_S, tries: int = TRIES, *, insist: bool = False,
+        answer_s: float = ANSWER_S, tries: int = TRIES, *, insist_s: float = 0.0,
     ) -> AnyMessage | None:  # fmt: skip
         """Send a request until its answer comes; None if it never does. Other messages wait for `wait`.
 
         ``is_it(answer, sequence)`` says whether an answer belongs to the request of that sequence number: that of the
-        last try or of an earlier one. Each of the ``tries`` waits for ``answer_s``. With ``insist`` a request to stop
-        does not end them, and there are more tries while anything was heard of the device during the last ones.
+        last try or of an earlier one. Each of the ``tries`` waits for ``answer_s``. With ``insist_s`` a request to stop
+        does not end them, and there are more of them until nothing at all has been heard of the device for so long.
         """
         before = self._memory_bytes()
         sequences: list[int] = []
-        tried_ns: list[int] = []
-        for attempt in range(_MOST_TRIES if insist else tries):
-            if attempt and not insist and (self._hurried or self._stop() or link.refusal):  # it will be refused again
+        heard_ns = self.now_ns()
+        for attempt in range(_MOST_TRIES if insist_s else tries):
+            if attempt and not insist_s and (self._hurried or self._stop() or link.refusal):  # it will be refused again
                 break
-            if attempt >= tries and insist and link.last_heard_ns < tried_ns[-tries]:
+            heard_ns = max(heard_ns, link.last_heard_ns)
+            if attempt >= tries and self.now_ns() - heard_ns > insist_s * 1e9:
                 break
-            tried_ns.append(self.now_ns())
             sequences.append(link.send(request))
             deadline_ns = self.now_ns() + round(answer_s * 1e9)
             while True:

@@ -32,7 +32,7 @@ from aolink.recording.writer import RecordingWriter
 from aolink.rig import Rig
 from aolink.session.commanding import Inputs
 from aolink.session.controlling import Controlling
-from aolink.session.estimating import Estimating
+from aolink.session.estimating import BesideTheLoop
 from aolink.session.loop import SessionLoop
 from aolink.session.report import Report
 from aolink.signals import Interrupted
@@ -131,6 +131,8 @@ class SimulatedTimeHub(Host):
     def __init__(self, rig: Rig, seed: int | None = None, stop: Callable[[], bool] = lambda: False) -> None:
         super().__init__(stop)
         self.clock_ns = 0
+        self.loop: SessionLoop | None = None
+        """The session's, once it has begun."""
         self.at: list[tuple[int, Callable[[], object]]] = []
         """What is to happen when, on the clock."""
         self.held: dict[int, tuple[int, int]] = {}
@@ -149,8 +151,8 @@ class SimulatedTimeHub(Host):
         return _EPOCH_NS + self.clock_ns
 
     def change(self, name: str, firmware: Callable[[Message], Message | None]) -> None:
-        """Give the device on a line another firmware: it sends what the function makes of its messages, packet by packet;
-        None for nothing."""
+        """Give the device on a line another firmware: it sends what the function makes of its messages, packet by
+        packet; None for nothing."""
         decoder, read = PacketDecoder(), self.ends[name].read
 
         def changed() -> bytes:
@@ -263,7 +265,7 @@ def run_session(
     progress: Callable[[int], None] = lambda exposures: None,
     reconnect_s: float = 0.0,
     alone: bool = False,
-    beside: Estimating | None = None,
+    beside: BesideTheLoop | None = None,
 ) -> Run:
     """A session from Identify to the end of its account, as `aolink.session.record` makes it; errors are kept.
 
@@ -290,7 +292,7 @@ def run_session(
             lambda exposure, _: live.append(exposure), beside,
             controlling=Controlling(rig, controller, estimators) if controller else None,
         )  # fmt: skip
-        run = Run(hub, loop, mirror, path, live)
+        run, hub.loop, hub.beside = Run(hub, loop, mirror, path, live), loop, beside.processes if beside else ()
         try:
             loop.run(exposures, stop, progress)
         except (Exception, Interrupted) as error:

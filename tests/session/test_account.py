@@ -348,7 +348,7 @@ def test_the_account_agrees_with_the_device_whatever_it_is_told(
             if isinstance(message, pb.CommandAck):
                 acks[message.block_id] = message
                 if all_arrive or not lost:
-                    account.answered(message)
+                    account.answered(message.block_id, message)
             elif isinstance(message, pb.Applied) and not lost:
                 for new in reports.take(message, 0):
                     if new.source != pb.Applied.AWAITED:

@@ -96,10 +96,12 @@ def test_blocks_that_never_came_were_never_answered(tmp_path: Path) -> None:
 
 def test_a_host_that_was_held_up_finds_the_mirror_latched(tmp_path: Path) -> None:
     hub, left = SimulatedTimeHub(RIG), [3.0]
-    run = run_session(
-        hub, RIG, tmp_path / "a.mcap", 100, progress=lambda done: hub.hold_up(left.pop()) if done == 9 and left else None
-    )
-    found = check(run)
+
+    def progress(done: int) -> None:
+        if done == 9 and left:
+            hub.hold_up(left.pop())
+
+    found = check(run_session(hub, RIG, tmp_path / "a.mcap", 100, progress=progress))
     assert found.by_answer["LATCHED"] > 0
     assert "refused, the watchdog had parked the mirror" in [each.reason for each in found.without_effect]
 
@@ -115,10 +117,10 @@ def test_a_refusal_has_the_words_of_the_mirror(tmp_path: Path) -> None:
 
 
 def test_what_is_still_queued_when_a_session_is_interrupted_has_no_effect(tmp_path: Path) -> None:
-    done: list[int] = []
+    done, path = list[int](), tmp_path / "a.mcap"
     run = run_session(
-        SimulatedTimeHub(RIG), RIG, tmp_path / "a.mcap", 0, stop=lambda: bool(done and done[-1] > 3), progress=done.append
-    )
+        SimulatedTimeHub(RIG), RIG, path, 0, stop=lambda: bool(done and done[-1] > 3), progress=done.append
+    )  # fmt: skip
     (queued,) = check(run).without_effect
     assert queued.reason == "not reported before the session ended, which empties the queue"
     assert queued.blocks == run.report.steps_superseded // RIG.mirror.block_steps > 0
