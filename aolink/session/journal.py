@@ -6,6 +6,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import asdict
+from typing import cast
 
 from foxglove_schemas_protobuf.Log_pb2 import Log
 
@@ -84,7 +85,7 @@ class Journal:
             tries=answered.tries, times_full=answered.times_full, sent_ns=answered.sent_ns,
         )  # fmt: skip
         if ack is not None:
-            message.answer = kind.Answer.ValueType(ack.code)
+            message.answer = cast(pb.CommandAnswer.Answer, ack.code)
             message.text, message.answered_ns = ack.text, receive_ns
             message.late_steps, message.superseded_steps = ack.late_steps, ack.superseded_steps
             message.queue_end_step = ack.queue_end_step

@@ -148,6 +148,7 @@ def test_what_a_driver_raises_refuses_the_command_in_words() -> None:
     mirror.send_block(0, np.full((8, 1), 0.01), 0, 0)
     (answered,) = mirror.poll()
     assert isinstance(answered, CommandAnswered)
+    assert answered.ack
     assert answered.ack.code == pb.NOT_SUPPORTED
     assert answered.ack.text == "the driver of the mirror failed when it was sent a command: OSError('no such channel')"
     with pytest.raises(DeviceError, match=r"input 0 at fast step 1 is 0.06, beyond the mirror's limits"):
@@ -169,7 +170,7 @@ def test_each_commanded_step_ends_once(
     def take(events: Iterable[Event]) -> None:
         for event in events:
             if isinstance(event, CommandAnswered):
-                account.answered(event.ack)
+                account.answered(event.block.block_id, event.ack)
             elif isinstance(event, pb.Applied):
                 account.reported(event)
 
@@ -327,6 +328,15 @@ def test_a_frame_that_comes_as_the_camera_stops_is_given_once(camera: AdaptedCam
     assert [event.frame_id for event in camera.poll() if isinstance(event, Frame)] == [1]
 
 
+def test_no_more_frames_are_given_than_were_asked_for(camera: AdaptedCamera, bench: CameraBench) -> None:
+    """A camera that runs until it is stopped takes more where the host is held up."""
+    first_step = (bench.host_ns - EPOCH_NS) // STEP_NS + 1
+    assert camera.start(first_step, 2)
+    bench.host_ns += 10**10
+    bench.taken = [frame(first_step * STEP_NS + k * PERIOD_NS) for k in range(-1, 3)]
+    assert [event.frame_id for event in camera.poll() if isinstance(event, Frame)] == [1, 2]
+
+
 def test_a_step_that_has_gone_by_is_too_late_to_start_at(camera: AdaptedCamera) -> None:
     assert not camera.start(200, 0)
 
@@ -353,6 +363,7 @@ def test_a_mirror_that_the_session_leaves_alone_is_parked_by_the_hosts_watchdog(
     mirror.send_block(30, np.full((5, 1), 0.01), 0, 0)
     (answered,) = mirror.poll()
     assert isinstance(answered, CommandAnswered)
+    assert answered.ack
     assert answered.ack.code == pb.LATCHED
     bench.host_ns += 20 * STEP_NS
     assert mirror.rearm() == 41

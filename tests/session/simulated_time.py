@@ -42,7 +42,6 @@ from aolink.simulation.streams import Stream
 from aolink.wire import messages_pb2 as pb
 from aolink.wire.link import Link, Received
 from aolink.wire.packet import MESSAGE_OF_TYPE, PacketDecoder, encode_packet
-from aolink.wire.signing import Signing
 from tests.kinds import must_be
 
 _EPOCH_NS = 1_767_225_600_000_000_000
@@ -91,8 +90,6 @@ class Way:
 
 class End:
     """One end of a line, as a host's transport and as a device's stream."""
-
-    signing: Signing | None = None
 
     def __init__(self, name: str, incoming: Way, outgoing: Way) -> None:
         self.name = name
@@ -150,7 +147,7 @@ class SimulatedTimeHub(Host):
     def now_ns(self) -> int:
         return _EPOCH_NS + self.clock_ns
 
-    def change(self, name: str, firmware: Callable[[Message], Message | None]) -> None:
+    def change(self, name: LineName, firmware: Callable[[Message], Message | None]) -> None:
         """Give the device on a line another firmware: it sends what the function makes of its messages, packet by
         packet; None for nothing."""
         decoder, read = PacketDecoder(), self.ends[name].read

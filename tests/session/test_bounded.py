@@ -89,20 +89,20 @@ def stopped_estimator(rig: Rig, name: str) -> Iterator[BesideTheLoop]:
         yield beside
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_camera_alone(tmp_path: Path) -> None:
     run = long_session(tmp_path, RIG, alone=True, estimators=["o1"])
     latencies = messages_of(schemas.Latency, Recording(run.path), topics.LATENCY)
     assert [each.frame_id for each in latencies] == [each.frame_id for each in run.exposures]
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("controller", ["", "integrator"])
 def test_a_mirror_some_of_whose_answers_and_reports_are_lost(tmp_path: Path, controller: str) -> None:
     long_session(tmp_path, LOSSY, controller=controller)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_an_estimator_that_never_answers(tmp_path: Path) -> None:
     """It serves the controller, which hears nothing."""
     with stopped_estimator(RIG, "o1") as beside:
@@ -111,7 +111,7 @@ def test_an_estimator_that_never_answers(tmp_path: Path) -> None:
     assert run.report.estimation["o1"].skipped == 400
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("controller", ["", "integrator"])
 def test_a_mirror_that_reports_nothing(tmp_path: Path, controller: str) -> None:
     """It acknowledges its commands: the exposures come with what was commanded."""

@@ -115,7 +115,7 @@ def test_any_counter_is_followed_whatever_is_lost(bits: int, first: int, frames:
         assert count.take(before % 2**bits, step_before) == (before, "")
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_device_in_c_with_a_counter_of_16_bits(tmp_path: Path) -> None:
     source = tmp_path / "device"
     shutil.copytree(DEVICE, source, ignore=shutil.ignore_patterns("build"))

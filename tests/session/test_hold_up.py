@@ -140,7 +140,7 @@ def test_what_a_hold_up_explains() -> None:
     assert hold_ups.unexplained_s(101.0, 206 * second) == 101.0  # it was too long
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_disk_is_not_too_slow_for_a_process_that_did_not_run(tmp_path: Path) -> None:
     """The thread that writes has work and cannot do it: this one does not let it run."""
     message = Log(message="x" * 5000)
@@ -157,7 +157,7 @@ def test_a_disk_is_not_too_slow_for_a_process_that_did_not_run(tmp_path: Path) -
     assert Recording(tmp_path / "a.mcap").counts[topics.LOG] == 10_001
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("alone", [False, True])
 @pytest.mark.parametrize("name", ["section-vi", "sh-4x4"])
 def test_a_process_that_is_stopped_and_continued(tmp_path: Path, name: str, alone: bool) -> None:

@@ -194,7 +194,7 @@ class DeafForwarder(Forwarder):
         return b"" if parks and self.deaf else data
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_second_ctrl_c_does_not_leave_the_mirror_where_it_is(tmp_path: Path) -> None:
     rig, path = tmp_path / "rig.toml", tmp_path / "a.mcap"
     rig.write_text(RIG.toml.replace("watchdog_s = 9.0", "watchdog_s = 60.0").replace("= 4000", "= 40000"))
