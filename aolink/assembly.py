@@ -291,21 +291,14 @@ _MOST_BLOCKS = 100_000
 """The most runs of steps that wait for their frame: no more than one is expected for each step."""
 
 
-_MOST_WAITING_BYTES = 256 << 20
-_FRAME_BYTES = 1024
-"""Memory of a frame besides its pixels."""
-
-
 class Assembler:
-    """Makes exposures: frames wait here until the inputs of their steps are known, and leave as exposures, in order.
-    Where too many wait, because no report comes at all, the oldest leave with the commanded inputs."""
+    """Makes exposures: frames wait here until the inputs of their steps are known, and leave as exposures, in order."""
 
     def __init__(self, rig: Rig) -> None:
         self._history = InputHistory(rig.mirror)
         self._no_lead = np.empty((0, rig.n_inputs))
         self._fast_step_ns = rig.timing.fast_step_ns
         self._frames: deque[Frame] = deque()
-        self._waiting_bytes = 0
         self._end: int | None = None
 
     def add_applied(self, message: pb.Applied | Run) -> list[Exposure]:
@@ -320,26 +313,20 @@ class Assembler:
     def add_frame(self, frame: Frame) -> list[Exposure]:
         """Take a frame; gives the exposures that are complete with it."""
         self._frames.append(frame)
-        self._waiting_bytes += _bytes_of(frame)
         self._history.know(frame.last_step + 1)
         return self._ready()
 
     def flush(self) -> list[Exposure]:
         """Give the frames that still wait, with commands in place of the reports that never came."""
-        return [self._expose_next() for _ in range(len(self._frames))]
+        exposures = [self._expose(frame) for frame in self._frames]
+        self._frames.clear()
+        return exposures
 
     def _ready(self) -> list[Exposure]:
         exposures = []
-        while self._frames and (
-            self._waiting_bytes > _MOST_WAITING_BYTES or self._history.is_known_until(self._frames[0].last_step + 1)
-        ):
-            exposures.append(self._expose_next())
+        while self._frames and self._history.is_known_until(self._frames[0].last_step + 1):
+            exposures.append(self._expose(self._frames.popleft()))
         return exposures
-
-    def _expose_next(self) -> Exposure:
-        frame = self._frames.popleft()
-        self._waiting_bytes -= _bytes_of(frame)
-        return self._expose(frame)
 
     def _expose(self, frame: Frame) -> Exposure:
         # The mirror rests until its first command; a camera may begin later, or its first frames be lost.
@@ -359,7 +346,3 @@ class Assembler:
             host_start_ns=frame.host_start_ns, host_receive_ns=frame.host_receive_ns,
             clock_sigma_ns=frame.clock_sigma_ns, alignment_sigma_ns=frame.alignment_sigma_ns, slopes=frame.slopes,
         )  # fmt: skip
-
-
-def _bytes_of(frame: Frame) -> int:
-    return frame.pixels.nbytes + frame.mask.nbytes + _FRAME_BYTES

@@ -28,7 +28,6 @@ from aolink.wire import messages_pb2 as pb
 
 _PATIENCE_NS = 1_000_000_000
 """How long reports that are awaited may take, from the newest report on."""
-_PARK_TRIES = 3
 
 
 class AdaptedMirror(Adapted):
@@ -214,15 +213,9 @@ class AdaptedMirror(Adapted):
         return self._give_up(self._awaited)
 
     def park(self) -> int:
-        for tries_left in reversed(range(_PARK_TRIES)):
-            try:
-                with self._call("when it was asked to park"):
-                    step = int(self._driver.park())
-                break
-            except DeviceError:  # a port that is gone is another error
-                if not tries_left:
-                    raise
         self._guarding = False
+        with self._call("when it was asked to park"):
+            step = int(self._driver.park())
         self._parked_from = step
         return step
 

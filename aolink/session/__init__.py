@@ -235,12 +235,8 @@ def _make_safe(loop: SessionLoop) -> None:
     """Park the mirror, again after each interruption, until it has confirmed that or an error says that it cannot be
     reached."""
     while True:
-        try:
+        with contextlib.suppress(Interrupted, KeyboardInterrupt):
             return loop.make_safe()
-        except AolinkError:
-            raise
-        except (Interrupted, KeyboardInterrupt):
-            continue
 
 
 @contextlib.contextmanager

@@ -24,7 +24,6 @@ from aolink.session.account import REFUSALS, Account
 from aolink.session.commanding import Commanding, Inputs, lead_steps
 from aolink.session.controlling import Controlling
 from aolink.session.estimating import Estimating, InTheLoop
-from aolink.session.hold_ups import HoldUps
 from aolink.session.journal import Journal
 from aolink.session.live import LiveExposures, Show
 from aolink.session.received import ReceivedFrames
@@ -40,10 +39,12 @@ ANSWER_NS = 200_000_000
 """How long the start waits for the answer to one clock query."""
 _GRACE_S = 1.5
 """In real time, how long a frame may take after its exposure's end before it counts as lost, s."""
+_HELD_UP_S = 1.0
+"""In real time, a turn of the loop that takes longer is one in which this process did not run, s."""
 _KEEP_ALIVES = 3
 """Least number of messages that a mirror is sent in the time of its watchdog."""
 _OUTAGE_WATCHDOGS = 2.0
-"""A mirror that was out of reach for more than this many times its watchdog's time is not re-armed."""
+"""A mirror that answers nothing for this many times its watchdog's time ends the session."""
 ESTIMATES_S = 5.0
 """In real time, how long the session's end waits for estimates that are under way, s."""
 _NOT_YET = 1 << 63
@@ -74,7 +75,8 @@ class SessionLoop:
         """The devices in the order in which their clocks are queried; the next one first."""
         self._last_query_ns = self._next_statistics_ns = 0
         self._last_frame_ns = 0
-        self._hold_ups = HoldUps()
+        self._turn_ns = self._held_up_until_ns = 0
+        """Host times: when this turn of the loop began, and when this process went on after it last did not run."""
         self._catching_up = False
         """Whether nothing is commanded, until the mirror's clock says in which fast step it is after a hold-up."""
         self._end_step: int | None = None
@@ -113,15 +115,13 @@ class SessionLoop:
             self._end_step = self._first_step + (exposures - 1) * timing.frame_period_steps + timing.exposure_steps
         self._commanding.begin(self._first_step, self._end_step)
         self._receive(0.0)
-        self._last_frame_ns = time.now_ns()
-        self._hold_ups.begin_turn(self._last_frame_ns)
+        self._last_frame_ns = self._turn_ns = time.now_ns()
         self._journal.log(f"session of {exposures or 'unlimited'} exposures from fast step {self._first_step}")
         self.report.ended = "interrupted"
         while not stop():
             self._receive(self._send_due())
             progress(self.report.exposures)
-            if not time.virtual and self._hold_ups.end_turn(time.now_ns()):
-                self._go_on_after_hold_up()
+            self._go_on_after_hold_up()
             if self._is_over(exposures):
                 self.report.ended = "complete"
                 break
@@ -216,8 +216,7 @@ class SessionLoop:
         for device in [each for each in self._returned if not each.clock.suspected]:
             self._go_on_with(device)
         is_there = self._mirror not in self._absent
-        waits = self._mirror.clock.suspected and self._hold_ups.ended_within(_GRACE_S, time.now_ns())
-        if self._catching_up and not waits:
+        if self._catching_up and not (self._mirror.clock.suspected and self._was_held_up()):
             self._catching_up = False
             self._commanding.catch_up()
         if self._mirror.latched and is_there:
@@ -247,36 +246,38 @@ class SessionLoop:
         return max(0, min(due)) / 1e9
 
     def _go_on_after_hold_up(self) -> None:
-        """Go on after a time in which this process did not run."""
-        held_up_s = self._hold_ups.newest_s
-        self._last_frame_ns += round(held_up_s * 1e9)
+        """Where this turn of the loop took so long that this process cannot have run, say so and go on."""
+        now = self._time.now_ns()
+        turn_ns, self._turn_ns = now - self._turn_ns, now
+        if self._time.virtual or turn_ns < _HELD_UP_S * 1e9:
+            return
+        self._held_up_until_ns = now
+        self._last_frame_ns += turn_ns
         self._journal.warn(
-            f"the session was held up for {held_up_s:.1f} s after {self.report.exposures} exposure(s): its process was"
-            " stopped, or the computer slept or was too busy; what came meanwhile may be lost"
+            f"the session was held up for {turn_ns / 1e9:.1f} s after {self.report.exposures} exposure(s): its process"
+            " was stopped, or the computer slept or was too busy; what came meanwhile may be lost"
         )
         if self._mirror.commanded:
             self._catching_up = True
-            self._mirror.clock.suspect(self._step_ns, self._hold_ups.until_ns)
+            self._mirror.clock.suspect(self._step_ns, now)
+
+    def _was_held_up(self) -> bool:
+        """Whether that is so short a time ago that what has come meanwhile may not have been read."""
+        return self._time.now_ns() - self._held_up_until_ns < _GRACE_S * 1e9
 
     def _keep_alive_ns(self) -> int:
         """Host time by which the mirror must be sent something, command or not."""
         return self._mirror.last_sent_ns + round(self._rig.mirror.watchdog_s * 1e9 / _KEEP_ALIVES)
 
     def _rearm(self, when: str) -> None:
-        """Re-arm a mirror that its watchdog has parked, unless it was out of reach for too long."""
-        watchdog_s, outage_s = self._rig.mirror.watchdog_s, self._mirror.outage_s
-        if self._hold_ups.unexplained_s(outage_s, self._time.now_ns()) > _OUTAGE_WATCHDOGS * watchdog_s:
-            raise DeviceError(
-                f"the mirror was parked by its watchdog: it took no command for {outage_s:.1f} s, more than twice the"
-                f" {watchdog_s:g} s of its watchdog; find out why (a slow host, the line), and begin a new session"
-            )
-        step = self._mirror.rearm()
+        """Re-arm a mirror that its watchdog has parked; one that answers nothing for too long has ended the session."""
+        outage_s, step = self._mirror.outage_s, self._mirror.rearm()
         self.report.rearmed += 1
         out = f", {outage_s:.2f} s after its last command" if outage_s else ""
         parked = f"the mirror was parked by its watchdog {when}"
         self._journal.log(f"{parked}: re-armed at fast step {step}{out}", Log.WARNING)
         self._commanding.go_back_to(step)  # the queued inputs are dropped
-        self._hold_ups.begin_turn(self._time.now_ns())  # until now it was the mirror that was waited for
+        self._turn_ns = self._time.now_ns()  # until now it was the mirror that was waited for
 
     def _vanished(self, device: Device, why: str) -> None:
         if device not in self._absent:
@@ -322,8 +323,7 @@ class SessionLoop:
             step = self._start_camera(begin, left)
             self._journal.log(f"the camera goes on with the exposure from fast step {step}")
         self._frames.camera_restarted()
-        self._last_frame_ns = self._time.now_ns()
-        self._hold_ups.begin_turn(self._last_frame_ns)
+        self._last_frame_ns = self._turn_ns = self._time.now_ns()
 
     def _is_over(self, exposures: int) -> bool:
         if self._time.virtual:
@@ -335,8 +335,8 @@ class SessionLoop:
             return False
         if self._end_step is not None:
             late_step = self._end_step + _GRACE_S * 1e9 / self._step_ns
-            is_late = self._commanding.device_step() > late_step and not self._hold_ups.ended_within(_GRACE_S, now)
-            if self.report.exposures >= exposures or is_late:
+            is_late = self._commanding.device_step() > late_step
+            if self.report.exposures >= exposures or (is_late and not self._was_held_up()):
                 return True
         patience_ns = 3 * timing.frame_period_steps * self._step_ns + (_GRACE_S + _START_DELAY_S) * 1e9
         # A camera and a mirror of one device are held up together, and the mirror is waited for that long.

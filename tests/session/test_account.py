@@ -264,24 +264,6 @@ def test_a_mirror_line_that_comes_back_in_time(seconds: float, tmp_path: Path) -
     assert idle[-1] < mended_ns / 1e6 + 100  # commanded again as soon as the line was back
 
 
-def test_a_mirror_is_not_re_armed_after_its_host_was_away_for_more_than_a_minute(tmp_path: Path) -> None:
-    rig, held_up = rig_with("watchdog_s = 0.5"), list[int]()
-    hub = SimulatedTimeHub(rig)
-
-    def progress(exposures: int) -> None:
-        if exposures == 5 and not held_up:
-            held_up.append(exposures)
-            hub.hold_up(61)
-
-    run = run_session(hub, rig, tmp_path / "a.mcap", 400, progress=progress)
-    assert isinstance(run.error, DeviceError)
-    assert "the mirror was parked by its watchdog: it took no command for 61" in str(run.error)
-    (warning,) = run.report.warnings
-    assert "the session was held up for 61.0 s" in warning
-    check_account(run)
-    assert run.report.steps_refused > 0
-
-
 def test_an_interrupted_session_accounts_for_what_was_queued(tmp_path: Path) -> None:
     hub, exposures = SimulatedTimeHub(RIG), list[int]()
     run = run_session(

@@ -74,7 +74,7 @@ def test_all_is_accepted_on_a_good_line(tmp_path: Path) -> None:
 
 def test_on_a_bad_line_it_is_recorded_how_often_each_block_was_sent(tmp_path: Path) -> None:
     """A closed loop replaces blocks whose answers were lost: those of some are not waited for any more."""
-    run = run_session(SimulatedTimeHub(rig := lossy(0.2), 1), rig, tmp_path / "a.mcap", 40, controller="integrator")
+    run = run_session(SimulatedTimeHub(rig := lossy(0.2), 1), rig, tmp_path / "a.mcap", 20, controller="integrator")
     found = check(run)
     assert found.sent_again > 5
     assert found.most_tries > 1

@@ -30,7 +30,7 @@ from tests.session.simulated_time import Run, SimulatedTimeHub, run_session
 from tests.session.test_beside import children
 
 RIG = parse_rig(small_rig(DRIFT).toml.replace("exposure_steps = 40", "exposure_steps = 20"))
-LOSSY = parse_rig(f"{RIG.toml}\n[simulation.faults]\npacket_loss_rate = 0.1\ncommand_loss_rate = 0.1\n")
+LOSSY = parse_rig(f"{RIG.toml}\n[simulation.faults]\npacket_loss_rate = 0.25\ncommand_loss_rate = 0.25\n")
 BOUNDED = {
     "report.latencies": 10_000, "delay_ms": 10_000, "_gate._sent": 4096, "_effective": 4096, "_answers._open": 4096,
     "_withdrawn": 64 * 6, "_skipped._rows": 10_000, "loop._sent": 1000, "loop._held": 1000, "loop._limited": 1000,
@@ -67,7 +67,7 @@ def long_session(
     hub, seen = hub or SimulatedTimeHub(rig, 1), dict[int, dict[str, int]]()
 
     def progress(done: int) -> None:
-        for part in (exposures // 2, exposures * 4 // 5):
+        for part in (exposures * 3 // 10, exposures * 6 // 10):
             if done >= part and part not in seen:
                 seen[part] = held(hub.loop)
 
@@ -99,16 +99,18 @@ def test_a_camera_alone(tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("controller", ["", "integrator"])
 def test_a_mirror_some_of_whose_answers_and_reports_are_lost(tmp_path: Path, controller: str) -> None:
-    long_session(tmp_path, LOSSY, controller=controller)
+    """Some blocks are never answered: the account lets them go."""
+    run = long_session(tmp_path, LOSSY, exposures=300, controller=controller)
+    assert bool(run.report.answers.by_answer.get("NONE")) == bool(controller)
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 def test_an_estimator_that_never_answers(tmp_path: Path) -> None:
     """It serves the controller, which hears nothing."""
     with stopped_estimator(RIG, "o1") as beside:
-        run = long_session(tmp_path, RIG, beside=beside, controller="lqg", estimators=["o1"])
+        run = long_session(tmp_path, RIG, exposures=200, beside=beside, controller="lqg", estimators=["o1"])
     assert run.report.ended == "complete"
-    assert run.report.estimation["o1"].skipped == 400
+    assert run.report.estimation["o1"].skipped == 200
 
 
 @pytest.mark.slow
@@ -117,7 +119,7 @@ def test_a_mirror_that_reports_nothing(tmp_path: Path, controller: str) -> None:
     """It acknowledges its commands: the exposures come with what was commanded."""
     hub = SimulatedTimeHub(RIG, 1)
     hub.change("mirror", lambda message: None if isinstance(message, pb.Applied) else message)
-    run = long_session(tmp_path, RIG, hub, 500, 1000, controller=controller)
+    run = long_session(tmp_path, RIG, hub, 250, 1000, controller=controller)
     assert run.report.ended == "complete"
     assert {each.inputs_assumed for each in run.exposures} == {20}
     assert run.report.steps_commanded == run.report.steps_not_reported + run.report.steps_superseded

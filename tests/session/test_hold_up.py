@@ -20,7 +20,6 @@ from aolink.recording import topics
 from aolink.recording.reader import Recording
 from aolink.recording.writer import RecordingWriter
 from aolink.rig import Rig, load_rig, parse_rig
-from aolink.session.hold_ups import HoldUps
 from aolink.wire import messages_pb2 as pb
 from tests.control.rigs import DRIFT, small_rig
 from tests.kinds import messages_of
@@ -49,10 +48,10 @@ class JumpingHub(SimulatedTimeHub):
         self.ahead_ns += round(seconds * 1e9)
 
 
-def session(folder: Path, rig: Rig, happens: Callable[[JumpingHub], None], *, at: int = 30, **options: object) -> Run:
-    """A session of 200 exposures, 8 s, after some of which something happens."""
+def session(folder: Path, rig: Rig, happens: Callable[[JumpingHub], None], *, at: int = 20, **options: object) -> Run:
+    """A session of 100 exposures, 4 s, after some of which something happens."""
     hub, left = JumpingHub(rig), [happens]
-    exposures = options.pop("exposures", 200)
+    exposures = options.pop("exposures", 100)
 
     def progress(exposures: int) -> None:
         if exposures == at and left:
@@ -61,46 +60,50 @@ def session(folder: Path, rig: Rig, happens: Callable[[JumpingHub], None], *, at
     return run_session(hub, rig, folder / "a.mcap", exposures, progress=progress, **options)  # type: ignore[arg-type]
 
 
-def check(run: Run, seconds: float = 5.0) -> None:
+def check(run: Run) -> None:
     """It has gone on to its end, with one word about it; what it recorded is true."""
     assert (run.error, run.report.ended) == (None, "complete")
-    assert run.report.frames_received + run.report.frames_lost == 200
+    assert run.report.frames_received + run.report.frames_lost == 100
     (said,) = [each for each in run.report.warnings if "held up" in each]
-    assert said.startswith(f"the session was held up for {seconds:.1f} s after ")
+    assert said.startswith("the session was held up for 2.5 s after ")
     check_account(run)
     truth = run.hub.truth()
     for block in messages_of(pb.CommandBlock, Recording(run.path), topics.COMMAND)[-5:]:
         assert truth[block.first_step][0]  # the mirror is commanded again
 
 
-@pytest.mark.parametrize("rig", RIGS.values(), ids=RIGS)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", RIGS)
 @pytest.mark.parametrize("controller", ["", "integrator"])
-def test_a_session_whose_process_was_stopped_goes_on(tmp_path: Path, rig: Rig, controller: str) -> None:
-    run = session(tmp_path, rig, lambda hub: hub.hold_up(5.0), controller=controller)
+def test_a_session_whose_process_was_stopped_goes_on(tmp_path: Path, name: str, controller: str) -> None:
+    run = session(tmp_path, RIGS[name], lambda hub: hub.hold_up(2.5), controller=controller)
     check(run)
-    assert run.report.rearmed == (rig.mirror.watchdog_s < 5)
+    assert run.report.rearmed == (RIGS[name].mirror.watchdog_s < 2.5)
     assert run.report.frames_lost == 0
 
 
-@pytest.mark.parametrize("rig", RIGS.values(), ids=RIGS)
-def test_a_session_whose_clock_has_jumped_ahead_goes_on(tmp_path: Path, rig: Rig) -> None:
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["the queue lasts", "with a slew limit"])
+def test_a_session_whose_clock_has_jumped_ahead_goes_on(tmp_path: Path, name: str) -> None:
     """As after a computer has slept together with its devices: these still are in the same fast step."""
-    run = session(tmp_path, rig, lambda hub: hub.jump(5.0))
+    run = session(tmp_path, RIGS[name], lambda hub: hub.jump(2.5))
     check(run)
-    assert sum("'s clock was set back by 5.0" in each for each in run.report.warnings) == 2
-    assert run.report.exposures == 200
+    assert sum("'s clock was set back by 2.5" in each for each in run.report.warnings) == 2
+    assert run.report.exposures == 100
 
 
 def test_a_camera_alone_goes_on(tmp_path: Path) -> None:
-    run = session(tmp_path, RIG, lambda hub: hub.hold_up(5.0), alone=True)
-    assert (run.error, run.report.exposures, len(run.report.warnings)) == (None, 200, 1)
+    run = session(tmp_path, RIG, lambda hub: hub.hold_up(2.5), alone=True)
+    assert (run.error, run.report.exposures, len(run.report.warnings)) == (None, 100, 1)
 
 
+@pytest.mark.slow
 def test_a_session_that_would_have_ended_meanwhile_takes_what_has_come(tmp_path: Path) -> None:
-    run = session(tmp_path, RIG, lambda hub: hub.hold_up(5.0), at=180)
-    assert (run.error, run.report.ended, run.report.exposures) == (None, "complete", 200)
+    run = session(tmp_path, RIG, lambda hub: hub.hold_up(5.0), at=80)
+    assert (run.error, run.report.ended, run.report.exposures) == (None, "complete", 100)
 
 
+@pytest.mark.slow
 def test_a_camera_that_sends_nothing_more_is_still_an_error(tmp_path: Path) -> None:
     def unplug(hub: JumpingHub) -> None:
         hub.to_host["camera"].cut = True
@@ -111,8 +114,9 @@ def test_a_camera_that_sends_nothing_more_is_still_an_error(tmp_path: Path) -> N
     assert "the camera has sent no frame for 4.0 s: is it still connected?" in str(run.error)
 
 
+@pytest.mark.slow
 def test_several_are_said_once_with_their_number(tmp_path: Path) -> None:
-    left = [130, 90, 50]
+    left = [80, 50, 20]
     hub = SimulatedTimeHub(RIG)
 
     def progress(exposures: int) -> None:
@@ -120,24 +124,9 @@ def test_several_are_said_once_with_their_number(tmp_path: Path) -> None:
             left.pop()
             hub.hold_up(1.2)
 
-    run = run_session(hub, RIG, tmp_path / "a.mcap", 200, progress=progress)
+    run = run_session(hub, RIG, tmp_path / "a.mcap", 100, progress=progress)
     (said,) = run.report.warnings
     assert said.endswith("may be lost (3 times)")
-
-
-def test_what_a_hold_up_explains() -> None:
-    hold_ups, second = HoldUps(), 1_000_000_000
-    hold_ups.begin_turn(100 * second)
-    assert not hold_ups.end_turn(100 * second + second // 2)
-    assert hold_ups.unexplained_s(3.0, 101 * second) == 3.0
-    assert hold_ups.end_turn(105 * second + second // 2)
-    assert hold_ups.newest_s == 5.0
-    assert hold_ups.unexplained_s(5.5, 106 * second) == 0.5
-    assert hold_ups.unexplained_s(3.0, 120 * second) == 3.0  # an outage of its own
-    assert hold_ups.ended_within(1.0, 106 * second)
-    assert not hold_ups.ended_within(1.0, 107 * second)
-    assert hold_ups.end_turn(205 * second)
-    assert hold_ups.unexplained_s(101.0, 206 * second) == 101.0  # it was too long
 
 
 @pytest.mark.slow
@@ -157,26 +146,23 @@ def test_a_disk_is_not_too_slow_for_a_process_that_did_not_run(tmp_path: Path) -
     assert Recording(tmp_path / "a.mcap").counts[topics.LOG] == 10_001
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("alone", [False, True])
-@pytest.mark.parametrize("name", ["section-vi", "sh-4x4"])
-def test_a_process_that_is_stopped_and_continued(tmp_path: Path, name: str, alone: bool) -> None:
-    rig, path = load_rig(name), tmp_path / "a.mcap"
-    seconds = 8 + 60 * rig.timing.frame_period_steps * rig.timing.fast_step_s
-    with simulated_rig(name, "--real-time") as (camera, mirror):
+@pytest.mark.rare
+def test_a_process_that_is_stopped_and_continued(tmp_path: Path) -> None:
+    rig, path = load_rig("section-vi"), tmp_path / "a.mcap"
+    with simulated_rig("section-vi", "--real-time") as (camera, mirror):
         command = [
-            sys.executable, "-m", "aolink", "record", "--camera", camera, "--rig", name, "-o", str(path), "--duration",
-            str(seconds), *([] if alone else ["--mirror", mirror]),
+            sys.executable, "-m", "aolink", "record", "--camera", camera, "--mirror", mirror, "--rig", "section-vi",
+            "-o", str(path), "--duration", "8",
         ]  # fmt: skip
         with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
             until(lambda: path.exists() and path.stat().st_size > 30_000)
             os.kill(process.pid, signal.SIGSTOP)
-            time.sleep(5.0)  # the fault itself
+            time.sleep(3.0)  # the fault itself
             os.kill(process.pid, signal.SIGCONT)
             _, said = process.communicate(timeout=120)
     assert process.returncode == 0, said
-    assert "the session was held up for 5." in said
+    assert "the session was held up for 3." in said
     recording = Recording(path)
     assert (recording.complete, recording.end_metadata["ended"]) == (True, "complete")
     steps = np.array([each.first_step for each in recording.exposures()])
-    assert steps[-1] - steps[0] > 0.9 * (seconds - 1) / rig.timing.fast_step_s
+    assert steps[-1] - steps[0] > 6 / rig.timing.fast_step_s

@@ -16,7 +16,7 @@ from google.protobuf.message import Message
 from aolink.devices.adapted_mirror import AdaptedMirror
 from aolink.devices.discovery import identify_port
 from aolink.devices.interfaces import CommandAnswered
-from aolink.errors import DeviceError, PortError
+from aolink.errors import DeviceError
 from aolink.jobs.demo import simulated_rig
 from aolink.recording.reader import Recording
 from aolink.rig import parse_rig
@@ -128,46 +128,6 @@ def test_a_mirror_that_talks_and_never_confirms_is_given_up_too(tmp_path: Path) 
     run = interrupted_session(hub := LosingHub(1000), tmp_path)
     assert isinstance(run.error, DeviceError)
     assert len(hub.parks) == 2 * 200
-
-
-class Stubborn(Bench):
-    """A mirror whose driver fails to park it some times."""
-
-    def __init__(self, fails: int, error: Exception) -> None:
-        super().__init__()
-        self._fails, self._error = fails, error
-
-    def park(self) -> int:
-        step = super().park()
-        if self.parks <= self._fails:
-            raise self._error
-        return step
-
-
-def test_a_driver_that_fails_to_park_is_asked_again() -> None:
-    bench = Stubborn(2, OSError("busy"))
-    mirror = mirror_of(bench)
-    assert mirror.park() == 0
-    assert bench.parks == 3
-    mirror.close()
-    assert bench.parks == 3
-
-
-def test_a_driver_that_never_parks_is_asked_once_more_when_it_is_closed() -> None:
-    bench = Stubborn(100, OSError("busy"))
-    mirror = mirror_of(bench)
-    mirror.send_block(0, np.zeros((4, 1)), 0, bench.host_ns)
-    with pytest.raises(DeviceError, match="failed when it was asked to park"):
-        mirror.park()
-    mirror.close()
-    assert bench.parks == 4
-
-
-def test_a_driver_whose_port_is_gone_is_not_asked_again() -> None:
-    mirror = mirror_of(bench := Stubborn(100, PortError("gone")))
-    with pytest.raises(PortError):
-        mirror.park()
-    assert bench.parks == 1
 
 
 def test_answers_that_have_not_been_taken_are_not_lost() -> None:
