@@ -93,6 +93,7 @@ def test_three_hot_pixels_beside_each_other_are_found(motion):
     assert {(int(x), int(y)) for y, x in np.argwhere(found.defects)} == set(THREE)
 
 
+@pytest.mark.slow
 def test_a_hot_pixel_of_a_film_that_nothing_is_followed_in(tmp_path):
     """It is masked, and estimates are as in the same film without it."""
     rig = load_rig("sh-4x4")

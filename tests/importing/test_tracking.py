@@ -297,6 +297,7 @@ def test_a_motion_that_is_none_of_them_is_said(seed: int) -> None:
     assert fit_motion(walk).unexplained == 0, "a frame that is exposed throughout correlates neighbours only"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("period", "lasts", "walks"), [(3.7, 10, 0.0), (5.3, 50, 0.4), (12, 20, 0.4), (30, 10, 0.0)])
 def test_a_vibration_is_found_with_its_uncertainty(period: float, lasts: float, walks: float) -> None:
     """Alone, and of an object that walks at random as well; 30 places of 480 are not seen."""
@@ -362,6 +363,7 @@ def test_a_film_without_light_has_no_objects() -> None:
         find_objects(array_film(np.zeros((5, 64, 64), np.uint8), "dark"), FilmSettings(track=1))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(4))
 def test_a_walk_and_a_bound_motion_are_told_apart_and_fitted(seed: int) -> None:
     rng = np.random.default_rng(seed)

@@ -68,6 +68,7 @@ def test_bad_inputs_find_nothing() -> None:
     assert all("from 1000 to 1020" in line and line.endswith("nothing found") for line in lines)
 
 
+@pytest.mark.slow
 def test_a_kind_of_inputs_that_there_is_not_is_an_error() -> None:
     done = run(TOOLS / "fuzz", "pakets")
     assert done.returncode == 2
