@@ -72,6 +72,7 @@ def test_it_wraps_while_frames_are_lost(tmp_path: Path) -> None:
     assert [each.frame_id for each in run.exposures] == [65_530, 65_531, 65_532, 65_539, 65_540, 65_541]
 
 
+@pytest.mark.slow
 def test_a_counter_of_eight_bits_wraps_again_and_again(tmp_path: Path) -> None:
     hub = SimulatedTimeHub(RIG)
     counting(hub, 200, 8)
@@ -115,7 +116,7 @@ def test_any_counter_is_followed_whatever_is_lost(bits: int, first: int, frames:
         assert count.take(before % 2**bits, step_before) == (before, "")
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 def test_a_device_in_c_with_a_counter_of_16_bits(tmp_path: Path) -> None:
     source = tmp_path / "device"
     shutil.copytree(DEVICE, source, ignore=shutil.ignore_patterns("build"))

@@ -6,6 +6,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import pytest
+
 from aolink.devices.host import Host
 from aolink.devices.no_mirror import NoMirror
 from aolink.estimation import make_estimator
@@ -60,6 +62,7 @@ def test_warnings_that_differ_in_their_numbers_are_said_once_with_their_count(tm
     assert len(recording.metadata["warnings"]) < 400
 
 
+@pytest.mark.slow
 def test_a_controller_whose_model_fits_and_does_not_in_turn_says_so_once(tmp_path: Path) -> None:
     """Its estimates are those of a rig that is shaken more than its file says, and those of one that is not."""
     rig = small_rig(DRIFT)

@@ -63,6 +63,7 @@ def is_parked(hub: LosingHub) -> bool:
     return hub.server.devices.parked and not hub.server.devices.latched
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lost", [0, 1, 2, 5, 12])
 def test_a_mirror_that_does_not_hear_it_is_asked_again(tmp_path: Path, lost: int) -> None:
     """Also after a request to stop: the session ends in good order, and what was queued is superseded."""
@@ -73,6 +74,7 @@ def test_a_mirror_that_does_not_hear_it_is_asked_again(tmp_path: Path, lost: int
     assert run.report.steps_superseded > 1000
 
 
+@pytest.mark.slow
 def test_a_mirror_whose_confirmation_is_lost_is_asked_again(tmp_path: Path) -> None:
     hub, heard = LosingHub(0), list[Message]()
 
@@ -88,6 +90,7 @@ def test_a_mirror_whose_confirmation_is_lost_is_asked_again(tmp_path: Path) -> N
     assert is_parked(hub)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seconds", [0.01, 0.1])
 def test_an_interruption_while_it_parks_does_not_end_that(tmp_path: Path, seconds: float) -> None:
     """A second Ctrl-C comes while the mirror has not confirmed it yet."""
@@ -108,6 +111,7 @@ def test_an_interruption_while_it_parks_does_not_end_that(tmp_path: Path, second
     assert len(hub.parks) == 4
 
 
+@pytest.mark.slow
 def test_a_mirror_that_says_nothing_more_is_given_up(tmp_path: Path) -> None:
     """Its watchdog parks it, which has begun when it heard something last."""
     hub, done = LosingHub(100), list[int]()
@@ -124,6 +128,7 @@ def test_a_mirror_that_says_nothing_more_is_given_up(tmp_path: Path) -> None:
     assert 9.5 < asked_s < 11  # 5 s, and as long by whoever deals with the error
 
 
+@pytest.mark.slow
 def test_a_mirror_that_talks_and_never_confirms_is_given_up_too(tmp_path: Path) -> None:
     run = interrupted_session(hub := LosingHub(1000), tmp_path)
     assert isinstance(run.error, DeviceError)
@@ -154,7 +159,7 @@ class DeafForwarder(Forwarder):
         return b"" if parks and self.deaf else data
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 def test_a_second_ctrl_c_does_not_leave_the_mirror_where_it_is(tmp_path: Path) -> None:
     rig, path = tmp_path / "rig.toml", tmp_path / "a.mcap"
     rig.write_text(RIG.toml.replace("watchdog_s = 9.0", "watchdog_s = 60.0").replace("= 4000", "= 40000"))
