@@ -113,13 +113,13 @@ def test_an_estimator_that_never_answers(tmp_path: Path) -> None:
     assert run.report.estimation["o1"].skipped == 200
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 @pytest.mark.parametrize("controller", ["", "integrator"])
 def test_a_mirror_that_reports_nothing(tmp_path: Path, controller: str) -> None:
     """It acknowledges its commands: the exposures come with what was commanded."""
     hub = SimulatedTimeHub(RIG, 1)
     hub.change("mirror", lambda message: None if isinstance(message, pb.Applied) else message)
-    run = long_session(tmp_path, RIG, hub, 250, 1000, controller=controller)
+    run = long_session(tmp_path, RIG, hub, 500, 1000, controller=controller)
     assert run.report.ended == "complete"
     assert {each.inputs_assumed for each in run.exposures} == {20}
     assert run.report.steps_commanded == run.report.steps_not_reported + run.report.steps_superseded
