@@ -80,7 +80,7 @@ def _gaps_and_estimates(recording: Recording) -> tuple[dict[str, float], dict[st
     period, last, gaps = recording.rig.timing.frame_period_steps, None, []
     names = recording.estimators
     counts, unused = dict.fromkeys(names, 0), {name: UnusedCounter() for name in names}
-    for recorded in recording.messages(topics.EXPOSURE, *map(topics.estimate_topic, names)):
+    for recorded in recording.messages():  # all of them, because one that cannot be used is found when it is read
         message = recorded.message
         if isinstance(message, ExposureInfo):
             if last is not None and message.first_step - last != period:
@@ -104,7 +104,7 @@ def _losses(recording: Recording) -> dict[str, int]:
         if value.isdigit() and int(value):
             counted[name] = int(value)
     if recording.losses:
-        counted["parts_of_the_file"] = len(recording.losses)
+        counted["parts_of_the_file"] = sum(loss.count for loss in recording.losses)
     return counted
 
 

@@ -21,7 +21,12 @@ import sys
 from contextlib import suppress
 from pathlib import Path
 
+from aolink.errors import EstimatorError
+from aolink.limits import check_room
+
 _FOLDER = Path(__file__).parent
+_COMPILE_BYTES = 768 << 20
+"""Address space that compiling takes."""
 _COMPILE = f"""
 import sys
 
@@ -59,6 +64,7 @@ def compile_once(folder: Path, program: str) -> None:
         ready = kept / f"ready-{_machine()}"
         if ready.exists() and ready.stat().st_mtime >= changed:
             return
+        check_room(_COMPILE_BYTES, "compiling the loops of the estimators", EstimatorError)
         kept.mkdir(exist_ok=True)
         with open(kept / "compiling.lock", "w") as lock:
             fcntl.flock(lock, fcntl.LOCK_EX)  # another process may be compiling
