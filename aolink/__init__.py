@@ -2,7 +2,7 @@
 
 >>> import aolink
 >>> exposures = aolink.simulate("section-vi", n_exposures=3, seed=1)
->>> estimates = aolink.estimate(exposures, "o3")
+>>> estimates = aolink.estimate(exposures, "moments")
 >>> estimates[0].path.shape
 (1, 200)
 """

@@ -3,11 +3,14 @@ not affect the others."""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from functools import cache
-from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import EntryPoint, PackageNotFoundError, distribution, entry_points
 from typing import Any, Protocol, TypeVar
+from urllib.parse import urlsplit
+from urllib.request import url2pathname
 
 from aolink.errors import AolinkError
 
@@ -61,6 +64,19 @@ def row_named(name: str, ours: Mapping[str, Row], group: str, kind: str, error: 
     return row
 
 
+def install_command(extra: str) -> str:
+    """The command that installs an optional extra where aolink came from: an index, or a folder such as a clone."""
+    place, editable = "aolink", ""
+    try:
+        origin = json.loads(distribution("aolink").read_text("direct_url.json") or "{}")
+    except PackageNotFoundError:  # it runs from a folder that nobody has installed
+        origin = {}
+    if "dir_info" in origin:
+        place = url2pathname(urlsplit(origin["url"]).path)
+        editable = "-e " if origin["dir_info"].get("editable") else ""
+    return f"pip install {editable}'{place}[{extra}]'"
+
+
 @contextmanager
 def needs_extra(extra: str, error: type[AolinkError]) -> Iterator[None]:
     """A context for the import of an optional package: raises ``error``, which says what to install, where the package
@@ -68,4 +84,4 @@ def needs_extra(extra: str, error: type[AolinkError]) -> Iterator[None]:
     try:
         yield
     except ImportError as missing:
-        raise error(f"this needs {missing.name}: pip install 'aolink[{extra}]'") from None
+        raise error(f"this needs {missing.name}: {install_command(extra)}") from None

@@ -6,18 +6,18 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from zipfile import ZipFile
 
 import pytest
 from hypothesis import settings
 
-from aolink.jobs.demo import simulated_rig
 from aolink.rig import Rig, load_rig, parse_rig
 from aolink.session import Report, record
-from tests.commands import TIMEOUT_S, CommandServer
+from tests.commands import TIMEOUT_S, command_server, simulated_rig
 
 ESTIMATORS = ("open-loop", "o1", "o2", "o3")
 EXPOSURES = 12
@@ -47,21 +47,13 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Session:
     return Session(path, report)
 
 
-@pytest.fixture(scope="session")
-def command_server() -> Iterator[CommandServer]:
-    """Where the commands of all tests of this worker are run."""
-    server = CommandServer()
-    yield server
-    server.close()
-
-
 @pytest.fixture
-def aolink(tmp_path: Path, command_server: CommandServer) -> Callable[..., subprocess.CompletedProcess[str]]:
+def aolink(tmp_path: Path) -> Callable[..., subprocess.CompletedProcess[str]]:
     """Run the command line in an empty folder."""
 
     def run(*arguments: str | Path, **options: Any) -> subprocess.CompletedProcess[str]:
         if options.keys() <= {"input"}:
-            return command_server.run([*map(str, arguments)], tmp_path, **options)
+            return command_server().run([*map(str, arguments)], tmp_path, **options)
         command = [sys.executable, "-m", "aolink", *map(str, arguments)]
         return subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, timeout=TIMEOUT_S, **options)
 
@@ -72,8 +64,10 @@ def aolink(tmp_path: Path, command_server: CommandServer) -> Callable[..., subpr
 def with_example(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     """The environment of a process in which tests/example_package is installed."""
     folder = tmp_path_factory.mktemp("installed")
-    command = [sys.executable, "-m", "pip", "install", "-q", "--no-deps", "--no-build-isolation", "--no-index"]
-    subprocess.run([*command, "--target", folder, Path(__file__).parent / "example_package"], check=True)
+    build = [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(folder)]
+    subprocess.run(build, cwd=Path(__file__).parent / "example_package", capture_output=True, check=True)
+    (wheel,) = folder.glob("*.whl")
+    ZipFile(wheel).extractall(folder)
     return {**os.environ, "PYTHONPATH": os.pathsep.join([str(folder), str(Path(__file__).parents[1])])}
 
 

@@ -15,7 +15,6 @@ from aolink.simulation.devices import LineName
 from aolink.simulation.server import RigServer
 from aolink.simulation.streams import PtyStream, Stream, TcpStream
 from aolink.wire.packet import MessageDecoder, PacketDecoder, encode_message
-from aolink.wire.signing import Signing
 
 Lie = Callable[[Message], Message | Iterator[Message] | None]
 """What is sent in the place of a message: itself or another, several, perhaps without end, or None for nothing."""
@@ -26,8 +25,6 @@ class LyingStream:
 
     A thread of its own sends it, so that the rig goes on reading while the host does not.
     """
-
-    signing: Signing | None = None
 
     def __init__(self, lie: Lie, *, tcp: bool = False) -> None:
         self._port: Stream = TcpStream("127.0.0.1", 0) if tcp else PtyStream()

@@ -1,4 +1,7 @@
-"""What some tests need beside the core: where it is missing they are skipped, and with AOLINK_REQUIRE_ALL they fail."""
+"""What some tests need beside the core and the developers' tools.
+
+Where it is missing they are skipped, and with AOLINK_REQUIRE_ALL they fail. CI sets that, and installs it all.
+"""
 
 from __future__ import annotations
 
@@ -13,11 +16,11 @@ def missing(what: str, error: Exception) -> NoReturn:
     """Skip a test or a whole module; in CI, which sets AOLINK_REQUIRE_ALL, raise ``error``."""
     if os.environ.get("AOLINK_REQUIRE_ALL"):
         raise error
-    pytest.skip(f"{what} is missing", allow_module_level=True)
+    pytest.skip(f"needs {what}, which CI installs", allow_module_level=True)
 
 
 def needed(module: str) -> Any:
-    """A module of an extra, or of the developers' tools."""
+    """A module that not every installation for the tests has."""
     try:
         return import_module(module)
     except ImportError as error:

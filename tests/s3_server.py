@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
+import logging
 import threading
 import urllib.request
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from moto.moto_server.werkzeug_app import DomainDispatcherApplication, create_backend_app
-from werkzeug.serving import WSGIRequestHandler, make_server
-
-
-class _Quiet(WSGIRequestHandler):
-    def log(self, type: str, message: str, *arguments: Any) -> None:
-        """Requests are no news."""
+from tests.needs import needed
 
 
 class S3Server:
@@ -24,7 +19,8 @@ class S3Server:
         self.sent: list[int] = []
         """Bytes of each answer to a request for an object."""
         self.url = ""
-        self._application = DomainDispatcherApplication(create_backend_app)
+        moto = needed("moto.moto_server.werkzeug_app")
+        self._application = moto.DomainDispatcherApplication(moto.create_backend_app)
 
     def __call__(self, environment: dict[str, Any], start_response: Callable[..., Any]) -> Iterable[bytes]:
         def start(status: str, headers: list[tuple[str, str]], *rest: Any) -> Any:
@@ -53,8 +49,9 @@ class S3Server:
 @contextmanager
 def serving_s3() -> Iterator[S3Server]:
     """Run it in a thread."""
+    logging.getLogger("werkzeug").setLevel(logging.ERROR)  # requests are no news
     served = S3Server()
-    server = make_server("127.0.0.1", 0, served, threaded=True, request_handler=_Quiet)
+    server = needed("werkzeug.serving").make_server("127.0.0.1", 0, served, threaded=True)
     served.url = f"http://127.0.0.1:{server.server_port}"
     thread = threading.Thread(target=server.serve_forever)
     thread.start()

@@ -289,7 +289,7 @@ def arguments(command: str, sources: dict[str, Path], target: str) -> list[str]:
     return WRITING[command].format(target=target, **sources).split()
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("command", WRITING)
 def test_a_target_that_another_command_writes_is_refused(
     aolink: Run, sources: dict[str, Path], tmp_path: Path, command: str
@@ -331,7 +331,7 @@ def in_read_only_folder(tmp_path: Path) -> Iterator[Run]:
     folder.chmod(0o755)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("command", WRITING)
 def test_a_read_only_file_system_is_one_clear_line(
     in_read_only_folder: Run, sources: dict[str, Path], command: str
@@ -343,6 +343,7 @@ def test_a_read_only_file_system_is_one_clear_line(
     assert re.fullmatch(rf"aolink: cannot write {words[-1]}: {why}\n", refused.stderr), refused.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "words", [["demo", "--rig", "tip-tilt", "--out", "ro"], ["estimate", "{0}", "-e", "o1", "-o", "ro/out/"]]
 )

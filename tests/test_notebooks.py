@@ -17,12 +17,6 @@ ROOT = Path(__file__).parents[1]
 NOTEBOOKS = sorted((ROOT / "recordings" / "notebooks").glob("*.ipynb"))
 
 
-def test_there_are_three_of_which_a_page_tells() -> None:
-    page = (ROOT / "recordings" / "README.md").read_text()
-    assert [each.stem for each in NOTEBOOKS] == ["first_session", "my_own_film", "which_estimator"]
-    assert all(f"(notebooks/{each.name})" in page for each in NOTEBOOKS)
-
-
 @pytest.mark.parametrize("notebook", NOTEBOOKS, ids=lambda path: path.stem)
 def test_a_notebook_is_kept_without_outputs(notebook: Path) -> None:
     cells = [cell for cell in json.loads(notebook.read_text())["cells"] if cell["cell_type"] == "code"]
@@ -31,7 +25,7 @@ def test_a_notebook_is_kept_without_outputs(notebook: Path) -> None:
     assert notebook.stat().st_size < 10_000
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("notebook", NOTEBOOKS, ids=lambda path: path.stem)
 def test_a_notebook_runs(notebook: Path, tmp_path: Path) -> None:
     """By nbclient, as `jupyter execute` does, in a folder of its own."""

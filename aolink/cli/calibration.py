@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.markup import escape
 
-from aolink.cli.common import JsonOption, KeyOption, OverwriteOption, app, progress, stderr, stdout, with_key
+from aolink.cli.common import JsonOption, KeyOption, OverwriteOption, app, progress, stderr, stdout
 from aolink.cli.terminal import ask, progress_bar
 from aolink.errors import AolinkError, CalibrationError
 from aolink.files import check_target, writing
@@ -78,9 +78,6 @@ def calibrate(
     loaded = load_rig(rig)
     if (files and (camera or mirror)) or not (files or camera or "camera" in loaded.devices):
         raise typer.BadParameter("give recordings, or --camera, or [devices.camera] in the rig file")
-    if files and key:
-        raise typer.BadParameter("--key is for the devices' packets: leave it out with recordings")
-    to_record, camera, mirror = with_key(loaded, camera, mirror, key)
     suffix, kind = (".npz", CalibrationError) if interaction else ("", AolinkError)
     check_target(output, overwrite=overwrite, sources=files or [], suffix=suffix, error=kind)
     folder = keep or Path(mkdtemp(prefix="aolink-"))
@@ -92,12 +89,12 @@ def calibrate(
             folder.mkdir(parents=True, exist_ok=True)
             with stop_after() as stop, progress("exposures", None) as tell:
                 calibrate.record_pokes(
-                    to_record, camera, mirror, paths[0], share=poke, repeats=repeats, overwrite=overwrite, stop=stop,
+                    loaded, camera, mirror, paths[0], share=poke, repeats=repeats, overwrite=overwrite, stop=stop,
                     progress=tell, hold_s=hold,
                 )  # fmt: skip
         else:
             paths = calibrate.record_frames(
-                to_record, camera, mirror, folder, frames=frames, overwrite=overwrite,
+                loaded, camera, mirror, folder, frames=frames, overwrite=overwrite,
                 ask=partial(ask, stderr), stoppable=stop_after, progress=partial(progress_bar, stderr, frames),
             )  # fmt: skip
         if interaction:

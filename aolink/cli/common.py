@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from aolink.cli.terminal import PlainConsole, progress_bar
-from aolink.errors import EstimatorError, RigError
+from aolink.errors import EstimatorError, PortError, RigError
 
 if TYPE_CHECKING:
     from aolink.estimation import Score
@@ -53,13 +53,21 @@ EstimatorOption = Annotated[
     typer.Option(
         "--estimator",
         "-e",
-        help="Estimator to run, such as o3, moments or, with options, o3:second_order; may be given several times.",
+        help="Estimator to run, such as moments, o1 or, with options, o3:second_order; may be given several times.",
     ),
 ]
-KeyOption = Annotated[
-    Path | None,
-    typer.Option("--key", metavar="FILE", help="Sign packets with the key in this file, which both ends need."),
-]
+
+
+def _no_signing(option: typer.CallbackParam, value: str | bool | None) -> None:
+    if value not in (None, False):
+        from aolink.wire.packet import NO_SIGNING
+
+        raise PortError(f"{'/'.join(option.opts)}: {NO_SIGNING}")
+
+
+KeyOption = Annotated[str | None, typer.Option("--key", hidden=True, callback=_no_signing)]
+RemoteOption = Annotated[bool, typer.Option("--allow-remote", "--unsigned", hidden=True, callback=_no_signing)]
+"""Options of the last release, which are refused with what does the same now."""
 OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace the target file if it exists.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON for scripts.")]
 
@@ -94,17 +102,6 @@ def load_checked(path_or_name: str) -> "Rig":
         if finding.severity == "warning":
             warn(f"{finding.key}: {finding.message}")
     return loaded
-
-
-def with_key(
-    rig: "Rig", camera: str | None, mirror: str | None, key: Path | None,
-) -> "tuple[Rig, str | None, str | None]":  # fmt: skip
-    """The rig and the ports of a session whose packets --key signs: the ports are in the rig's table then."""
-    if key is None:
-        return rig, camera, mirror
-    from aolink.devices.opening import signed
-
-    return signed(rig, camera, mirror, key), None, None
 
 
 def open_recording(file: "str | Path | Url", *, check: bool = False, side: "Sequence[Path | Url]" = ()) -> "Recording":

@@ -26,7 +26,7 @@ Engine = StrEnum("Engine", {"AOLINK": "aolink", "FILTERPY": "filterpy"})
 
 
 @app.command(
-    epilog="Example: aolink estimate session.mcap -e o1 -e o3 -o again.mcap"
+    epilog="Example: aolink estimate session.mcap -e o1 -e moments -o again.mcap"
     "  |  aolink estimate *.mcap -e moments --set plant.process_noise=0.2,0.4 --jobs 2 -o results/"
 )
 def estimate(
@@ -78,7 +78,7 @@ def estimate(
 ) -> None:
     """Estimate the motion inside each exposure of recordings, again or for the first time.
 
-    Without -e it runs the estimators that the recording has estimates of, or o3.
+    Without -e it runs the estimators that the recording has estimates of, or moments.
     With many files or models it skips work that was done before and has not changed.
     A file that fails does not stop the others (exit code 1). Exit code 6 if no exposure gave a measurement.
     """
@@ -102,6 +102,7 @@ def estimate(
         return
     if output is None or (output.suffix == ".mcap" and not is_folder and not side):
         raise typer.BadParameter("many files or models need -o DIR: a folder for the results")
+    from aolink.estimation.registry import DEFAULT_ESTIMATOR
     from aolink.jobs import batch
     from aolink.jobs.tables import parquet as load_parquet
     from aolink.recording.remote import location
@@ -116,7 +117,13 @@ def estimate(
         if scheduler:  # the workers run in other folders
             sources, output = [batch.absolute(each) for each in sources], output.absolute()
         todo: Sequence[Job | SideJob] = batch.side_jobs(
-            sources, models, estimator or ["o3"], output, engine.value, table=table is not None, overwrite=overwrite
+            sources,
+            models,
+            estimator or [DEFAULT_ESTIMATOR],
+            output,
+            engine.value,
+            table=table is not None,
+            overwrite=overwrite,
         )
         part = f"-{shard.replace('/', '-of-')}" if shard else ""
         results = table.with_stem(table.stem + part) if table else output / f"results{part}.csv"

@@ -8,7 +8,7 @@ import typer
 from aolink.cli.common import OverwriteOption, app, open_recording, progress, stdout
 
 
-@app.command(epilog="Example: aolink export session.mcap -o session.parquet -e o3")
+@app.command(epilog="Example: aolink export session.mcap -o session.parquet -e moments")
 def export(
     file: Annotated[str, typer.Argument(metavar="FILE", help="A recording: a file or a URL.")],
     output: Annotated[

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from aolink.errors import AolinkError
+from aolink.extensions import install_command
 from aolink.files import writing
 
 _MOST_LABELS = 24
@@ -23,7 +24,7 @@ def batch_picture(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
     try:
         from matplotlib.figure import Figure
     except ImportError:
-        raise AolinkError("a picture needs matplotlib: pip install 'aolink[plot]'") from None
+        raise AolinkError(f"a picture needs matplotlib: {install_command('plot')}") from None
     done = [row for row in rows if row["estimator"]]
     if not done:
         raise AolinkError("nothing was estimated: there is nothing to draw")

@@ -48,11 +48,11 @@ def deblur(
         typer.Argument(metavar="FILE", help="A recording, all of whose exposures are restored.", parser=local_file),
     ] = None,
     estimator: Annotated[
-        str,
+        str | None,
         typer.Option(
-            "--estimator", "-e", help="The estimator whose path is used; it is run if the recording lacks it."
+            "--estimator", "-e", help="The estimator whose path is used, by default moments; it is run if it was not."
         ),
-    ] = "moments",
+    ] = None,
     image: Annotated[
         Path | None,
         typer.Option(
@@ -78,11 +78,12 @@ def deblur(
     as_json: JsonOption = False,
 ) -> None:
     """Remove the motion blur from every picture of a recording, or from a single picture with a known PSF."""
+    from aolink.estimation.registry import DEFAULT_ESTIMATOR
     from aolink.restoration.registry import DEFAULT_METHOD
 
     method = method or DEFAULT_METHOD
     if file is not None and not (image or psf or noise_sd):
-        _deblur_recording(file, out, estimator, method, overwrite=overwrite, as_json=as_json)
+        _deblur_recording(file, out, estimator or DEFAULT_ESTIMATOR, method, overwrite=overwrite, as_json=as_json)
     elif file is None and image is not None and psf is not None:
         _deblur_picture(image, psf, out, method, noise_sd, overwrite=overwrite, as_json=as_json)
     else:

@@ -38,16 +38,10 @@ def rig(
     real_time: Annotated[bool, typer.Option("--real-time", help="Run in real time, not on virtual time.")] = False,
     seed: Annotated[int | None, typer.Option(help="Instead of the rig file's seed.", min=0)] = None,
     listen: Annotated[
-        str | None, typer.Option(metavar="HOST:PORT", help="Serve TCP ports of this machine, not terminals.")
+        str | None, typer.Option(metavar="HOST:PORT", help="Serve TCP ports, to this machine only, not terminals.")
     ] = None,
-    allow_remote: Annotated[
-        bool,
-        typer.Option("--allow-remote", help="Let --listen take an address that other machines can reach, with --key."),
-    ] = False,
     key: KeyOption = None,
-    unsigned: Annotated[
-        bool, typer.Option("--unsigned", help="With --allow-remote, instead of --key: everybody may move the mirror.")
-    ] = False,
+    allow_remote: common.RemoteOption = False,
     light: Annotated[
         str | None,
         typer.Option(
@@ -103,22 +97,12 @@ def rig(
         loaded = replace(loaded, simulation=replace(loaded.simulation, faults=faults))
     from aolink.simulation.server import RigServer
     from aolink.simulation.streams import open_streams
-    from aolink.wire.signing import read_key
 
-    if key and unsigned:
-        raise typer.BadParameter("give --key or --unsigned, not both")
     with StopRequest().installed() as stop, ExitStack() as stack:
         links = None
         if loaded.simulation.faults.vanish_rate:
             links = Path(stack.enter_context(TemporaryDirectory(prefix="aolink-rig-")))
-        streams = open_streams(
-            listen, key=read_key(key) if key else None, allow_remote=allow_remote, unsigned=unsigned, links=links
-        )
-        if allow_remote:
-            common.warn(
-                "other machines can reach this rig: it obeys those that have the key, and what it sends can be read by"
-                " all" if key else "other machines can reach this rig, and everybody there can move the mirror"
-            )  # fmt: skip
+        streams = open_streams(listen, links=links)
         server = RigServer(loaded, streams, seed=seed, real_time=real_time)
         ports = {line: stream.name for line, stream in streams.items()}
         if as_json:
@@ -129,7 +113,7 @@ def rig(
             print(
                 f"rig {loaded.name}, {'real' if real_time else 'virtual'} time; to record 100 exposures from it:\n"
                 f"  {program()} record --camera {ports['camera']} --mirror {ports['mirror']} --rig {rig}"
-                f"{f' --key {key}' if key else ''} --estimator o3 --exposures 100 -o session.mcap\nCtrl-C stops it.",
+                " --estimator moments --exposures 100 -o session.mcap\nCtrl-C stops it.",
                 flush=True,
             )
         server.run(lambda: stop() or (tied and input_ended()))
@@ -232,7 +216,7 @@ def devices(
     failed: AolinkError | None = None
     for port in ports:
         try:
-            found.append(identify_port(port, key))
+            found.append(identify_port(port))
         except AolinkError as error:
             failed = error
             common.stderr.print(f"{port}: {escape(str(error))}")

@@ -35,7 +35,7 @@ CalibrationLight = StrEnum("CalibrationLight", ["DARK", "FLAT", "STILL"])
 
 @app.command(
     epilog="Example: aolink record --camera /dev/pts/3 --mirror /dev/pts/4 --rig section-vi"
-    " --estimator o3 --exposures 100 -o session.mcap"
+    " --estimator moments --exposures 100 -o session.mcap"
 )
 def record(
     rig: Annotated[
@@ -63,7 +63,8 @@ def record(
         str | None,
         typer.Option(
             metavar="NAME",
-            help="Close the loop with this controller, integrator, lqg or another package's; the first -e serves it.",
+            help="Close the loop with this controller, integrator, lqg or another package's; the first -e serves it,"
+            " moments where there is none.",
         ),
     ] = None,
     force: Annotated[
@@ -113,6 +114,7 @@ def record(
     """
     from aolink import session
     from aolink.recording.mcap_file import WriteOptions
+    from aolink.session.controlling import served
 
     options = WriteOptions(
         compression=compression, chunk_bytes=chunk_kib << 10, flush_s=flush_s, fsync_s=fsync_s,
@@ -128,7 +130,6 @@ def record(
         if not 0 < periods <= MOST_EXPOSURES:
             raise typer.BadParameter(f"--duration {duration:g} is not a number of seconds above zero")
         exposures = math.ceil(periods)
-    loaded, camera, mirror = common.with_key(loaded, camera, mirror, key)
     played = None
     if inputs:
         from aolink.session.excitation import excitation
@@ -137,13 +138,14 @@ def record(
             raise typer.BadParameter("--input is not for --control or --calibration, which give the inputs themselves")
         played = excitation(inputs, loaded)
         exposures = exposures or played.exposures or None
-    get_ready(loaded, estimator or [])
+    names = served(loaded, control or "", estimator or [])
+    get_ready(loaded, names)
     if dry_run:
         from aolink.session.dry_run import dry_run as checked
 
         with StopRequest().installed() as stop:
             found = checked(
-                loaded, camera, mirror, output, estimators=estimator or [], exposures=exposures or 0,
+                loaded, camera, mirror, output, estimators=names, exposures=exposures or 0,
                 calibration=calibration or "", inputs=played, control=control or "", force=force,
                 overwrite=overwrite, stop=stop,
             )  # fmt: skip
@@ -157,10 +159,10 @@ def record(
         notes = ["skipped: " + ", ".join(f"{name} {n}" for name, n in skipped)] if skipped else []
         tell(done, "; ".join([*notes, *([report.control.note] if report.control else [])]))
 
-    with _live_view(loaded, estimator or [], shown=view) as live:
+    with _live_view(loaded, names, shown=view) as live:
         with StopRequest().installed() as stop, progress("exposures", exposures) as tell:
             session.record(
-                loaded, camera, mirror, output, estimators=estimator or [], exposures=exposures or 0, note=note,
+                loaded, camera, mirror, output, estimators=names, exposures=exposures or 0, note=note,
                 calibration=calibration or "", inputs=played, control=control or "", force=force,
                 watch=live.show if live else None, overwrite=overwrite,
                 options=options, reconnect_s=reconnect, stop=stop, progress=on_progress, report=report,
@@ -255,16 +257,15 @@ def replay(
     if to_rig:
         if control:
             raise typer.BadParameter("--to-rig sends the recorded commands: `aolink record --control` closes a loop")
-        driven = recording.rig.devices
-        if not (output and (camera or "camera" in driven) and (mirror or "mirror" in driven)):
+        if not (output and camera and mirror):
             raise typer.BadParameter(
-                "--to-rig needs -o FILE, --camera PORT and --mirror PORT, or [devices] in its rig file"
+                "--to-rig needs -o FILE, --camera PORT and --mirror PORT, because no device that a recording names is"
+                f" opened; with drivers use `aolink record --rig RIG.toml --input {file} -o FILE`"
             )
-        to = common.with_key(recording.rig, camera, mirror, key)
-        _replay_to_rig(recording, names, *to, output, overwrite=overwrite, as_json=as_json)
+        _replay_to_rig(recording, names, camera, mirror, output, overwrite=overwrite, as_json=as_json)
         return
-    if camera or mirror or key or output:
-        raise typer.BadParameter("--camera, --mirror, --key and -o are for --to-rig")
+    if camera or mirror or output:
+        raise typer.BadParameter("--camera, --mirror and -o are for --to-rig")
     if control:
         if view or rate or start or end is not None:
             raise typer.BadParameter("--control takes the whole recording at once: leave out --view, --rate and times")
@@ -311,8 +312,8 @@ def _replay_control(recording: "Recording", controller: str, estimator: str, *, 
 
 
 def _replay_to_rig(
-    recording: "Recording", names: list[str], rig: "Rig", camera: str | None, mirror: str | None, output: Path, *,
-    overwrite: bool, as_json: bool,
+    recording: "Recording", names: list[str], camera: str | None, mirror: str | None, output: Path, *, overwrite: bool,
+    as_json: bool,
 ) -> None:  # fmt: skip
     from aolink import session
     from aolink.cli.tables import recordings as tables
@@ -325,7 +326,7 @@ def _replay_to_rig(
     commands = RecordedCommands(recording)
     with StopRequest().installed() as stop, progress("exposures", commands.exposures) as tell:
         report = session.record(
-            rig, camera, mirror, output, estimators=names, exposures=commands.exposures,
+            recording.rig, camera, mirror, output, estimators=names, exposures=commands.exposures,
             inputs=commands.inputs, note=f"commands of {recording.path.name}", overwrite=overwrite, stop=stop,
             progress=tell,
         )  # fmt: skip
@@ -345,39 +346,44 @@ def _replay_to_rig(
     stop.raise_if_asked()
 
 
-@app.command(epilog="Example: aolink demo --rig section-vi-lively --out /tmp")
+@app.command(epilog="Example: aolink demo  |  aolink demo --rig section-vi-lively -e o1 -e o3 -e profile --out /tmp")
 def demo(
-    rig: Annotated[str, typer.Option(help="Rig file or name.")] = "section-vi",
+    rig: Annotated[str, typer.Option(help="Rig file or name.")] = "moving-scene",
     out: Annotated[Path, typer.Option(metavar="DIR", help="The folder in which to make a new, dated one.")] = Path(),
-    exposures: Annotated[int, typer.Option(min=2, help="How many exposures.")] = 300,
+    estimator: Annotated[
+        list[str] | None,
+        typer.Option("--estimator", "-e", help="Estimator to run; by default open-loop, o1 and moments."),
+    ] = None,
+    exposures: Annotated[int, typer.Option(min=2, help="How many exposures.")] = 40,
     seed: Annotated[int | None, typer.Option(min=0, help="Instead of the rig file's seed.")] = None,
     real_time: Annotated[bool, typer.Option("--real-time", help="Run in real time and measure latencies.")] = False,
     control: Annotated[
         str | None,
-        typer.Option(metavar="NAME", help="Close the loop, and compare with the open one and the integrator."),
+        typer.Option(
+            metavar="NAME",
+            help="Close the loop, served by the first -e, and compare with the open one and the integrator.",
+        ),
     ] = None,
 ) -> None:
-    """Run everything with a simulated rig: record, estimate, estimate again, compare, draw."""
+    """Run everything with a simulated rig: record, estimate, estimate again, compare, deblur, draw."""
     from aolink.cli.tables import scores, sessions
-    from aolink.jobs.demo import new_folder, possible_estimators, run_demo
-    from aolink.recording.reader import Recording
-    from aolink.recording.reestimate import scored
+    from aolink.jobs.demo import new_folder, run_demo, usual_estimators
 
     loaded = common.load_checked(rig)
+    names = list(dict.fromkeys(estimator or usual_estimators(loaded, control or "")))
+    get_ready(loaded, names)
     folder = new_folder(out)
-    get_ready(loaded, possible_estimators(loaded))
     stop = StopRequest()
     try:
         with progress_bar(common.stderr, exposures) as tell:
             result = run_demo(
-                loaded, rig, folder, exposures=exposures, seed=seed, real_time=real_time,
+                loaded, rig, folder, estimators=names, exposures=exposures, seed=seed, real_time=real_time,
                 control=control or "", stoppable=stop.installed, progress=tell,
             )  # fmt: skip
     except Interrupted as interrupted:
         raise Interrupted(interrupted.number, f"the files made until then are in {folder}") from None
-    if not stop():
-        recording = Recording(result.recording)
-        stdout.print(scores.scores(scored(recording, recording.estimators)))
+    if result.scores:
+        stdout.print(scores.scores(result.scores, ("RMSE path", "NIS", "NEES end")))
     stdout.print(sessions.session(result.report))
     for line in sessions.demo_summary(result, program()):
         stdout.print(line, markup=False)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import select
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -12,6 +11,7 @@ from rich.console import Console, ConsoleOptions, RenderableType
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.segment import Segment
 
+from aolink.polling import wait_readable
 from aolink.signals import Interrupted
 
 _SHOWN = {ord("\n"), ord("\t")}
@@ -67,5 +67,4 @@ def ask(console: Console, question: str) -> str:
 
 def input_ended() -> bool:
     """Whether standard input is at its end; any input on it is thrown away."""
-    readable, _, _ = select.select([0], [], [], 0)
-    return bool(readable) and not os.read(0, 4096)
+    return wait_readable([0], 0) and not os.read(0, 4096)

@@ -33,8 +33,8 @@ class Fit:
     """Whether both are within what chance and an inexact model explain."""
 
     def text(self) -> str:
-        correlation = f"correlation of neighbouring innovations {self.whiteness:+.2f}"
-        return f"NIS {self.nis_ratio:.2f} times its expectation, {correlation}"
+        squares = f"squared errors of prediction (NIS) {self.nis_ratio:.2f} times what the model expects"
+        return f"{squares}, correlation of neighbouring errors {self.whiteness:+.2f} where it expects 0"
 
 
 class _Sums(NamedTuple):

@@ -60,6 +60,8 @@ class AdaptedCamera(Adapted):
         self._arrivals = Arrivals(self._period_ns)
         self._running = self._tells_time = False
         self._first_step = 0
+        self._left = math.inf
+        """How many frames the session still asks for; more may come until the camera has stopped."""
         self._last: tuple[int, int] | None = None
         """The id of the frame before, and its start on the camera's clock."""
         self._end_step = 0
@@ -90,6 +92,7 @@ class AdaptedCamera(Adapted):
         with calling(self.name, "when it was asked to start"):
             self._driver.start(start_ns + round(min(margin_ns, self._step_ns)), exposures)
         self._first_step, self._end_step, self._running = first_step, 0, True
+        self._left = exposures or math.inf
         return True
 
     def stop(self) -> None:
@@ -145,6 +148,8 @@ class AdaptedCamera(Adapted):
         return [ClockSampled.add(self.clock, exchange) for exchange in exchanges]
 
     def _take(self, raw: SimpleFrame, now_ns: int) -> list[Event]:
+        if not self._left:
+            return []
         pixels = np.asarray(raw.pixels)
         self._check(raw, pixels)
         frame_id = self._frame_id(raw)
@@ -163,6 +168,7 @@ class AdaptedCamera(Adapted):
         if first_step < self._first_step:  # the camera had kept it from before the session
             self._last = None
             return []
+        self._left -= 1
         self._end_step = first_step + n_steps
         frame = Frame(
             frame_id=frame_id, first_step=first_step, last_step=self._end_step - 1,

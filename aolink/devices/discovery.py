@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 from dataclasses import dataclass, field
-from pathlib import Path
 
 from serial.tools import list_ports as serial_ports
 
@@ -16,7 +15,6 @@ from aolink.errors import AolinkError
 from aolink.wire import messages_pb2 as pb
 from aolink.wire.hub import Hub
 from aolink.wire.port import SerialPort
-from aolink.wire.signing import read_key
 
 
 @dataclass(frozen=True)
@@ -90,12 +88,11 @@ def list_ports() -> list[tuple[str, str]]:
     return sorted((port.device, port.description or "") for port in serial_ports.comports())
 
 
-def identify_port(port: str, key: str | Path | None = None) -> FoundDevice:
-    """Ask the device behind a port for its identity, with packets signed by a key file. Raises PortError and
-    DeviceError."""
-    hub, secret = Hub(), read_key(key) if key else None
+def identify_port(port: str) -> FoundDevice:
+    """Ask the device behind a port for its identity. Raises PortError and DeviceError."""
+    hub = Hub()
     try:
-        identity = identify(hub, hub.connect(f"given ({port})", SerialPort(port), secret), new_nonce())
+        identity = identify(hub, hub.connect(f"given ({port})", SerialPort(port)), new_nonce())
     finally:
         hub.close()
     camera, mirror = identity.camera, identity.mirror

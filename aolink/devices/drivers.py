@@ -12,6 +12,9 @@ from aolink.errors import AolinkError, DeviceError, RigError
 from aolink.extensions import installed, loaded
 from aolink.rig import Rig
 from aolink.rig.device_tables import DeviceTable
+from aolink.rig.toml_table import shown
+from aolink.wire.packet import NO_SIGNING
+from aolink.wire.port import check_address
 
 DeviceKind = Literal["camera", "mirror"]
 KINDS: tuple[DeviceKind, ...] = get_args(DeviceKind)
@@ -48,6 +51,20 @@ def check_driver(kind: DeviceKind, table: DeviceTable, rig: Rig) -> Callable[...
     except TypeError as error:
         raise RigError(f"devices.{kind}: the driver {table.driver} cannot take these keys: {error}") from None
     return make
+
+
+def native_port(kind: DeviceKind, table: DeviceTable) -> str:
+    """The port of a native device. Raises PortError where it cannot be one, and RigError for other keys."""
+    if "key" in table.options:
+        raise RigError(f"devices.{kind}.key: {NO_SIGNING}")
+    port = table.options.get("port")
+    if not isinstance(port, str) or len(table.options) > 1 or table.delay:
+        raise RigError(
+            f"devices.{kind}: the driver {NATIVE} takes port, a text; found {shown(table.options)}"
+            f"{' and a delay, though it reports its time' if table.delay else ''}"
+        )
+    check_address(port)
+    return port
 
 
 @contextmanager

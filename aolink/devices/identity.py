@@ -10,7 +10,7 @@ from aolink.rig import Rig
 from aolink.wire import messages_pb2 as pb
 from aolink.wire.hub import Hub
 from aolink.wire.link import Link
-from aolink.wire.packet import PROTOCOL_VERSION, SIGNED_VERSION, schema_hash
+from aolink.wire.packet import NO_SIGNING, PROTOCOL_VERSION, SIGNED_VERSION, schema_hash
 
 _LONGEST_NAME = 200
 
@@ -35,24 +35,13 @@ def identify(hub: Hub, link: Link, nonce: int) -> pb.Identity:
     try:
         identity = hub.request(link, pb.Identify(nonce=nonce), pb.Identity, lambda answer, _: answer.nonce == nonce)
     except PortError:
-        if not link.refusal:  # the device closes the connection to a host that it refuses
+        if link.foreign_version is None:  # the device closes the connection to a host that it refuses
             raise
-    if identity is None and link.refusal and link.signing:
-        raise DeviceError(
-            f"a packet from the {link.name} port {link.refusal}: with --key both ends need the same key file; a device"
-            " that knows no signed packets is used without, on a line that nobody else can reach"
-        )
-    if identity is None and link.foreign_version == SIGNED_VERSION:
-        raise DeviceError(
-            f"the device on the {link.name} port takes signed packets only: give its key (--key FILE, or key = FILE in"
-            " the rig file's table of the device)"
-        )
     if identity is None and link.foreign_version is not None:
         found = link.foreign_version
     elif identity is None:
         heard = link.counts.bytes_received
         what = f"{heard} bytes came that are not aolink packets" if heard else "nothing came"
-        what += "; does it know signed packets?" if link.signing else ""
         raise DeviceError(
             f"no device answers on the {link.name} port ({what}): is it the right port, is the device switched on,"
             " does another host have it?"
@@ -60,9 +49,10 @@ def identify(hub: Hub, link: Link, nonce: int) -> pb.Identity:
     else:
         found = identity.protocol_version
     if identity is None or found != PROTOCOL_VERSION:
+        update = f"update the {'device' if found < PROTOCOL_VERSION else 'host'}"
         raise DeviceError(
-            f"the device on the {link.name} port speaks protocol version {found},"
-            f" this aolink speaks {PROTOCOL_VERSION}: update the {'device' if found < PROTOCOL_VERSION else 'host'}"
+            f"the device on the {link.name} port speaks protocol version {found}, this aolink speaks"
+            f" {PROTOCOL_VERSION}: {NO_SIGNING if found == SIGNED_VERSION else update}"
         )
     if identity.schema_hash != schema_hash():
         raise DeviceError(

@@ -5,14 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import replace
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 from aolink.devices.adapted_camera import AdaptedCamera
 from aolink.devices.adapted_mirror import AdaptedMirror
-from aolink.devices.drivers import KINDS, NATIVE, DeviceKind, calling, driver_names, open_driver
+from aolink.devices.drivers import KINDS, NATIVE, DeviceKind, calling, driver_names, native_port, open_driver
 from aolink.devices.gate import Gate
 from aolink.devices.host import Host
 from aolink.devices.identity import check_against_rig, check_kind, identify, new_nonce
@@ -26,7 +24,6 @@ from aolink.rig import Rig
 from aolink.rig.device_tables import Delay, DeviceTable
 from aolink.wire import messages_pb2 as pb
 from aolink.wire.port import SerialPort
-from aolink.wire.signing import read_key
 
 
 @contextmanager
@@ -73,7 +70,7 @@ def open_devices(
     host = Host(stop)
     with ExitStack() as stack:
         stack.callback(host.close)
-        ports = {kind: _port_and_key(kind, table, rig) for kind, table in tables.items() if table.driver == NATIVE}
+        ports = {kind: native_port(kind, table) for kind, table in tables.items() if table.driver == NATIVE}
         native_camera, native_mirror, warnings = _open_native(rig, host, ports, stop)
         if reconnect_s:
             _allow_return(host, stop, reconnect_s)
@@ -150,35 +147,13 @@ def _closing_what_fails(kind: DeviceKind, close: Callable[[], None]) -> Iterator
         raise
 
 
-def signed(rig: Rig, camera_port: str | None, mirror_port: str | None, key: str | Path) -> Rig:
-    """The rig whose native devices, those at the ports among them, have their packets signed with a key file."""
-    tables = _tables(rig, camera_port, mirror_port)
-    for kind, table in tables.items():
-        if table.driver == NATIVE:
-            tables[kind] = replace(table, options={**table.options, "key": Path(key).absolute()})
-    return replace(rig, devices={str(kind): table for kind, table in tables.items()})
-
-
-def _port_and_key(kind: DeviceKind, table: DeviceTable, rig: Rig) -> tuple[str, bytes | None]:
-    others = dict(table.options)
-    port, key = others.pop("port", None), others.pop("key", None)
-    if not isinstance(port, str) or not isinstance(key, str | Path | None) or others or table.delay:
-        raise RigError(
-            f"devices.{kind}: the driver {NATIVE} takes port, a text, and key, a file's name; found {table.options}"
-            f"{' and a delay' if table.delay else ''}"
-        )
-    if isinstance(key, str):  # from the rig file; not one that the user has given beside it
-        key = rig.path_of(key, f"devices.{kind}.key") if key else None
-    return port, read_key(key) if key else None
-
-
 def _open_native(
-    rig: Rig, host: Host, ports: dict[DeviceKind, tuple[str, bytes | None]], stop: Callable[[], bool]
+    rig: Rig, host: Host, ports: dict[DeviceKind, str], stop: Callable[[], bool]
 ) -> tuple[NativeCamera | None, NativeMirror | None, list[str]]:
     """The devices that speak packets, None for those that do not, and warnings about them."""
     if not ports:
         return None, None, []
-    links = {kind: host.connect(kind, SerialPort(port, stop=stop), key) for kind, (port, key) in ports.items()}
+    links = {kind: host.connect(kind, SerialPort(port, stop=stop)) for kind, port in ports.items()}
     asked_ns = host.now_ns()
     identities: dict[str, pb.Identity] = {}
     for kind, link in links.items():

@@ -156,18 +156,19 @@ def narrow_intervals(rig: Rig) -> Iterator[tuple[str, str]]:
     """The rig file's key and a sentence for a rig on which importance sampling is often too sure."""
     if importance_is_too_sure(rig):
         what = (
-            "the 95 % intervals of profile are often too narrow on such a rig (they held 0.90 to 0.97); those of"
-            " mixture held 0.94 to 0.98, but it takes some 0.2 s an axis and exposure"
+            "profile misses some of the paths that explain a blur on such a rig, and its 95 % intervals are often too"
+            " narrow; mixture searches at length, which takes some 0.2 s an axis and exposure"
         )
         if modes_stay_lost(rig):
             what = (
-                "profile is the same as mixture on such a rig; it takes up to 1.2 s an axis and exposure, and the 95 %"
-                " intervals held 0.88 to 0.98"
+                "paths that explain a blur are easily missed on such a rig; profile searches at length there, as"
+                " mixture does, which takes up to a second or so an axis and exposure, and the 95 % intervals may still"
+                " be too narrow"
             )
         yield (
             "sensor.noise_density",
-            f"signal to noise is {peak_snr(rig):.3g}, and several eigenmodes move the spot, one of them a vibration"
-            f" that lasts for longer than a frame period: {what}; compare both with moments",
+            f"signal to noise is {peak_snr(rig):.3g}, and several motions (eigenmodes of the plant) move the spot, one"
+            f" of them a vibration that lasts for longer than a frame period: {what}; compare both with moments",
         )
 
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from aolink.errors import EstimatorError
 from aolink.estimation.alignment import Shifted, considered, matters, share_of_shift
 from aolink.estimation.batch import Batch
 from aolink.estimation.estimate import Estimate, Status, as_recorded
@@ -50,7 +51,18 @@ class Estimator:
         return estimate
 
     def steps(self, batch: Batch) -> Iterator[Estimate]:
-        """The estimates of a batch of exposures, one after the other, the same bits as by `step`."""
+        """The estimates of a batch of exposures, one after the other, the same bits as by `step`.
+
+        Raises EstimatorError where the rig has numbers that cannot be computed with.
+        """
+        try:
+            yield from self._steps(batch)
+        except (ArithmeticError, np.linalg.LinAlgError) as error:
+            raise EstimatorError(
+                f"{self.name} cannot compute with this rig: {error}; are its numbers too large or too small?"
+            ) from error
+
+    def _steps(self, batch: Batch) -> Iterator[Estimate]:
         step_ns = self.rig.timing.fast_step_ns
         if self._copies is None:
             for k, exposure in enumerate(batch.exposures):
@@ -172,7 +184,7 @@ def _status_reasons(posterior: Posterior) -> list[str]:
     words = {
         Status.GATED: "too far from the prediction, not used",
         Status.DIVERGED: "too far from the prediction several times in a row: it starts again",
-        Status.REINITIALISED: "started again from the plant's prior",
+        Status.REINITIALISED: "started again from the plant's own motion, without what earlier frames had shown",
     }
     counts = np.bincount(posterior.status, minlength=len(Status))
     axes = len(posterior.status)

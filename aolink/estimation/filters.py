@@ -10,7 +10,6 @@ import numpy as np
 
 from aolink.errors import EstimatorError
 from aolink.estimation.assumptions import importance_is_too_sure, modes_stay_lost
-from aolink.estimation.compiled import make_ready
 from aolink.estimation.frames.centroid_noise import centroid_covariance
 from aolink.estimation.frames.frame_data import Profile, SpotWindows
 from aolink.estimation.kalman.filter import BlurFilter, Filter, TwoStateFilter
@@ -107,7 +106,6 @@ def _warm_up(rig: Rig) -> None:
     model = exposure_model(rig.plant, steps, rig.timing.exposure_offset)
     shape = (rig.plant.axes, rig.plant.n_outputs // 2, *sensor.window)
     dark = SpotWindows(density=np.zeros(shape), mask=np.ones(shape, dtype=bool))
-    make_ready()
     for each in (JointMoments, JointProfile):
         blur_filter = BlurFilter(rig.plant, each(sensor, rig.plant.n_outputs))
         blur_filter.step(model, model.response(np.zeros((steps, rig.n_inputs))), dark)
@@ -115,7 +113,6 @@ def _warm_up(rig: Rig) -> None:
 
 def _warm_up_line(rig: Rig, options: Options) -> None:
     """Estimate a dark exposure of one line, so that what this loads is loaded before the session."""
-    make_ready()
     plant, pixels = replace(rig.plant, axes=1), rig.sensor.profile.pixels
     model = exposure_model(plant, 2)
     dark = Profile(density=np.zeros((1, pixels)), mask=np.ones((1, pixels), dtype=bool))
@@ -164,7 +161,6 @@ def _of_pixels(rig: Rig, options: Options, updates: Any) -> Filter:
 
     pixels = MixtureFilter(rig.plant, rig.sensor, updates, gate=options.gate)
     # mixture compiles at once what profile would compile at the first posterior of several modes.
-    make_ready()
     pixels.warm_up(MIXTURE)
     updates.reduction(exposure_model(rig.plant, rig.timing.exposure_steps, rig.timing.exposure_offset), rig.sensor)
     return pixels

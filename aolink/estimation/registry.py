@@ -30,11 +30,10 @@ if TYPE_CHECKING:
 
 GROUP = "aolink.estimators"
 """The entry points by which other packages add estimators."""
-DEFAULT_ESTIMATOR = "o3"
+DEFAULT_ESTIMATOR = "moments"
+"""The estimator where one is needed and none is named: also for a controller, as it takes milliseconds an exposure."""
 BASELINE_ESTIMATOR = "o1"
 """The estimator that others are compared with: it takes the centroid of a blurred spot alone."""
-LOOP_ESTIMATOR = "moments"
-"""The estimator that serves the controller of a demo, where it can work on the rig."""
 # Spots of one copy of the plant, by `moments`.
 _MOST_SPOTS = 128
 _LOADED_BYTES = 384 << 20
@@ -59,8 +58,8 @@ class EstimatorRow:
     """Engines that it can run on."""
     wanders: bool = False
     """Whether it follows a plant with ``plant.wandering``; it has to model the noise inside an exposure."""
-    in_demo: Callable[[Rig], bool] = lambda rig: True
-    """Whether it is fast enough on a rig for `aolink demo`."""
+    loops: Callable[[Rig], tuple[str, ...]] = lambda rig: ()
+    """The groups of compiled loops (`compiled.GROUPS`) that it needs on a rig, beside those that all need."""
 
 
 def estimator_row(name: str) -> EstimatorRow:
@@ -98,6 +97,7 @@ def make_estimator(rig: Rig, name: str, **options: Any) -> Estimator:
     """
     check_room(_LOADED_BYTES, "making an estimator", EstimatorError)
     # Not before: whoever wants no more of a row than its colour and rank waits for none of these.
+    from aolink.estimation.compiled import make_ready
     from aolink.estimation.estimator import Estimator
     from aolink.estimation.model.exposure_model import exposure_model
     from aolink.estimation.options import checked_options, with_options
@@ -112,11 +112,18 @@ def make_estimator(rig: Rig, name: str, **options: Any) -> Estimator:
             f" plant.axes = {rig.plant.axes}: use engine 'aolink'"
         )
 
+    make_ready(*_shared_loops(rig), *row.loops(rig))
+
     def made(rig: Rig) -> Estimator:
         # Code that the first exposure would load or compile is ready before the session.
         steps = rig.timing.exposure_steps
-        exposure_model(rig.plant, steps, rig.timing.exposure_offset).response(np.ones((steps, rig.n_inputs)))
-        return Estimator(rig, name, row.build(rig, chosen))
+        try:
+            exposure_model(rig.plant, steps, rig.timing.exposure_offset).response(np.ones((steps, rig.n_inputs)))
+            return Estimator(rig, name, row.build(rig, chosen))
+        except (ArithmeticError, ValueError) as error:  # a LinAlgError is a ValueError
+            raise EstimatorError(
+                f"{name} cannot compute with this rig: {error}; are its numbers too large or too small?"
+            ) from error
 
     if rig.plant.wandering is None or not row.wanders:
         return made(rig)
@@ -143,7 +150,7 @@ def _pixels_refusal(name: str) -> Callable[[Rig], str | None]:
         if rig.plant.n_states > MANY_STATES:
             alike = " that does not consist of equal systems side by side" if name == "profile" else ""
             return (
-                f"{name} follows the posterior's modes for at most {MANY_STATES} states of one plant, {rig.name} has"
+                f"{name} takes at most {MANY_STATES} states of one plant, {rig.name} has"
                 f" {rig.plant.n_states}{alike}: use {'o3' if alike else 'profile or moments'}"
             )
         if reason := _many_spots_refusal(rig, name):  # its widest Gaussian is found by windowed moments
@@ -158,19 +165,17 @@ def _pixels_refusal(name: str) -> Callable[[Rig], str | None]:
     return refusal
 
 
-def _is_quick_for_mixture(rig: Rig) -> bool:
-    """Whether `mixture` is quick enough for a demo: on a line sensor, where it does not temper points in nearly every
-    exposure. For spots on a plane the filters that use every pixel are too slow."""
-    from aolink.estimation.assumptions import importance_is_too_sure
+def _shared_loops(rig: Rig) -> tuple[str, ...]:
+    if alike_systems(rig.plant) is not None:
+        return ("larger plants", "many spots")
+    small = (rig.plant.n_states, rig.plant.n_inputs, rig.plant.n_outputs) == (2, 1, 1)
+    return ("o1 to o3 and moments",) if small else ("o1 to o3 and moments", "larger plants")
 
-    return rig.sensor.directions == 1 and not importance_is_too_sure(rig)
 
-
-def _is_quick_for_profile(rig: Rig) -> bool:
-    """The same for `profile`, which hands over to `mixture` on fewer rigs."""
-    from aolink.estimation.assumptions import importance_is_too_sure, modes_stay_lost
-
-    return rig.sensor.directions == 1 and not (importance_is_too_sure(rig) and modes_stay_lost(rig))
+def _pixels_loops(rig: Rig) -> tuple[str, ...]:
+    if alike_systems(rig.plant) is not None:
+        return ()
+    return ("profile",) if rig.sensor.directions == 1 else ("profile of spots",)
 
 
 def _built(maker: str, *orders: int) -> Callable[[Rig, Options], Filter]:
@@ -199,15 +204,15 @@ _OURS = {
         ),
         EstimatorRow(
             name="profile", rank=50, colour=(140, 210, 80), build=_built("profile"),
-            refusal=_pixels_refusal("profile"), wanders=True, in_demo=_is_quick_for_profile,
+            refusal=_pixels_refusal("profile"), loops=_pixels_loops, wanders=True,
         ),
         EstimatorRow(
             name="mixture", rank=60, colour=(240, 80, 140), build=_built("mixture"),
-            refusal=_pixels_refusal("mixture"), wanders=True, in_demo=_is_quick_for_mixture,
+            refusal=_pixels_refusal("mixture"), loops=_pixels_loops, wanders=True,
         ),
         EstimatorRow(
             name="sampled", rank=70, colour=(190, 130, 80), build=_built("sampled"),
-            refusal=_pixels_refusal("sampled"), wanders=True, in_demo=lambda rig: False,
+            refusal=_pixels_refusal("sampled"), loops=_pixels_loops, wanders=True,
         ),
     )
 }  # fmt: skip

@@ -11,6 +11,7 @@ from typing import Any
 from aolink.errors import ExportError
 from aolink.estimation.estimate import Estimate
 from aolink.exposure import Exposure
+from aolink.extensions import install_command
 from aolink.series import Series
 
 Progress = Callable[[int], None]
@@ -27,7 +28,7 @@ def needed(module: str, extra: str, what: str) -> Any:
         return import_module(module)
     except ImportError:
         package = module.partition(".")[0]
-        raise ExportError(f"{what} needs {package}: pip install 'aolink[{extra}]'") from None
+        raise ExportError(f"{what} needs {package}: {install_command(extra)}") from None
 
 
 def together(

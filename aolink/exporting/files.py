@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Callable, Sequence
 from itertools import islice
 from pathlib import Path
@@ -15,7 +14,7 @@ from aolink.exporting.arrays import arrays, to_xarray
 from aolink.exporting.common import Progress, facts, needed, no_progress
 from aolink.exporting.table import columns, rows
 from aolink.exporting.telemetry import write_fits
-from aolink.files import check_target, writing
+from aolink.files import check_target, write_csv, writing
 from aolink.series import Series
 
 _ROWS_AT_ONCE = 4096
@@ -68,12 +67,12 @@ def _write_netcdf(series: Series, names: Sequence[str], path: Path, progress: Pr
 
 def _write_csv(series: Series, names: Sequence[str], path: Path, progress: Progress) -> None:
     known = [column.name for column in columns(series, names)]
+    found = (
+        row | {"time": np.datetime_as_string(np.datetime64(row["time"], "ns"), timezone="UTC")}
+        for row in rows(series, names, progress=progress)
+    )
     with path.open("w", encoding="utf-8", newline="") as file:
-        writer = csv.DictWriter(file, known)
-        writer.writeheader()
-        for row in rows(series, names, progress=progress):
-            time = np.datetime_as_string(np.datetime64(row["time"], "ns"), timezone="UTC")
-            writer.writerow(row | {"time": time})
+        write_csv(file, known, found)
 
 
 def _write_parquet(series: Series, names: Sequence[str], path: Path, progress: Progress) -> None:

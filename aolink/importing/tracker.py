@@ -211,7 +211,7 @@ def trackpy_locator(sd: float) -> Callable[[FloatArray], FloatArray] | None:
     def locate(light: FloatArray) -> FloatArray:
         with warnings.catch_warnings():  # a warning of pandas, about how trackpy calls it
             warnings.simplefilter("ignore")
-            found = trackpy.locate(np.maximum(light, 0.0), diameter)
+            found = trackpy.locate(np.maximum(light, 0.0), diameter, characterize=False)
         return np.asarray(found[["x", "y"]].to_numpy(dtype=np.float64))
 
     return locate

@@ -11,7 +11,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from aolink.devices.drivers import KINDS, NATIVE, check_driver
+from aolink.devices.drivers import KINDS, NATIVE, check_driver, native_port
 from aolink.devices.interfaces import lacks_of
 from aolink.errors import AolinkError
 from aolink.estimation.assumptions import broken_assumptions, narrow_intervals, peak_snr
@@ -91,16 +91,15 @@ def check_devices(rig: Rig) -> Iterator[Finding]:
         if table is None:
             continue
         key = f"devices.{kind}"
-        if table.driver != NATIVE:
-            try:
-                driver = check_driver(kind, table, rig)
-            except AolinkError as error:
-                yield _error(key, str(error))
+        try:
+            if table.driver == NATIVE:
+                native_port(kind, table)
                 continue
-            lacks = "; ".join(lacks_of(driver)) or "nothing"
-            yield _info(key, f"the driver {table.driver}; what its device lacks: {lacks}")
-        elif table.delay is not None:
-            yield _error(key, f"the driver {NATIVE} reports its time: delay_s and delay_sd_s are for others")
+            lacks = "; ".join(lacks_of(check_driver(kind, table, rig))) or "nothing"
+        except AolinkError as error:
+            yield _error(key, str(error))
+            continue
+        yield _info(key, f"the driver {table.driver}; what its device lacks: {lacks}")
     if rig.devices and "mirror" not in rig.devices:
         yield _info("devices.mirror", "no mirror is named: without --mirror the camera is recorded alone")
 
@@ -375,8 +374,11 @@ def _check_observability(rig: Rig) -> Iterator[Finding]:
             f"the centroid over {rig.timing.exposure_steps} fast steps loses {mode}, wholly or in part;"
             " the blur may still show it, another exposure time would",
         )
-    message = f"rank {report.rank} of {report.n_states} at the fast rate, {report.centroid_rank} by centroids"
-    yield _info("plant", f"{message}; o2 needs {report.o2_needs}")
+    yield _info(
+        "plant",
+        f"the outputs show {report.rank} of the plant's {report.n_states} states, and the centroids of exposures alone"
+        f" {report.centroid_rank}; o2 needs {report.o2_needs}",
+    )
 
 
 def _different_copies(rig: Rig) -> Rig:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from aolink.errors import AolinkError
 from aolink.exporting.common import Progress, no_progress
+from aolink.extensions import install_command
 from aolink.jobs.batch import Done, Job, SideJob, do
 from aolink.jobs.unit import aolink_version
 
@@ -84,7 +85,7 @@ def _connected(address: str) -> Iterator[Client]:
     try:
         from distributed import Client
     except ImportError:
-        raise AolinkError("--scheduler needs Dask: pip install 'aolink[cluster]'") from None
+        raise AolinkError(f"--scheduler needs Dask: {install_command('cluster')}") from None
     for name in ("distributed", "distributed.client", "distributed.core"):
         logging.getLogger(name).setLevel(logging.CRITICAL)  # the error is raised here, once
     try:

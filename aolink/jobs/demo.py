@@ -1,31 +1,33 @@
-"""The job of `aolink demo`, from end to end: a rig, a session, the estimates again, the pictures, the table."""
+"""The job of `aolink demo`, from end to end: a rig, a session, the estimates again, restored scenes, the picture."""
 
 from __future__ import annotations
 
 import contextlib
 import json
-import os
-import select
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from aolink.colours import by_rank
 from aolink.control.fall_back import INTEGRATOR
 from aolink.errors import AolinkError, DeviceError, ExportError, ViewerError
-from aolink.estimation import estimator_rows
-from aolink.estimation.registry import BASELINE_ESTIMATOR, LOOP_ESTIMATOR
+from aolink.estimation import Score, estimator_row
+from aolink.estimation.registry import BASELINE_ESTIMATOR, DEFAULT_ESTIMATOR
 from aolink.exposure import residual_rms
 from aolink.files import writing
+from aolink.polling import wait_readable
 from aolink.recording.deblur import RestoredCounts, write_deblurred
 from aolink.recording.reader import Recording
-from aolink.recording.reestimate import first_difference, reestimate
+from aolink.recording.reestimate import first_difference, reestimate, scored
 from aolink.rig import Rig
 from aolink.session import Report, record
 
+_PICTURE_SIZE = (1600, 1000)
+"""Size of the viewer's picture, pixels."""
 _RIG_START_S = 60.0
 _RIG_END_S = 5.0
 
@@ -35,30 +37,34 @@ class DemoResult:
     """The results of the demo."""
 
     recording: Path
+    """The session's recording, with the restored pictures where the rig has a picture sensor."""
     rrd: Path | None = None
     """The Rerun file; None if the demo was interrupted before."""
     picture: Path | None = None
     not_of_viewer: str = ""
     """The reason why the picture is not the viewer's, but matplotlib's or None; empty where it is the viewer's."""
+    shown: str = ""
+    """The exposure that the picture is about, and why."""
     report: Report
+    scores: Mapping[str, Score] = field(default_factory=dict)
+    """The estimators' scores against the truth, by rank."""
     residuals: Mapping[str, float] = field(default_factory=dict)
     """True slopes at the fast rate where the loop was closed, root mean square, slope units, by the controller's name;
     "open" for none. Each controller has a recording of its name beside the session's."""
     deblurred: RestoredCounts | None = None
     """Summary of the restored pictures; None where the rig has no picture sensor."""
-    deblurred_by: str = ""
-    """Estimator whose path they were restored with."""
-    deblurred_recording: Path | None = None
-    """The session's recording with the restored pictures."""
     differences: Mapping[str, str] = field(default_factory=dict)
     """The first difference of online and offline estimates, by estimator; empty if there is none."""
     seconds: dict[str, float]
     """Wall time of each part."""
 
 
-def possible_estimators(rig: Rig) -> tuple[str, ...]:
-    """The estimators that can work on a rig and would not make its demo long, by rank."""
-    return tuple(row.name for row in estimator_rows() if row.in_demo(rig) and row.refusal(rig) is None)
+def usual_estimators(rig: Rig, control: str = "") -> list[str]:
+    """The estimators of a demo that names none: no camera, the centroid and the blur, as far as they can work on the
+    rig; with a controller, the one that serves it comes first."""
+    usual = ("open-loop", BASELINE_ESTIMATOR, DEFAULT_ESTIMATOR)
+    possible = [name for name in usual if estimator_row(name).refusal(rig) is None]
+    return possible[::-1] if control else possible
 
 
 @contextlib.contextmanager
@@ -70,15 +76,14 @@ def simulated_rig(rig: str | Path, *options: str) -> Iterator[tuple[str, str]]:
     DeviceError
         The process does not start.
     """
-    command = [sys.executable, "-m", "aolink", "rig", str(rig), "--json", "--tied", *options]
+    command = [sys.executable, "-P", "-m", "aolink", "rig", str(rig), "--json", "--tied", *options]
     # It has a process group of its own: Ctrl-C goes to the session, which still has to park the mirror.
     # Its input is a pipe that ends with this process, however that ends, and the rig ends with the pipe.
     started = False
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stdin=subprocess.PIPE, start_new_session=True)
     try:
         assert process.stdout is not None
-        ready, _, _ = select.select([process.stdout], [], [], _RIG_START_S)
-        line = process.stdout.readline() if ready else b""
+        line = process.stdout.readline() if wait_readable([process.stdout], _RIG_START_S) else b""
         if not line:
             raise DeviceError(f"the simulated rig did not start; try it by hand: {' '.join(command)}")
         ports, started = json.loads(line), True
@@ -110,9 +115,10 @@ def new_folder(parent: Path) -> Path:
 
 
 def run_demo(
-    rig: Rig, source: str | Path, folder: Path, *, exposures: int, seed: int | None, real_time: bool,
-    control: str = "", stoppable: Callable[[], AbstractContextManager[Callable[[], bool]]],
-    progress: Callable[[str, int], None],
+    rig: Rig, source: str | Path, folder: Path, *, estimators: Sequence[str], exposures: int, seed: int | None = None,
+    real_time: bool = False, control: str = "",
+    stoppable: Callable[[], AbstractContextManager[Callable[[], bool]]] = lambda: contextlib.nullcontext(lambda: False),
+    progress: Callable[[str, int], None] = lambda part, done: None,
 ) -> DemoResult:  # fmt: skip
     """Run the demo in ``folder``. Raises AolinkError; the recording up to then stays.
 
@@ -120,6 +126,7 @@ def run_demo(
     for the session alone, which ends in good order when the function that it gives returns True; nothing else is made
     then. With ``control`` the session's loop is closed by that controller, and two others are recorded before, from the
     same seed: with the loop open, and closed by the integrator. The Rerun file has the residual slopes of all of them.
+    The picture is about the exposure in which the spot moved most.
     """
     from aolink import plotting, viewing
 
@@ -127,7 +134,6 @@ def run_demo(
         partial.write_text(rig.toml)
     path, rrd, picture = folder / "session.mcap", folder / "session.rrd", folder / "session.png"
     seconds: dict[str, float] = {}
-    estimators = possible_estimators(rig)
 
     @contextlib.contextmanager
     def part(name: str) -> Iterator[Callable[[int], None]]:
@@ -138,13 +144,10 @@ def run_demo(
 
     options = ["--real-time"] if real_time else []
     options += ["--seed", str(seed)] if seed is not None else []
-    if control:  # the first one serves the controller
-        serving = LOOP_ESTIMATOR if LOOP_ESTIMATOR in estimators else BASELINE_ESTIMATOR
-        estimators = (serving, *(name for name in estimators if name != serving))
-    sessions = [("", path, estimators)]
+    sessions: list[tuple[str, Path, Sequence[str]]] = [(control, path, estimators)]
     if control:
         others = [each for each in ("", INTEGRATOR.name) if each != control]
-        sessions = [(of, folder / f"{of or 'open'}.mcap", ()) for of in others] + [(control, path, estimators)]
+        sessions = [(of, folder / f"{of or 'open'}.mcap", ()) for of in others] + sessions
     residuals: dict[str, float] = {}
     for of, where, names in sessions:
         what = f"record {of or 'open'}" if control else "record"
@@ -165,22 +168,23 @@ def run_demo(
             for name, again in offline.items()
             if (difference := first_difference(list(recording.iter_estimates(name)), again))
         }
-    deblurred, sharp = None, None
+        ranked = by_rank(list(estimators))
+        scores = scored(recording, ranked)
+    deblurred = None
     if rig.scene is not None:
-        sharp = folder / "deblurred.mcap"
         with part("deblur") as tell:
-            deblurred = write_deblurred(
-                recording, sharp, estimator=estimators[-1], workers=os.cpu_count() or 1, progress=tell
-            )
-        recording = Recording(sharp)
+            # A few scenes take less time than other processes take to start.
+            deblurred = write_deblurred(recording, folder / "deblurred.mcap", estimator=ranked[-1], progress=tell)
+        recording = Recording(folder / "deblurred.mcap")
     with part("write .rrd"):
         loops = {of or "open": Recording(where) for of, where, _ in sessions} if control else {}
-        viewing.save_rrd(recording, rrd, look=viewing.Look(loops=loops))
+        number, why = next(iter(plotting.overview(recording).telling().items()))
+        viewing.save_rrd(recording, rrd, look=viewing.Look(loops=loops, about=number))
     drawn: Path | None = picture
     not_of_viewer = ""
     with part("draw"):
         try:
-            viewing.screenshot(rrd, picture)
+            viewing.screenshot(rrd, picture, size=_PICTURE_SIZE, at_ns=_middle_ns(recording, number))
         except ViewerError as error:
             drawn, not_of_viewer = None, str(error)
             try:
@@ -188,7 +192,14 @@ def run_demo(
             except ExportError as also:
                 not_of_viewer += f"; {also}"
     return DemoResult(
-        recording=path, rrd=rrd, picture=drawn, residuals=residuals, not_of_viewer=not_of_viewer, report=report,
-        deblurred=deblurred, deblurred_by=estimators[-1], deblurred_recording=sharp, differences=differences,
+        recording=recording.path, rrd=rrd, picture=drawn, not_of_viewer=not_of_viewer, report=report, scores=scores,
+        shown=f"exposure {number}, {why}", residuals=residuals, deblurred=deblurred, differences=differences,
         seconds=seconds,
     )  # fmt: skip
+
+
+def _middle_ns(recording: Recording, number: int) -> int:
+    """The middle of an exposure, ns since the first exposure began."""
+    exposure = recording[number]
+    steps = exposure.first_step - recording[0].first_step + exposure.n_steps // 2
+    return steps * recording.rig.timing.fast_step_ns

@@ -206,9 +206,9 @@ class Following:
         before, old = values[best], self._followed[best]
         if not value > before + LEAST_GAIN:
             text = (
-                f"a new model was fitted and is not offered: on {HELD_OUT} exposures after those that it was fitted to"
-                f" its log-likelihood is {value - before:+.1f} nats beside {old.name}, and"
-                f" {LEAST_GAIN:+g} are needed"
+                f"a new model was fitted and is not offered: it does not explain the {HELD_OUT} exposures after those"
+                f" that it was fitted to much better than {old.name} does (log-likelihood {value - before:+.1f} nats,"
+                f" {LEAST_GAIN:+g} are needed)"
             )
             return News(frame_id=frame_id, fits=None, text=text)
         self.offers += 1

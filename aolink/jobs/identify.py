@@ -192,11 +192,15 @@ def _of_output(
     sensor = of.sensor(x)
     notes = _ruled_out(of, everything, tops)
     if of.with_kernel and not sets[-1].pieces[0].open_low:
-        notes.append("kernel_change is not in the rig file: estimators take the kernel as the same in all exposures")
+        notes.append(
+            "kernel_change is not in the rig file: estimators take one kernel for all exposures, so less noise"
+        )
     for each in sets:
         if each.name.endswith("frequency_hz") and len(each.pieces) > 1:
             rest = ", ".join(f"{piece.best:.4g}" for piece in each.pieces if not piece.low <= each.best <= piece.high)
-            notes.append(f"{each.name}: {rest} Hz explains the exposures nearly as well: an alias that remains")
+            notes.append(
+                f"{each.name}: {rest} Hz explains the exposures nearly as well: the frames are too slow to tell"
+            )
     return IdentifiedModel(
         output=output, model=_without_plant(of, x), plant=plant, noise=sensor.noise, wider=sensor.wider,
         parameters=sets, tried=tuple(scored), log_likelihood=tops[0].log_likelihood,
@@ -226,5 +230,5 @@ def _ruled_out(of: Space, found: Sequence[Maximum], left: Sequence[Maximum]) -> 
             kept = {f"{math.exp(each.x[k]):.4g}" for each in left}
             out = dict.fromkeys(f"{math.exp(each.x[k]):.4g}" for each in found)
             if gone := [each for each in out if each not in kept]:
-                notes.append(f"{name}: the pixels rule out {', '.join(gone)} Hz, which centroid and width leave")
+                notes.append(f"{name}: the pixels rule out {', '.join(gone)} Hz, which centroids and widths allow")
     return notes

@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from aolink.errors import AolinkError, RecordingError
-from aolink.files import writing
+from aolink.extensions import install_command
+from aolink.files import write_csv, writing
 
 COLUMNS = (
     "recording", "model", "estimator", "exposures", "path_rmse", "start_rmse", "end_rmse",
@@ -45,9 +46,7 @@ def fill_table(partial: Path, rows: Sequence[Mapping[str, Any]], suffix: str) ->
         pq.write_table(pa.Table.from_pylist([dict(row) for row in rows], schema=_schema(COLUMNS)), partial)
     else:
         with partial.open("w", newline="") as file:
-            writer = csv.DictWriter(file, COLUMNS)
-            writer.writeheader()
-            writer.writerows(rows)
+            write_csv(file, COLUMNS, rows)
 
 
 @contextmanager
@@ -139,7 +138,7 @@ def parquet() -> tuple[Any, Any]:
         import pyarrow as pa
         import pyarrow.parquet as pq
     except ImportError:
-        raise AolinkError("Parquet needs pyarrow: pip install 'aolink[parquet]', or write .csv") from None
+        raise AolinkError(f"Parquet needs pyarrow: {install_command('parquet')}, or write .csv") from None
     return pa, pq
 
 

@@ -18,6 +18,7 @@ import numpy as np
 
 from aolink.errors import AolinkError, EstimatorError, RecordingError, RigError
 from aolink.estimation import Driver, Engine, Estimate, Score, Scorer
+from aolink.estimation.registry import DEFAULT_ESTIMATOR
 from aolink.exposure import Exposure
 from aolink.files import check_target, writing
 from aolink.jobs.tables import COLUMNS, is_table_of, rows_into, table_beside
@@ -60,7 +61,7 @@ class Model:
 class Settings:
     """How a recording is estimated: plain data, which can be pickled."""
 
-    estimator: str = "o3"
+    estimator: str = DEFAULT_ESTIMATOR
     """The estimator, one of `aolink.estimation.ESTIMATOR_NAMES`."""
     model: Model = Model()
     """The model, by default the recording's own rig."""
@@ -85,8 +86,8 @@ def estimate_file(url: str | Path, out: str | Path, settings: Settings | None = 
     url:
         The recording: a file, or a URL that fsspec knows.
     out:
-        The side file to write, such as ``session.o3.mcap``: `Recording` takes it as ``side``, and `aolink view` beside
-        the recording.
+        The side file to write, such as ``session.moments.mcap``: `Recording` takes it as ``side``, and `aolink view`
+        beside the recording.
     settings:
         The defaults of `Settings` if not given.
 

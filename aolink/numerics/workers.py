@@ -56,15 +56,16 @@ def thread_count() -> int:
 
 @contextmanager
 def processes(count: int) -> Iterator[ProcessPoolExecutor]:
-    """A pool of ``count`` processes, whose linear algebra has one thread. Ctrl-C goes to this process alone.
+    """A pool of ``count`` processes, whose linear algebra has one thread, and which import no modules of the current
+    folder. Ctrl-C goes to this process alone.
 
     Any exception in the block ends the processes at once. They also end when this process does, even if it is killed;
     their work is then given up in good order, so that nothing half written stays.
     """
-    environment = {name: os.environ.get(name) for name in THREAD_VARIABLES}
-    os.environ.update(dict.fromkeys(THREAD_VARIABLES, "1"))
+    environment = {name: os.environ.get(name) for name in (*THREAD_VARIABLES, "PYTHONSAFEPATH")}
+    os.environ.update(dict.fromkeys(environment, "1"))
     # Start the standard library's resource tracker here, out of reach of the terminal's signals.
-    with _unheard_by_children():
+    with _apart():
         resource_tracker.ensure_running()
     try:
         with _Pool(count, mp_context=get_context("spawn"), initializer=_begin_to_watch) as pool:
@@ -128,19 +129,21 @@ class _Pool(ProcessPoolExecutor):
     """A pool whose processes get no signal from a terminal, from their first instant on."""
 
     def submit(self, function: Callable[..., Any], /, *arguments: Any, **options: Any) -> Future[Any]:
-        """Submit a call, which may start a process: that inherits which signals are blocked."""
-        with _unheard_by_children():
+        """Submit a call, which may start a process: that inherits which signals are blocked, and where modules lie."""
+        with _apart():
             return super().submit(_until_ended, function, *arguments, **options)
 
 
 @contextmanager
-def _unheard_by_children() -> Iterator[None]:
+def _apart() -> Iterator[None]:
     """Block a terminal's signals; a process that is started meanwhile never gets them, and this one gets them a moment
-    later."""
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, _FOR_THE_PARENT)
+    later. Nor does it get the current folder among those where modules lie, as a notebook has it."""
+    before, path = signal.pthread_sigmask(signal.SIG_BLOCK, _FOR_THE_PARENT), sys.path[:]
+    sys.path[:] = filter(os.path.isabs, path)
     try:
         yield
     finally:
+        sys.path[:] = path
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 

@@ -48,7 +48,7 @@ class SpotReconstructor:
 
         Slopes do not determine the step from one part to another: the mean of each part is zero.
         """
-        null = _matrix([(self.parts, np.arange(n), np.ones(n))], (self.parts.max() + 1, n))
+        null = _matrix([(self.parts, np.arange(n), np.ones(n))], (int(self.parts.max()) + 1, n))
         right = sparse.vstack([null.T, sparse.csr_array((null.shape[0], null.shape[0]))])
         bordered = sparse.hstack([sparse.vstack([self._gathered @ differences, null]), right])
         self._factor = splu(sparse.csc_array(bordered))

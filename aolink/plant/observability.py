@@ -157,11 +157,11 @@ def _has_part_in(A: FloatArray, value: complex, space: NDArray[Any], parts: list
 
 def _o2_needs(stable: bool, observable: bool) -> str:
     needs = [
-        "a spot off centre (drive.offset or drive.amplitude, or plant.initial_mean): at zero state and input"
-        " the second moment's slope is zero, and x and -x look alike"
+        "a spot off centre (drive.offset or drive.amplitude, or plant.initial_mean): where it"
+        " rests in the middle, a blur's width does not tell x from -x"
     ]
     if not stable:
         needs.append("a plant that forgets (every eigenvalue of A inside the unit circle): this one does not")
     if not observable:
-        needs.append("a state that the centroid sees whole, (A^N, C-bar) observable: this one is not")
+        needs.append("centroids that show every state: here they do not")
     return "; ".join(needs)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -112,7 +112,7 @@ def draw_exposure(
                 panel.set_xlabel("")
         first = first or left
     if on_plane:
-        _draw_spot(figure.add_subplot(grid[:, 3]), sensor, exposure, estimates, spot)
+        draw_spot(figure.add_subplot(grid[:, 3]), sensor, exposure, estimates, spot)
     if first is not None and first.get_legend_handles_labels()[0]:
         figure.legend(*first.get_legend_handles_labels(), loc="outside upper left", ncols=4)
     return figure
@@ -126,37 +126,73 @@ def _draw_row(
     over_time, histogram, intensity = panels
     line: Sensor = series.rig.sensor.profile
     seen = profile_density(series.rig.sensor, exposure, output)
-    paths = {name: each.path[output] for name, each in estimates.items()}
-    if exposure.truth is not None and exposure.truth.known[output]:
-        paths = {"truth": exposure.truth.path[output], **paths}
+    paths = paths_of(exposure, estimates, [output])
     low, high = limits_of(line, list(paths.values()))
-    scale = series.rig.timing.fast_step_s * 1e3 if unit == "s" else 1.0
-    times: FloatArray = np.asarray(np.arange(exposure.n_steps) * scale, dtype=np.float64)
+    length = exposure.n_steps * _step(series, unit)
     top = float(np.nanmax(seen)) if np.isfinite(seen).any() else line.peak_density
     over_time.pcolormesh(
-        [0, exposure.n_steps * scale], line.edges, seen[:, None], cmap="Greys", vmin=0, vmax=2.5 * max(top, 1e-12),
-        rasterized=True,
-    )  # fmt: skip
+        [0, length], line.edges, seen[:, None], cmap="Greys", vmin=0, vmax=2.5 * max(top, 1e-12), rasterized=True
+    )
     bins = np.linspace(low, high, _BINS + 1)
-    drawn: Any = np.nan_to_num(seen)
-    intensity.stairs(drawn, line.edges, orientation="horizontal", fill=True, color="0.8", label="measured")
-    if not np.isfinite(seen).any():
-        intensity.text(0.5, 0.5, "no pixel\narrived", ha="center", va="center", transform=intensity.transAxes)
-    for name, path in paths.items():
-        sd = None if name == "truth" else estimates[name].path_sd[output]
-        _draw_path(over_time, times, path, sd, name)
+    draw_intensity(intensity, series, exposure, estimates, output, orientation="horizontal")
+    draw_paths(over_time, series, exposure, estimates, [output], unit)
+    for name, (path,) in paths.items():
         share = np.histogram(np.clip(path, low, high), bins, density=True)[0]
         histogram.stairs(share, bins, orientation="horizontal", color=colour(name), linewidth=0.9)
-        predicted = series.rig.sensor.light_of(output) * exposure_density(line.kernel, line.edges, path)
-        width = 1.5 if name == "truth" else 1.0
-        intensity.stairs(predicted, line.edges, orientation="horizontal", color=colour(name), linewidth=width)
-    over_time.set(ylim=(low, high), xlim=(0, exposure.n_steps * scale))
-    over_time.set_xlabel("time in the exposure (ms)" if unit == "s" else "fast step in the exposure")
+    over_time.set(ylim=(low, high))
     histogram.set_xlabel("time at a position\n(1 / slope unit)")
     intensity.set_xlabel("intensity\n(1 / slope unit)")
     for panel in (histogram, intensity):
         panel.tick_params(labelleft=False)
         panel.set_xlim(left=0)
+
+
+def paths_of(exposure: Exposure, estimates: dict[str, Estimate], outputs: Sequence[int]) -> dict[str, FloatArray]:
+    """Paths of some outputs by their names, (outputs, n_steps), with the truth before the estimates where it is
+    known."""
+    chosen = list(outputs)
+    paths = {name: each.path[chosen] for name, each in estimates.items()}
+    if exposure.truth is not None and exposure.truth.known[chosen].all():
+        paths = {"truth": exposure.truth.path[chosen], **paths}
+    return paths
+
+
+def draw_intensity(
+    axes: Axes, series: Series, exposure: Exposure, estimates: dict[str, Estimate], output: int, *,
+    orientation: Literal["horizontal", "vertical"] = "vertical",
+) -> None:  # fmt: skip
+    """Draw the measured intensity profile of one output, and what each path predicts for it."""
+    sensor = series.rig.sensor
+    line: Sensor = sensor.profile
+    seen = profile_density(sensor, exposure, output)
+    drawn: Any = np.nan_to_num(seen)
+    axes.stairs(drawn, line.edges, orientation=orientation, fill=True, color="0.8", label="measured")
+    if not np.isfinite(seen).any():
+        axes.text(0.5, 0.5, "no pixel\narrived", ha="center", va="center", transform=axes.transAxes)
+    for name, (path,) in paths_of(exposure, estimates, [output]).items():
+        predicted = sensor.light_of(output) * exposure_density(line.kernel, line.edges, path)
+        width = 1.8 if name == "truth" else 1.3
+        axes.stairs(predicted, line.edges, orientation=orientation, color=colour(name), linewidth=width, label=name)
+
+
+def draw_paths(
+    axes: Axes, series: Series, exposure: Exposure, estimates: dict[str, Estimate], outputs: Sequence[int],
+    unit: TimeUnit = "s",
+) -> None:  # fmt: skip
+    """Draw paths of some outputs inside an exposure with the bands of their estimates."""
+    step = _step(series, unit)
+    times: FloatArray = np.asarray(np.arange(exposure.n_steps) * step, dtype=np.float64)
+    for name, paths in paths_of(exposure, estimates, outputs).items():
+        for output, path in zip(outputs, paths, strict=True):
+            sd = None if name == "truth" else estimates[name].path_sd[output]
+            _draw_path(axes, times, path, sd, name)
+    axes.set_xlim(0, exposure.n_steps * step)
+    axes.set_xlabel("time in the exposure (ms)" if unit == "s" else "fast step in the exposure")
+
+
+def _step(series: Series, unit: TimeUnit) -> float:
+    """The length of a fast step on the time axis of an exposure."""
+    return series.rig.timing.fast_step_s * 1e3 if unit == "s" else 1.0
 
 
 def _draw_path(axes: Axes, times: FloatArray, path: FloatArray, sd: FloatArray | None, name: str) -> None:
@@ -172,7 +208,7 @@ def _draw_path(axes: Axes, times: FloatArray, path: FloatArray, sd: FloatArray |
         axes.fill_between(times, path - BAND * sd, path + BAND * sd, color=colour(name), alpha=0.2, linewidth=0)
 
 
-def _draw_spot(axes: Axes, sensor: BaseSensor, exposure: Exposure, estimates: dict[str, Estimate], spot: int) -> None:
+def draw_spot(axes: Axes, sensor: BaseSensor, exposure: Exposure, estimates: dict[str, Estimate], spot: int) -> None:
     """Draw the picture of one spot with the paths over it."""
     window = sensor.window_of(spot)
     counts = np.where(exposure.mask[window], exposure.pixels[window].astype(float), np.nan)
@@ -180,9 +216,7 @@ def _draw_spot(axes: Axes, sensor: BaseSensor, exposure: Exposure, estimates: di
     picture = axes.imshow(counts, cmap="Greys", extent=(low, high, high, low), interpolation="nearest")
     axes.figure.colorbar(picture, ax=axes, label="counts", orientation="horizontal", shrink=0.9)
     outputs = [2 * spot, 2 * spot + 1]
-    paths = {name: each.path[outputs] for name, each in estimates.items()}
-    if exposure.truth is not None and exposure.truth.known[outputs].all():
-        paths = {"truth": exposure.truth.path[outputs], **paths}
+    paths = paths_of(exposure, estimates, outputs)
     for name, path in paths.items():
         axes.plot(*path, color=colour(name), linewidth=1.6 if name == "truth" else 1.0)
     axes.set(xlabel="x (slope units)", ylabel="y (slope units)", xlim=(low, high), ylim=(high, low))

@@ -1,33 +1,41 @@
-"""An overview of a recording as one PNG, for machines on which the viewer cannot draw."""
+"""One exposure of a recording explained in one PNG, for machines on which the viewer cannot draw."""
 
 from __future__ import annotations
 
-from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from aolink.errors import ExportError
+from aolink.extensions import install_command
 from aolink.files import writing
-from aolink.plotting.exposure import plot_exposure
-from aolink.plotting.overview import Overview, need_exposures, overview
-from aolink.plotting.session import plot_blur, plot_errors
-from aolink.plotting.style import colour
+from aolink.plotting.exposure import draw_intensity, draw_paths, draw_spot, exposure_with_estimates, paths_of
+from aolink.plotting.overview import limits_of, need_exposures, overview
+from aolink.plotting.scene import plot_scene
+from aolink.plotting.session import plot_blur
+from aolink.plotting.style import legend_above
+from aolink.recording.reader import Recording
 
 if TYPE_CHECKING:
+    from matplotlib.figure import SubFigure
+
+    from aolink.estimation.estimate import Estimate
+    from aolink.exposure import Exposure
     from aolink.series import Series
 
-_SIZE_IN, _DPI = (16.0, 11.5), 110
-_CLOSE_UPS = 3
-"""Exposures whose inside is drawn."""
+    Estimates = dict[str, Estimate]
+
+_SIZE_IN, _DPI = (16.0, 10.0), 110
+_NEAR = 4
+"""Exposures before and after the one that is explained whose blur is drawn."""
 _STYLE: dict[Any, Any] = {
     "font.size": 10, "axes.spines.top": False, "axes.spines.right": False, "legend.frameon": False,
 }  # fmt: skip
 
 
 def draw_session(series: Series, path: str | Path) -> Path:
-    """Draw a series: intensity over the session, the inside of some exposures, the errors where truth is known.
+    """Draw the most telling exposure of a series: the blur with the path through it, the intensity profile with what
+    each estimator predicts for it, the path with the band of each estimator, and the scene as it came, restored, and at
+    rest.
 
     Parameters
     ----------
@@ -45,48 +53,61 @@ def draw_session(series: Series, path: str | Path) -> Path:
         import matplotlib as mpl
         from matplotlib.figure import Figure
     except ImportError:
-        raise ExportError("a picture without the viewer needs matplotlib: pip install 'aolink[plot]'") from None
+        raise ExportError(f"a picture without the viewer needs matplotlib: {install_command('plot')}") from None
     view = overview(series)
     need_exposures(view)
+    number, why = next(iter(view.telling().items()))
+    exposure, estimates = exposure_with_estimates(series, number, view.names)
     with mpl.rc_context(_STYLE):
         figure = Figure(figsize=_SIZE_IN, layout="constrained")
-        figure.suptitle(f"{series.rig.name}: {series.path.name}", x=0.01, ha="left", fontsize=13)
-        rows: Any = figure.subfigures(3, 1, height_ratios=[1.25, 2.0, 1.15])
-        above, middle, below = rows
-        plot_blur(view, above.subplots())
-        chosen = _close_ups(view)
-        places: Any = middle.subfigures(1, len(chosen), squeeze=False)
-        for place, number in zip(places[0], chosen, strict=True):
-            plot_exposure(series, number, place)
-            place.supxlabel(f"inside exposure {number} (frame {view.frame_ids[number]})")
-        _draw_errors(below, view)
+        figure.suptitle(f"{series.rig.name}: exposure {number}, {why}", x=0.01, ha="left", fontsize=13)
+        shares = [1.0, 1.0, 0.55] if isinstance(series, Recording) and exposure.scene is not None else [1.0, 1.0]
+        columns: Any = figure.subfigures(1, len(shares), width_ratios=shares)
+        above, below = columns[0].subfigures(2, 1)
+        _draw_blur(above, series, number, exposure, estimates)
+        _draw_profile(below, series, exposure, estimates)
+        _draw_bands(columns[1], series, exposure, estimates)
+        if isinstance(series, Recording) and exposure.scene is not None:
+            plot_scene(series, number, columns[2])
         with writing(Path(path), overwrite=True, error=ExportError) as partial:
             figure.savefig(partial, format="png", dpi=_DPI)
     return Path(path)
 
 
-def _close_ups(view: Overview) -> list[int]:
-    """The exposure in which the spot moved most, from each third of the session."""
-    edges = np.unique(np.linspace(0, len(view), _CLOSE_UPS + 1).astype(int))
-    moved = np.nan_to_num(view.moved, nan=-1.0)
-    return [int(a + np.argmax(moved[a:b])) for a, b in pairwise(edges)]
+def _titled(figure: SubFigure, title: str) -> SubFigure:
+    figure.suptitle(title, x=0.02, ha="left", fontsize=11)
+    return figure
 
 
-def _draw_errors(figure: Any, view: Overview) -> None:
-    """Draw the error of the path along the session, and over all of it."""
-    over_time, whole = figure.subplots(1, 2, width_ratios=[2, 1])
-    if not view.errors:
-        for axes in (over_time, whole):
-            axes.set_axis_off()
-        over_time.set_title("No errors: the recording holds no truth or no estimates", loc="left")
+def _draw_blur(figure: SubFigure, series: Series, number: int, exposure: Exposure, estimates: Estimates) -> None:
+    if series.rig.sensor.directions == 2:
+        spot = _titled(figure, "The blur of a spot, and the paths through it").subplots()
+        draw_spot(spot, series.rig.sensor, exposure, estimates, 0)
         return
-    plot_errors(view, over_time)
-    names = list(view.errors)
-    overall = [view.scores[name].path_rmse for name in names]
-    places = np.arange(len(names))[::-1]
-    whole.barh(places, overall, color=[colour(name) for name in names])
-    for place, value in zip(places, overall, strict=True):
-        whole.annotate(f" {value:.3g}", (value, place), va="center")
-    whole.set_yticks(places, names)
-    whole.set(xlabel="RMSE of the path over the whole session (slope units)")
-    whole.margins(x=0.15)
+    first = max(0, number - _NEAR)
+    near = overview(series[first : number + _NEAR])
+    axes = _titled(figure, f"The blur of {len(near)} exposures, and the paths through it").subplots()
+    plot_blur(near, axes)
+    begin, end = near.spans[number - first] * near.scale("s")
+    axes.axvspan(begin, end, fill=False, edgecolor="tab:red", linewidth=1.5)
+
+
+def _draw_profile(figure: SubFigure, series: Series, exposure: Exposure, estimates: Estimates) -> None:
+    axes = _titled(figure, "The intensity profile, and what each path predicts for it").subplots()
+    draw_intensity(axes, series, exposure, estimates, 0)
+    limits = limits_of(series.rig.sensor.profile, list(paths_of(exposure, estimates, [0]).values()))
+    axes.set(xlim=limits, ylim=(0, None), xlabel="position (slope units)", ylabel="intensity (1 / slope unit)")
+    legend_above(axes)
+
+
+def _draw_bands(figure: SubFigure, series: Series, exposure: Exposure, estimates: Estimates) -> None:
+    outputs = list(range(series.rig.sensor.directions))
+    shown = [[name] for name in estimates] or [[]]
+    panels: Any = figure.subplots(len(shown), 1, sharex=True, sharey=True, squeeze=False)
+    for axes, names in zip(panels[:, 0], shown, strict=True):
+        draw_paths(axes, series, exposure, {name: estimates[name] for name in names}, outputs)
+        by = "".join(f" by {name}, its 95 % band" for name in names)
+        truth = ", and the truth (black)" if exposure.truth is not None else ""
+        axes.set_title(f"The path{by}{truth}", loc="left", fontsize=11)
+        axes.set_ylabel("slope units" if len(outputs) == 1 else "x and y (slope units)")
+        axes.label_outer()

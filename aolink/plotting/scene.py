@@ -21,8 +21,9 @@ _PICTURE_IN = (3.0, 3.2)
 def plot_scene(recording: Recording, number: int, figure: Figure | SubFigure | None = None) -> Figure | SubFigure:
     """Draw the picture sensor's scene of one exposure: as it came, restored, and at rest, as far as these exist.
 
-    All have the same grey: black is dark, white an intensity of one. Pixels that never came are red. For a rig without
-    a picture sensor whose spots were restored, the frame of the spots is drawn.
+    They are beside each other, on a figure higher than wide under each other. All have the same grey: black is dark,
+    white an intensity of one. Pixels that never came are red. For a rig without a picture sensor whose spots were
+    restored, the frame of the spots is drawn.
 
     Parameters
     ----------
@@ -38,7 +39,9 @@ def plot_scene(recording: Recording, number: int, figure: Figure | SubFigure | N
     """
     pictures = _pictures(recording, number)
     figure = figure_or_new(figure, (_PICTURE_IN[0] * len(pictures), _PICTURE_IN[1]))
-    axes = figure.subplots(1, len(pictures), squeeze=False)[0]
+    upright = figure.bbox.height > figure.bbox.width
+    shape = (len(pictures), 1) if upright else (1, len(pictures))
+    axes = figure.subplots(*shape, squeeze=False).ravel()
     shown: Any = None
     for each, (title, picture) in zip(axes, pictures.items(), strict=True):
         each.set_facecolor("tab:red")
@@ -47,7 +50,8 @@ def plot_scene(recording: Recording, number: int, figure: Figure | SubFigure | N
         each.set_xticks([])
         each.set_yticks([])
     what = "intensity (1 = full)" if recording.rig.scene is not None else "share of the brightest pixel"
-    figure.colorbar(shown, ax=list(axes), label=what, shrink=0.8)
+    where = "bottom" if upright else "right"
+    figure.colorbar(shown, ax=list(axes), label=what, shrink=0.8, location=where)
     return figure
 
 

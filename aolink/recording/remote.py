@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
 from aolink.errors import RecordingError
+from aolink.extensions import install_command
 
 if TYPE_CHECKING:
     from _typeshed import WriteableBuffer
@@ -125,11 +126,11 @@ class Url:
         try:
             from fsspec.core import url_to_fs
         except ImportError:
-            raise RecordingError(f"reading {self} needs fsspec: pip install 'aolink[remote]'") from None
+            raise RecordingError(f"reading {self} needs fsspec: {install_command('remote')}") from None
         try:
             found: tuple[Any, str] = url_to_fs(self.text)
         except ImportError as error:
-            raise RecordingError(f"reading {self} needs more: {error}; pip install 'aolink[remote]'") from None
+            raise RecordingError(f"reading {self} needs more: {error}; {install_command('remote')}") from None
         except ValueError as error:
             raise RecordingError(f"cannot read {self}: {error}") from None
         return found

@@ -18,6 +18,7 @@ from aolink.estimation.estimate import motion
 from aolink.exposure import Exposure, step_shares
 from aolink.numerics.arrays import BoolArray, FloatArray, Indices
 from aolink.numerics.covariance import psd_root
+from aolink.numerics.single_thread import by_one_thread
 from aolink.optics.camera import is_saturated, to_density
 from aolink.optics.scene import SceneSensor, scene_motion
 from aolink.optics.sensor import Kernel
@@ -66,6 +67,7 @@ def scene_psf(rig: Rig, exposure: Exposure, estimate: Estimate) -> Psf:
     return next(estimated_psfs(exposure, estimate, [mix], rig.scene.kernel, rig.scene.pixel_scale))
 
 
+@by_one_thread  # for matrices of some 100 rows the threads of BLAS take several times as long, if cores are busy
 def deblur(rig: Rig, exposure: Exposure, estimate: Estimate, method: str = DEFAULT_METHOD) -> RestoredPictures:
     """Restore the pictures of an exposure with the path of its estimate; intensities are cut at 0 and 1.
 

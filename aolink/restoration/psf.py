@@ -229,7 +229,7 @@ def _pixels_of(positions: FloatArray, variance: FloatArray) -> tuple[FloatArray,
     reach = _REACH * math.sqrt(float(variance.max()))
     low = min(0, math.floor(positions.min() - reach))
     high = max(0, math.ceil(positions.max() + reach))
-    mass, slope = pixel_masses(variance[:, None], np.arange(low, high + 2) - 0.5, positions, 1)
+    mass, slope = pixel_masses(variance[:, None], np.arange(low, high + 2, dtype=np.float64) - 0.5, positions, 1)
     return mass, slope, -low
 
 

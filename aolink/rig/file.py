@@ -34,8 +34,9 @@ _TABLES = (
 """The top-level keys of a rig file."""
 _LONGEST = 16 << 20
 _DEEPEST = 200
-"""The most characters of a rig file, and the most parts of a key: the memory for a key grows with the square of its
-parts."""
+_MOST_KEYS = 20_000
+"""The most characters of a rig file, the most parts of a key, for whose square there must be memory, and the most keys,
+tables and rows of matrices together, because each takes a while to read."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -142,12 +143,22 @@ def parse_rig(text: str, folder: Path | None = None) -> Rig:
     folder:
         The folder of the file; None for a text that comes out of a recording.
     """
-    if len(text) > _LONGEST or _deepest_key(text) > _DEEPEST:
-        raise RigError(f"it is longer than {_LONGEST >> 20} MiB, or has a key of more than {_DEEPEST} parts")
+    if len(text) > _LONGEST or text.count("=") + text.count("[") > _MOST_KEYS or _deepest_key(text) > _DEEPEST:
+        raise RigError(
+            f"it is longer than {_LONGEST >> 20} MiB, or has more than {_MOST_KEYS} keys, tables and rows of matrices,"
+            f" or a key of more than {_DEEPEST} parts"
+        )
     try:
         root = Table(tomllib.loads(text), "")
     except (ValueError, RecursionError) as error:  # a TOMLDecodeError, or a number or nesting beyond what Python reads
         raise RigError(f"not valid TOML: {error}") from None
+    try:
+        return _read(root, text, folder)
+    except (ArithmeticError, ValueError) as error:  # a LinAlgError is a ValueError
+        raise RigError(f"it has numbers that are too large or too small to compute with ({error})") from error
+
+
+def _read(root: Table, text: str, folder: Path | None) -> Rig:
     root.finish(*_TABLES)
     name, summary = root.text("name"), root.text("summary", "")
     timing = root.read("timing", read_timing)

@@ -25,6 +25,8 @@ _MOST_INPUTS = 10_000
 # Each output has a coefficient of its own for the slopes that the model leaves out, and estimators keep the covariance
 # of all coefficients: for 512 it is 2 MB an exposure.
 _MOST_UNMODELLED = 512
+_MOST_STEP_S = 1e4
+_MOST_OFFSET_S, _MOST_DRIFT_PPM = 1e9, 1e5
 _MOST_FAULT_S = 60.0
 # Largest relative changes that estimators follow: a plant that differs more from its matrices should be identified.
 _WANDERING: dict[parts.Wanders, float] = {
@@ -141,12 +143,12 @@ def _covariance(table: Table, name: str, size: int, why: str) -> FloatArray:
 
 def read_timing(table: Table) -> Timing:
     """Read the table ``[timing]``. Raises `RigError`."""
-    fast_step_s = table.number("fast_step_s", above=0.0)
+    fast_step_s = table.number("fast_step_s", above=0.0, high=_MOST_STEP_S)
     steps = table.integer("exposure_steps", low=1, high=1_000_000)
     period = table.integer("frame_period_steps", steps, low=1, high=10_000_000)
     if period < steps:
         raise RigError(f"timing.frame_period_steps = {period} is shorter than timing.exposure_steps = {steps}")
-    if abs(fast_step_s * 1e9 - round(fast_step_s * 1e9)) > 1e-6:
+    if not (step_ns := round(fast_step_s * 1e9)) or abs(fast_step_s * 1e9 - step_ns) > 1e-6:
         raise RigError(f"timing.fast_step_s = {fast_step_s!r} is not a whole number of nanoseconds")
     offset = table.number("exposure_offset", 0.0, low=0.0)
     if offset >= 1:
@@ -235,9 +237,9 @@ def read_simulation(table: Table) -> parts.Simulation:
     return parts.Simulation(
         seed=table.integer("seed", 1, low=0),
         light=parse_light(table.text("light", "moving"), table.key("light")),
-        clock_offset_s=table.number("clock_offset_s", 0.0),
-        clock_drift_ppm=table.number("clock_drift_ppm", 0.0),
-        latency_s=table.number("latency_s", 100e-6, low=0.0),
+        clock_offset_s=table.number("clock_offset_s", 0.0, low=-_MOST_OFFSET_S, high=_MOST_OFFSET_S),
+        clock_drift_ppm=table.number("clock_drift_ppm", 0.0, low=-_MOST_DRIFT_PPM, high=_MOST_DRIFT_PPM),
+        latency_s=table.number("latency_s", 100e-6, low=0.0, high=_MOST_FAULT_S),
         faults=table.read("faults", _faults, optional=True),
     )
 

@@ -40,6 +40,8 @@ KEYS = frozenset(_KEYS.split() + _FAULTS.split())
 Where a key is missing, a similar key of the file that is not among these counts as a misspelling of it. The keys that
 the readers have asked for so far would not do: they have not asked yet for the keys after the missing one.
 """
+_LARGEST = 1e30
+"""The size up to which numbers are accepted, and its inverse that down to which: powers of them can be computed."""
 
 
 def named_file(folder: Path | None, name: str | Path, key: str) -> Path:
@@ -149,6 +151,10 @@ class Table:
         if not (low <= value <= high and value > above):
             bound = f"at least {low:g}" if value < low else f"at most {high:g}" if value > high else f"above {above:g}"
             raise RigError(f"{self.key(name)} = {value:g} must be {bound}")
+        if value and not 1 / _LARGEST <= abs(value) <= _LARGEST:
+            raise RigError(
+                f"{self.key(name)} = {value:g} must be 0, or of a size from {1 / _LARGEST:g} to {_LARGEST:g}"
+            )
         return float(value)
 
     def frequency(self, name: str, fast_step_s: float) -> float:
@@ -241,8 +247,8 @@ class Table:
             raise RigError(
                 f"{self.key(name)}: expected numbers in rows of equal length, found {shown(value)}"
             ) from None
-        if not np.isfinite(array).all():
-            raise RigError(f"{self.key(name)} holds a number that is not finite")
+        if not (abs(array) <= _LARGEST).all():
+            raise RigError(f"{self.key(name)} holds a number that is not finite, or larger than {_LARGEST:g}")
         return array
 
     def others(self) -> dict[str, Any]:

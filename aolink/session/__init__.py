@@ -26,7 +26,7 @@ from aolink.recording.writer import RecordingWriter
 from aolink.rig import Drive, Rig
 from aolink.rig.scene_table import read_scene_picture
 from aolink.session.commanding import Inputs
-from aolink.session.controlling import Controlling, facts
+from aolink.session.controlling import Controlling, facts, served
 from aolink.session.estimating import BesideTheLoop, Outcome
 from aolink.session.excitation import Excitation
 from aolink.session.live import Show
@@ -129,8 +129,9 @@ def record(
         `aolink.session.excitation.Excitation`.
     control:
         Name of the controller that closes the loop, one of `aolink.control.controller_names`: it gives the inputs,
-        instead of the rig's drive. The first of the estimators serves it. On virtual time an exposure changes the
-        inputs ``control.delay_s`` after its end; in real time as soon after that as possible.
+        instead of the rig's drive. The first of the estimators serves it, or ``moments`` where there are none. On
+        virtual time an exposure changes the inputs ``control.delay_s`` after its end; in real time as soon after that
+        as possible.
     force:
         Whether to close a loop even if it is unstable by the model.
     watch:
@@ -155,7 +156,7 @@ def record(
         A device, a port, the disk or an estimator failed, by the error's class. The mirror is parked if it can be
         reached, and the recording is closed with the data so far.
     """
-    estimators = list(dict.fromkeys(estimators))
+    estimators = served(rig, control, estimators)
     driver = Driver(rig, estimators)
     controlling, of_control = None, dict[str, str]()
     if control:

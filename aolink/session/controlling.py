@@ -7,9 +7,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from aolink.control import Act, ControllerRow, ControlLoop, State
-from aolink.errors import ControlError
+from aolink.control import Act, ControllerRow, ControlLoop, State, find_controller
 from aolink.estimation import Estimate
+from aolink.estimation.registry import DEFAULT_ESTIMATOR
 from aolink.exposure import Exposure
 from aolink.recording import convert
 from aolink.recording import schemas_pb2 as pb
@@ -21,20 +21,24 @@ MARGIN_S = 0.003
 """Real time: how long a block may take to the mirror, at least, before its first step begins."""
 
 
+def served(rig: Rig, controller: str, estimators: Sequence[str]) -> list[str]:
+    """A session's estimators, each once; the default one where a controller needs one and none is named."""
+    names = list(dict.fromkeys(estimators))
+    return names or ([DEFAULT_ESTIMATOR] if controller and find_controller(controller, rig).needs_state else [])
+
+
 class Controlling:
-    """A controller in a session, and the estimator that serves it: the first one of the session.
+    """A controller in a session, and the estimator that serves it: the first of those that `served` gives.
 
     Raises
     ------
     ControlError
-        There is no such controller, it cannot work on this rig, or it needs an estimator and has none.
+        There is no such controller, or it cannot work on this rig.
     """
 
     def __init__(self, rig: Rig, controller: str | ControllerRow, estimators: Sequence[str]) -> None:
         self.loop = ControlLoop(rig, controller)
-        self.estimator = estimators[0] if estimators and self.loop.needs_state else ""
-        if self.loop.needs_state and not estimators:
-            raise ControlError(f"the controller {self.loop.name} needs an estimator's state: give one, such as moments")
+        self.estimator = estimators[0] if self.loop.needs_state else ""
         self.report = ControlReport(controller=self.loop.name, estimator=self.estimator)
         self.cause_frame = 0
         """The newest exposure that the inputs depend on."""

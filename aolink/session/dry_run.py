@@ -19,6 +19,7 @@ from aolink.files import check_target
 from aolink.rig import Rig
 from aolink.session import at_rest, controller
 from aolink.session.commanding import Inputs
+from aolink.session.controlling import served
 from aolink.session.excitation import Excitation, check_inputs
 from aolink.session.loop import ANSWER_NS
 
@@ -50,7 +51,7 @@ def dry_run(
         The error with which the session would fail at its beginning; the inputs, too, are compared with the mirror's
         limits, over the first million fast steps.
     """
-    path, names = Path(path), list(dict.fromkeys(estimators))
+    path, names = Path(path), served(rig, control, estimators)
     check_target(path, overwrite=overwrite, suffix=".mcap", error=RecordingError)
     Driver(rig, names)
     facts = {"rig": f"{rig.name}, digest {rig.digest[:12]}"}

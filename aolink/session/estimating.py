@@ -11,7 +11,6 @@ from __future__ import annotations
 import contextlib
 import os
 import pickle
-import select
 import socket
 import subprocess
 import sys
@@ -26,6 +25,7 @@ from aolink.estimation import Driver, Estimate, exposure_model
 from aolink.estimation.driver import SkippedInputs
 from aolink.exposure import Exposure
 from aolink.numerics.workers import THREAD_VARIABLES
+from aolink.polling import wait_readable
 from aolink.recording import convert
 from aolink.recording import schemas_pb2 as pb
 from aolink.rig import Rig
@@ -179,7 +179,7 @@ class BesideTheLoop:
     def serve(self, timeout_s: float) -> None:
         """Wait up to ``timeout_s`` until data can be sent or received, and do so."""
         alive = [each for each in self.processes if each.alive]
-        select.select(alive, [each for each in alive if each.has_to_send], [], timeout_s)
+        wait_readable(alive, timeout_s, [each for each in alive if each.has_to_send])
         for each in alive:
             each.serve()
 
@@ -201,9 +201,9 @@ class EstimatorProcess:
         self._to_send: deque[memoryview] = deque()
         self._received = bytearray()
         self._connection, theirs = socket.socketpair()
-        # It imports modules from where this process has found them. Its linear algebra has one thread, as
-        # in all processes of a pool: the cores are for the loop as well.
-        environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+        # It imports modules from where this process has found them, except the current folder. Its linear algebra has
+        # one thread, as in all processes of a pool: the cores are for the loop as well.
+        environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(os.path.isabs, sys.path))}
         environment |= dict.fromkeys(THREAD_VARIABLES, "1")
         main = f"from aolink.session.estimator_process import main; main({theirs.fileno()}, {os.getpid()}, {niceness})"
         with theirs:

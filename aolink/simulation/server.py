@@ -8,7 +8,6 @@ and the same seed gives the same bytes however fast the host is.
 from __future__ import annotations
 
 import math
-import selectors
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
@@ -17,13 +16,21 @@ import numpy as np
 from google.protobuf.message import DecodeError, Message
 
 from aolink.errors import RigError
+from aolink.polling import wait_readable
 from aolink.rig import Faults, Rig
 from aolink.simulation.devices import LineName, Outgoing, SimulatedDevices
 from aolink.simulation.faults import Way
-from aolink.simulation.streams import VERSIONS, Stream, refusal_event
+from aolink.simulation.streams import Stream, refusal_event
 from aolink.wire import messages_pb2 as pb
-from aolink.wire.packet import DELIMITER, MessageDecoder, Packet, PacketDecoder, PacketType, encode_packets
-from aolink.wire.signing import refusal
+from aolink.wire.packet import (
+    DELIMITER,
+    PROTOCOL_VERSION,
+    MessageDecoder,
+    Packet,
+    PacketDecoder,
+    PacketType,
+    encode_packets,
+)
 
 VIRTUAL_EPOCH_NS = 1_767_225_600_000_000_000
 """Host time at which a virtual session begins: 2026-01-01 00:00 UTC, always the same."""
@@ -112,7 +119,7 @@ class LineEnd:
 
     def put(self, message: Message, due_ns: int = 0) -> None:
         """Queue a message for sending at ``due_ns``."""
-        for packet in encode_packets(message, self._sequence, self.stream.signing):
+        for packet in encode_packets(message, self._sequence):
             self._sequence = (self._sequence + 1) & 0xFFFF
             if isinstance(message, pb.VirtualTime):
                 packet = DELIMITER + packet  # ends any damaged packet before it
@@ -160,13 +167,10 @@ class LineEnd:
         way.append((max(due_ns, way[-1][0]) if way else due_ns, data))
 
     def _parse(self, packet: Packet) -> Message | None:
-        signing = self.stream.signing
-        if why := refusal(packet, signing):
-            if packet.type == PacketType.IDENTIFY and packet.version in VERSIONS:
-                self.put(refusal_event(why))
+        if packet.version != PROTOCOL_VERSION:
+            if packet.type == PacketType.IDENTIFY:
+                self.put(refusal_event(packet.version))
             return None
-        if signing is not None:
-            packet = signing.take(packet)
         try:
             return self._messages.take(packet)
         except DecodeError:
@@ -237,12 +241,9 @@ class RigServer:
         return min(max(due_ns / 1e9, 0.0), _IDLE_S)
 
     def _wait(self) -> None:
-        timeout = self.idle_s()
-        with selectors.DefaultSelector() as selector:
-            for line in [each for each in self._lines.values() if each.returns_ns is None]:
-                events = selectors.EVENT_READ | (selectors.EVENT_WRITE if line.unsent else 0)
-                selector.register(line.stream.fileno(), events)
-            idle = not selector.select(timeout)
+        here = [line for line in self._lines.values() if line.returns_ns is None]
+        unsent = [line.stream for line in here if line.unsent]
+        idle = not wait_readable([line.stream for line in here], self.idle_s(), unsent)
         if idle and not self._real_time:  # a delimiter was damaged on its way, and the host waits
             for line in self._lines.values():
                 line.take_undelimited()

@@ -25,8 +25,7 @@ from aolink.errors import PortError
 from aolink.simulation.devices import LineName
 from aolink.wire import messages_pb2 as pb
 from aolink.wire import packet as wire_packet
-from aolink.wire.packet import DELIMITER, PROTOCOL_VERSION, SIGNED_VERSION, MessageDecoder, PacketDecoder, PacketType
-from aolink.wire.signing import Signing, refusal
+from aolink.wire.packet import DELIMITER, PROTOCOL_VERSION, MessageDecoder, PacketDecoder, PacketType
 
 INTRODUCTION_S = 2.0
 """A connection without an Identify packet by this time is dropped, s."""
@@ -34,8 +33,6 @@ IDLE_S = 10.0
 """A host that has sent nothing for this long gives way to the next one that identifies itself, s."""
 _MOST_GUESTS = 16
 """Connections that may be waiting to identify themselves; beyond that, the oldest is dropped."""
-VERSIONS = (PROTOCOL_VERSION, SIGNED_VERSION)
-"""Protocol versions of refused packets whose sender gets the reason."""
 _MOST_INTRODUCTION = 64
 """More bytes than an encoded Identify packet can have."""
 
@@ -44,8 +41,6 @@ class Stream(Protocol):
     """The device's end of a port."""
 
     name: str
-    signing: Signing | None
-    """The signing of packets; None where they are not signed."""
 
     def fileno(self) -> int: ...
     def read(self) -> bytes: ...
@@ -61,8 +56,7 @@ class PtyStream:
     leads to it, as udev makes them, and is its name then.
     """
 
-    def __init__(self, link: Path | None = None, signing: Signing | None = None) -> None:
-        self.signing = signing
+    def __init__(self, link: Path | None = None) -> None:
         self._link = link
         self.reopen()
         self.name = str(link or os.ttyname(self._slave))
@@ -124,13 +118,12 @@ class TcpStream:
     """A TCP port that serves one host at a time; ``name`` is the address for pyserial.
 
     A connection that begins with anything but an Identify packet is closed at once, and one that has sent nothing is
-    closed after `introduction_s`; a host whose Identify is not signed correctly gets the reason, and may try again
-    until then. A host that has identified itself keeps the port until it leaves; once it has been silent for `idle_s`,
-    the next host that identifies itself takes its place.
+    closed after `introduction_s`; a host whose Identify is of another version gets the reason. A host that has
+    identified itself keeps the port until it leaves; once it has been silent for `idle_s`, the next host that
+    identifies itself takes its place.
     """
 
-    def __init__(self, host: str, port: int, signing: Signing | None = None) -> None:
-        self.signing = signing
+    def __init__(self, host: str, port: int) -> None:
         self._host, self._port = host, port
         self.reopen()
         self.introduction_s, self.idle_s = INTRODUCTION_S, IDLE_S
@@ -187,12 +180,11 @@ class TcpStream:
         for guest in guests:
             data = guest.receive()
             guest.introduction += data or b""
-            begun = begins_with_identify(guest.introduction, self.signing)
-            if isinstance(begun, str):
-                message = wire_packet.encode_message(refusal_event(begun), 0, self.signing)
+            begun = begins_with_identify(guest.introduction)
+            if isinstance(begun, pb.Event):
                 with contextlib.suppress(OSError):
-                    guest.connection.send(message)
-                guest.introduction, begun = b"", None
+                    guest.connection.send(wire_packet.encode_message(begun, 0))
+                begun = False
             if begun is None and data is not None and time.monotonic() - guest.since_s < self.introduction_s:
                 self._guests.append(guest)
             elif begun and not (self._peer is not None and time.monotonic() - self._peer.heard_s < self.idle_s):
@@ -217,19 +209,19 @@ class TcpStream:
         self._listener.close()
 
 
-def begins_with_identify(data: bytes, signing: Signing | None = None) -> bool | str | None:
+def begins_with_identify(data: bytes) -> bool | pb.Event | None:
     """Whether bytes begin with a whole Identify packet, or with a zero byte and one; None while this cannot be known.
 
-    Where they do, but the packet is not signed correctly, the result is a text with the reason.
+    Where the packet is of another version, the result is the message for its sender.
     """
     piece, end, _ = data.removeprefix(DELIMITER).partition(DELIMITER)
     if not end:
         return False if len(data) > _MOST_INTRODUCTION else None
     packets = PacketDecoder().feed(piece + end)
-    if not packets or packets[0].type != PacketType.IDENTIFY or packets[0].version not in VERSIONS:
+    if not packets or packets[0].type != PacketType.IDENTIFY:
         return False
-    if (why := refusal(packets[0], signing)) or signing is not None:
-        return why or True
+    if packets[0].version != PROTOCOL_VERSION:
+        return refusal_event(packets[0].version)
     try:
         MessageDecoder().take(packets[0])
     except DecodeError:
@@ -237,52 +229,30 @@ def begins_with_identify(data: bytes, signing: Signing | None = None) -> bool | 
     return True
 
 
-def refusal_event(why: str) -> pb.Event:
-    """The message for a host whose Identify is not signed correctly."""
-    return pb.Event(level=pb.Event.WARNING, text=f"this Identify {why}")
+def refusal_event(version: int) -> pb.Event:
+    """The message for a host whose Identify is of another version."""
+    text = f"this Identify is of version {version}, this device speaks version {PROTOCOL_VERSION} (no signed packets)"
+    return pb.Event(level=pb.Event.WARNING, text=text)
 
 
-def open_streams(
-    listen: str | None, *, key: bytes | None = None, allow_remote: bool = False, unsigned: bool = False,
-    links: Path | None = None,
-) -> dict[LineName, Stream]:  # fmt: skip
+def open_streams(listen: str | None, *, links: Path | None = None) -> dict[LineName, Stream]:
     """Two pseudo terminals, or two TCP ports on ``listen`` = HOST:PORT (the mirror's is the next one; 0: any).
 
-    With ``key``, of 32 bytes, they take and send signed packets only. ``links`` is a folder for links to the terminals,
-    which stay the same where these vanish and return.
-
-    Raises
-    ------
-    PortError
-        The address cannot be listened on, or other machines could reach it and ``allow_remote`` is not given, or
-        neither ``key`` nor ``unsigned`` is.
+    ``links`` is a folder for links to the terminals, which stay the same where these vanish and return. Raises
+    PortError if the address cannot be listened on, or other machines could reach it.
     """
-    names: tuple[LineName, LineName] = ("camera", "mirror")
-    camera, mirror = (Signing(key, name, to_host=True) if key else None for name in names)
     if listen is None:
-        return {
-            "camera": PtyStream(links and links / "camera", camera),
-            "mirror": PtyStream(links and links / "mirror", mirror),
-        }
+        return {"camera": PtyStream(links and links / "camera"), "mirror": PtyStream(links and links / "mirror")}
     host, _, port = listen.rpartition(":")
     if not host or not port.isdigit() or int(port) > 65_534:
         raise PortError(f"--listen {listen}: expected HOST:PORT, for example 127.0.0.1:5000")
     number, address = int(port), _address(host, listen)
     if not ipaddress.ip_address(address).is_loopback:
-        if not allow_remote:
-            raise PortError(
-                f"--listen {listen} lets other machines move the mirror: give 127.0.0.1:{port}, or add --allow-remote"
-                " and --key FILE if that is what you want"
-            )
-        if not (key or unsigned):
-            raise PortError(
-                f"--listen {listen} --allow-remote lets everybody who reaches this machine move the mirror: add --key"
-                " FILE, so that only those with the key do, or --unsigned if everybody may"
-            )
-    return {
-        "camera": TcpStream(address, number, camera),
-        "mirror": TcpStream(address, number + 1 if number else 0, mirror),
-    }
+        raise PortError(
+            f"--listen {listen} would let every machine that reaches this one move the mirror: give 127.0.0.1:{port},"
+            " and let others in through a tunnel (ssh -L)"
+        )
+    return {"camera": TcpStream(address, number), "mirror": TcpStream(address, number + 1 if number else 0)}
 
 
 def _address(host: str, listen: str) -> str:

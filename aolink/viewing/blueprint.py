@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -9,7 +10,6 @@ import rerun.blueprint as rrb
 
 from aolink.plotting.overview import NIS_COVERAGE
 from aolink.plotting.pupil import MAPS
-from aolink.plotting.style import BAND
 from aolink.recording import topics
 from aolink.rig import Rig
 from aolink.viewing import entities
@@ -20,7 +20,10 @@ from aolink.viewing.timebase import FAST_STEP, TIME
 
 PATH_WINDOW = 2
 """Exposures that the path's view shows to each side of the time cursor."""
-
+_HALF = 0.55
+"""The same where the layout is about one exposure, when the cursor is in its middle: the axis has room for its ends."""
+_ROWS = 8
+"""Exposures of a page that are shown where the layout is about one of them."""
 
 _LEGEND_ROW, _LEGEND_MOST = 0.1, 0.65
 """Height of a legend's row in a plot of the bottom row, and the most that all rows get, as shares of the plot's
@@ -54,6 +57,8 @@ class Contents:
     """Whether there are warnings."""
     alone: bool = False
     """Whether one exposure is shown alone."""
+    about: int | None = None
+    """Row, on its page, of the exposure that the layout is about; the other exposures are there as well."""
     compared: Contents | None = None
     """The contents of the recording that is shown beside it."""
 
@@ -71,14 +76,21 @@ class Contents:
 def blueprint(contents: Contents) -> rrb.Blueprint:
     """The layout: the exposure on top, the session's estimates below it, the devices at the bottom.
 
-    For one exposure alone it has the path that explains its blur, beside its paths and its frame.
+    For one exposure alone it has the path that explains its blur, beside its paths and its frame. A layout that is
+    about one exposure has a few large views.
     """
     layout: rrb.Container
-    if contents.alone:
-        beside = rrb.Vertical(contents=[_paths(contents), _camera(contents), _texts(contents)], row_shares=[3, 3, 1])
+    if contents.about is not None:
+        explained = [_camera(contents)[0], _profile(contents), *_residual(contents)]
+        layout = rrb.Horizontal(rrb.Vertical(contents=explained), _paths(contents))
+    elif contents.alone:
+        camera = rrb.Horizontal if contents.restored_spots else _tabs
+        seen = camera(contents=_camera(contents))
+        beside = rrb.Vertical(contents=[_paths(contents), seen, _texts(contents)], row_shares=[3, 3, 1])
         layout = rrb.Horizontal(_profile(contents), beside, column_shares=[3, 2])
     else:
-        exposure = rrb.Horizontal(_camera(contents), _profile(contents), _paths(contents), column_shares=[4, 4, 7])
+        seen = _tabs(_camera(contents))
+        exposure = rrb.Horizontal(seen, _profile(contents), _paths(contents), column_shares=[4, 4, 7])
         rows: list[rrb.Container | rrb.View] = [exposure]
         if beliefs := [*_errors(contents), *_nis(contents), *_states(contents), *_maps(contents)]:
             rows.append(rrb.Horizontal(contents=beliefs))
@@ -95,8 +107,8 @@ def blueprint(contents: Contents) -> rrb.Blueprint:
     return rrb.Blueprint(layout, *panels, rrb.TimePanel(state="collapsed", timeline=TIME))
 
 
-def _camera(contents: Contents) -> rrb.Container | rrb.View:
-    """The frame and the page that the exposure is on; a tab for the recording that is compared."""
+def _camera(contents: Contents) -> list[rrb.View]:
+    """The frame and the page that the exposure is on; also those of the recording that is compared."""
     sensor = contents.rig.sensor
     views: list[rrb.View] = []
     for each in contents.sides:
@@ -107,18 +119,27 @@ def _camera(contents: Contents) -> rrb.Container | rrb.View:
         shown = [entities.PAGE, entities.CENTROIDS, entities.ROW_NOW]
         shown += [f"{entities.PAGE}/path/{name}" for name in _drawn_paths(each)]
         what = "paths in their blur" if sensor.directions == 1 else "one spot along x"
-        count = "one exposure" if contents.alone else f"{HISTORY} exposures"
+        rows, columns = _part_of_page(each)
+        count = "one exposure" if contents.alone else f"{len(rows)} exposures"
         name = f"{title}{count} (pixels), {what}"
-        views.append(_picture([root + path for path in shown], name, HISTORY, sensor.profile.pixels))
+        views.append(_picture([root + path for path in shown], name, len(rows), len(columns), (rows[0], columns[0])))
         if each.restored_spots:
             views.append(_picture([root + entities.RESTORED_SPOTS], f"{title}frame restored (pixels)", *sensor.shape))
-    if contents.alone and contents.restored_spots:
-        return rrb.Horizontal(contents=views)
-    return _tabs(views) if len(views) > 1 else views[0]
+    return views
 
 
-def _tabs(views: Sequence[rrb.Container | rrb.View]) -> rrb.Tabs:
-    return rrb.Tabs(contents=views, active_tab=0)
+def _part_of_page(contents: Contents) -> tuple[range, range]:
+    """The rows and the columns of a page that are shown: all, or those about the exposure that the layout is about."""
+    line, near = contents.rig.sensor.profile, contents.drawn.near
+    if contents.about is None or near is None:
+        return range(HISTORY), range(line.pixels)
+    first = min(max(0, contents.about - _ROWS // 2), HISTORY - _ROWS)
+    low, high = ((end - line.field[0]) / line.pixel_width for end in near)
+    return range(first, first + _ROWS), range(math.floor(low), math.ceil(high))
+
+
+def _tabs(contents: Sequence[rrb.Container | rrb.View]) -> rrb.Container | rrb.View:
+    return rrb.Tabs(contents=contents, active_tab=0) if len(contents) > 1 else contents[0]
 
 
 def _drawn_paths(contents: Contents) -> list[str]:
@@ -132,8 +153,9 @@ def _scene(contents: Contents, path: str) -> rrb.View:
     return _picture([path], f"Scene {names[path]} (pixels)", *contents.rig.scene.shape)
 
 
-def _picture(paths: list[str], name: str, rows: int, columns: int) -> rrb.View:
-    bounds = rrb.VisualBounds2D(x_range=(0, columns), y_range=(0, rows))
+def _picture(paths: list[str], name: str, rows: int, columns: int, corner: tuple[int, int] = (0, 0)) -> rrb.View:
+    (top, left) = corner
+    bounds = rrb.VisualBounds2D(x_range=(left, left + columns), y_range=(top, top + rows))
     return rrb.Spatial2DView(name=name, contents=[f"+ /{path}" for path in paths], visual_bounds=bounds)
 
 
@@ -142,31 +164,34 @@ def _profile(contents: Contents) -> rrb.Container | rrb.View:
     views: list[rrb.View] = []
     for each in contents.sides:
         names = 1 + len(each.estimators) + each.truth
-        x_range, y_range = profile_bounds(each.rig.sensor.profile, each.density_top, names)
+        x_range, y_range = profile_bounds(each.rig.sensor.profile, each.density_top, names, each.drawn.near)
         title = "Compared: path" if each.drawn.root else "Path"
+        what = f"{title}; time at a position; intensity (1/slope unit) over slope"
         views.append(
             rrb.Spatial2DView(
                 origin=each.drawn.root + entities.PROFILE,
-                name=f"{title}; time at a position; intensity (1/slope unit) over slope",
+                name=what if each.about is None else "Intensity (1/slope unit) over slope: measured, and predicted",
                 visual_bounds=rrb.VisualBounds2D(x_range=x_range, y_range=y_range),
             )
         )
-    return _tabs(views) if len(views) > 1 else views[0]
+    return _tabs(views)
 
 
 def _paths(contents: Contents) -> rrb.Container | rrb.View:
     """A tab for each estimator with its band, with the estimator of the highest rank in front, and a tab with all of
-    them."""
+    them. In a layout that is about one exposure they are under each other, by rank."""
     truth = _path(contents, "truth") if contents.truth else []
     names = contents.estimators
     what = ", y fainter" if len(contents.drawn.chosen.labels) > 1 else ""
     tabs = [
         _lines(
-            contents, f"Path, {name} ± {BAND:g} sd (slope units{what})",
+            contents, f"Path, {name}, 95 % band (slope units{what})",
             [*truth, *_path(contents, name), entities.band(f"{entities.PATH}/{name}")], window=not contents.alone,
         )
         for name in reversed(names)
     ]  # fmt: skip
+    if contents.about is not None and names:
+        return rrb.Vertical(contents=tabs[::-1])
     if not truth and not names:
         return rrb.TextDocumentView(origin=entities.SESSION, name="No paths: no estimates, no truth")
     everyone = [path for name in names for path in _path(contents, name)]
@@ -209,7 +234,7 @@ def _nis(contents: Contents) -> list[rrb.View]:
     return [_lines(contents, f"NIS (no unit) with its {NIS_COVERAGE:.0%} bounds", shown)] if shown else []
 
 
-def _states(contents: Contents) -> list[rrb.Container]:
+def _states(contents: Contents) -> list[rrb.Container | rrb.View]:
     names = contents.estimators
     tabs = []
     for where in ("end", "start"):
@@ -241,11 +266,14 @@ def _maps(contents: Contents) -> list[rrb.Container]:
     return [rrb.Grid(contents=views, grid_columns=2)]
 
 
+def _residual(contents: Contents) -> list[rrb.View]:
+    shown = [f"{entities.RESIDUAL}/{name}" for name in contents.loops]
+    title = "Residual of each loop, RMS an exposure (slope units)"
+    return [_lines(contents, title, shown, legend=True)] if shown else []
+
+
 def _devices(contents: Contents) -> list[rrb.Container | rrb.View]:
-    views: list[rrb.Container | rrb.View] = []
-    if contents.loops:
-        shown = [f"{entities.RESIDUAL}/{name}" for name in contents.loops]
-        views.append(_lines(contents, "Residual of each loop, RMS an exposure (slope units)", shown, legend=True))
+    views: list[rrb.Container | rrb.View] = [*_residual(contents)]
     if contents.topics & {topics.COMMAND, topics.APPLIED}:
         shown = [
             path for topic, path in ((topics.COMMAND, entities.COMMAND), (topics.APPLIED, entities.APPLIED))
@@ -285,7 +313,7 @@ def _devices(contents: Contents) -> list[rrb.Container | rrb.View]:
     return views
 
 
-def _texts(contents: Contents) -> rrb.Container:
+def _texts(contents: Contents) -> rrb.Container | rrb.View:
     texts: list[rrb.View] = [rrb.TextDocumentView(origin=entities.SESSION, name="Session")]
     if contents.warnings:
         texts.append(rrb.TextLogView(origin=entities.WARNINGS, name="Warnings"))
@@ -299,7 +327,8 @@ def _texts(contents: Contents) -> rrb.Container:
 def _lines(
     contents: Contents, name: str, shown: list[str], *, window: bool = False, legend: bool = False,
 ) -> rrb.TimeSeriesView:  # fmt: skip
-    """A plot over time: of the whole session, or of `PATH_WINDOW` exposures about the time cursor.
+    """A plot over time: of the whole session, or of `PATH_WINDOW` exposures about the time cursor; in a layout that is
+    about one exposure, of that length.
 
     A ``legend`` stands above the lines; without one, the profile's key has the colours.
     """
@@ -310,7 +339,8 @@ def _lines(
         whole = rrb.TimeRange(rrb.TimeRangeBoundary.infinite(), rrb.TimeRangeBoundary.infinite())
         axis_x = rrb.archetypes.TimeAxis(view_range=whole)
         return rrb.TimeSeriesView(name=name, contents=expressions, axis_x=axis_x, axis_y=axis_y, plot_legend=corner)
-    steps = PATH_WINDOW * contents.rig.timing.frame_period_steps
+    timing = contents.rig.timing
+    steps = PATH_WINDOW * timing.frame_period_steps if contents.about is None else round(_HALF * timing.exposure_steps)
     near, span_s = rrb.TimeRangeBoundary.cursor_relative, steps * contents.rig.timing.fast_step_s
     ranges = [
         rrb.VisibleTimeRange(FAST_STEP, start=near(seq=-steps), end=near(seq=steps)),

@@ -35,6 +35,8 @@ HISTORY = 32
 """Exposures on a page."""
 _PANELS = (0.20, 0.16, 0.32)
 """Heights of the profile's panels as shares of their width: path, histogram of the path, intensity."""
+_ALONE = (0.0, 0.0, 0.6)
+"""The same where the intensity is drawn alone."""
 _GAP = 0.03
 """Gap between the panels, in the same unit."""
 _KEY_ROW, _KEY_COLUMNS = 0.095, 5
@@ -45,6 +47,8 @@ _LIGHT = 2.5
 """Top of the histogram divided by that of the intensity, which is the histogram blurred."""
 _POINTS_IN_ROW = 21
 """Points of a path inside one row of a page: more than the eye can separate."""
+_POINTS_IN_HIGH_ROW = 101
+"""The same where a few rows of a page are shown."""
 _SWINGS_IN_ROW = 5
 """A path over some pixels that a curve through this many points would miss is drawn as its range, because a row is not
 high."""
@@ -75,14 +79,15 @@ def centroid(sensor: Sensor, profile: FloatArray) -> float:
     return float(np.nansum(sensor.centres * profile) * sensor.pixel_width)
 
 
-def density_top(sensor: Sensor, exposures: Sequence[Exposure]) -> float:
+def density_top(sensor: Sensor, exposures: Sequence[Exposure], *, alone: bool = False) -> float:
     """Density at the top of the profile's plot: the brightest pixel of all but the most extreme exposures.
 
-    Where all exposures are dark, it is the peak of a resting spot, so that the plot has the same scale as with light.
+    Where all exposures are dark, it is the peak of a resting spot, so that the plot has the same scale as with light;
+    so it is where the intensity is drawn ``alone``, so that no predicted one is cut.
     """
     brightest = [np.nanmax(density(sensor, e)) for e in exposures if e.mask.any()]
     top = float(np.percentile(brightest, 98)) if brightest else 0.0
-    return top if top > pixel_noise_sd(sensor) else sensor.peak_density
+    return top if top > pixel_noise_sd(sensor) and not alone else max(top, sensor.peak_density)
 
 
 def log_frames(drawing: Drawing, timebase: Timebase, exposures: Sequence[Exposure]) -> None:
@@ -174,21 +179,23 @@ def log_page(
     drawing.log(CENTROIDS, look)
     columns = rr.Points2D.columns(positions=points.astype(np.float32)).partition([len(points)])
     _send_at_starts(drawing, CENTROIDS, timebase, shown, columns)
+    high = drawing.near is not None
     for name, by_frame in paths.items():
         strips = []
         for row, exposure in zip(rows, exposures, strict=True):
             if (path := by_frame.get(exposure.frame_id)) is not None:
-                if np.ptp(path) > _PIXELS * sensor.pixel_width and hides_swings(path, _SWINGS_IN_ROW):
+                if not high and np.ptp(path) > _PIXELS * sensor.pixel_width and hides_swings(path, _SWINGS_IN_ROW):
                     edges: tuple[FloatArray, ...] = extremes(path, _SWINGS_IN_ROW)
                     places = (np.arange(len(edges[0])) + 0.5) / len(edges[0])
                 else:
-                    some = _drawn(len(path), _POINTS_IN_ROW)
+                    some = _drawn(len(path), _POINTS_IN_HIGH_ROW if high else _POINTS_IN_ROW)
                     edges, places = (path[some],), (some + 0.5) / len(path)
                 for edge in edges:
                     x = np.clip((edge - sensor.field[0]) / sensor.pixel_width, 0, n)
                     strips.append(np.stack([x, row + places], axis=1).astype(np.float32))
         if strips:
-            _send_strips(drawing, f"{PAGE}/path/{name}", timebase, shown, [strips], colour_of(name), 1.5)
+            width = 0.8 if high else 1.5
+            _send_strips(drawing, f"{PAGE}/path/{name}", timebase, shown, [strips], colour_of(name), width)
 
 
 def log_now(drawing: Drawing, sensor: Sensor, timebase: Timebase, exposures: Sequence[Exposure]) -> None:
@@ -204,10 +211,10 @@ def log_profile_axes(drawing: Drawing, sensor: Sensor, top: float, names: Sequen
 
     The key has the colour of each of ``names`` and of the measured profile; they are the same in all views.
     """
-    low, high = sensor.field
-    place = Panels(sensor, top)
+    low, high = drawing.near or sensor.field
+    place = Panels(sensor, top, drawing.near)
     slopes, heights = _ticks(low, high), _ticks(0.0, top)
-    edges = [place.path, place.histogram, place.intensity]
+    edges = [place.path, place.histogram, place.intensity] if drawing.near is None else [place.intensity]
     grid = [panel(np.array([(x, 0.0), (x, 1.0)])) for panel in edges for x in slopes]
     grid += [panel(np.array([(low, y), (high, y)])) for panel in edges for y in (0.0, 1.0)]
     grid += [place.intensity(np.array([(low, y / top), (high, y / top)])) for y in heights[1:]]
@@ -233,7 +240,7 @@ def log_measured_profile(
     drawing: Drawing, sensor: Sensor, timebase: Timebase, exposures: Sequence[Exposure], top: float
 ) -> None:
     """Measured density over slope as a staircase of pixels: ``/profile/measured``."""
-    place = Panels(sensor, top)
+    place = Panels(sensor, top, drawing.near)
     slopes = np.repeat(sensor.edges, 2)[1:-1]
     seen = [np.repeat(np.nan_to_num(density(sensor, e)), 2) / top for e in exposures]
     strips = [[place.intensity(np.stack([slopes, each], axis=1))] for each in seen]
@@ -247,9 +254,10 @@ def log_path_profile(
     """The explanation of the blur: a path, its histogram, and the intensity that the kernel makes of it.
 
     ``/profile/path/NAME`` (time runs upwards), ``/profile/histogram/NAME`` and ``/profile/predicted/NAME``, both as
-    densities over the same slopes. ``light`` is the spot's share of its light.
+    densities over the same slopes; the last one alone for a layout that is about one exposure. ``light`` is the spot's
+    share of its light.
     """
-    place = Panels(sensor, top)
+    place = Panels(sensor, top, drawing.near)
     known = [e for e in exposures if e.frame_id in by_frame]
     colour, field, edges, centres = colour_of(name), sensor.field, sensor.edges, sensor.centres
     lines, stairs, profiles = [], [], []
@@ -261,15 +269,18 @@ def log_path_profile(
         stairs.append([place.histogram(_histogram(sensor, path, _LIGHT * top))])
         predicted = light * _predicted(sensor, edges, path) / top
         profiles.append([place.intensity(np.stack([centres, np.minimum(predicted, _MOST)], axis=1))])
-    _send_strips(drawing, f"{PROFILE}/path/{name}", timebase, known, lines, colour, 1.2)
-    _send_strips(drawing, f"{PROFILE}/histogram/{name}", timebase, known, stairs, colour, 1.2)
+    if drawing.near is None:
+        _send_strips(drawing, f"{PROFILE}/path/{name}", timebase, known, lines, colour, 1.2)
+        _send_strips(drawing, f"{PROFILE}/histogram/{name}", timebase, known, stairs, colour, 1.2)
     _send_strips(drawing, f"{PROFILE}/predicted/{name}", timebase, known, profiles, colour, 1.5)
 
 
-def profile_bounds(sensor: Sensor, top: float, names: int) -> tuple[tuple[float, float], tuple[float, float]]:
+def profile_bounds(
+    sensor: Sensor, top: float, names: int, near: tuple[float, float] | None = None
+) -> tuple[tuple[float, float], tuple[float, float]]:
     """Range of the profile's plot with a key of a number of names, in its drawing units: x, and y downwards."""
-    (low, high), place = sensor.field, Panels(sensor, top)
-    bottom = place.intensity(np.array([(low, -place.depth / top - 0.15)]))[0, 1]
+    (low, high), place = near or sensor.field, Panels(sensor, top, near)
+    bottom = place.intensity(np.array([(low, -place.depth / top - 0.22)]))[0, 1]
     return (low - 0.1 * (high - low), high + 0.05 * (high - low)), (
         float(place.key(names - 1)[1]) - 0.08 * (high - low),
         float(bottom),
@@ -279,14 +290,15 @@ def profile_bounds(sensor: Sensor, top: float, names: int) -> tuple[tuple[float,
 class Panels:
     """The places of the three panels of the profile's plot in its drawing units: slope to the right, y downwards.
 
-    The path is on top, then its histogram, and the intensity's zero is at y = 0.
+    The path is on top, then its histogram, and the intensity's zero is at y = 0. The intensity is alone where a part of
+    the field is given, ``near``.
 
     Each panel takes points (slope, height from 0 to 1), (n, 2).
     """
 
-    def __init__(self, sensor: Sensor, top: float) -> None:
-        self._low, high = sensor.field
-        self._width = high - self._low
+    def __init__(self, sensor: Sensor, top: float, near: tuple[float, float] | None = None) -> None:
+        self._low, high = near or sensor.field
+        self._width, self._heights = high - self._low, _ALONE if near else _PANELS
         self.depth = max(0.08 * top, 2.5 * pixel_noise_sd(sensor))
         """How far the noise reaches below zero, in density; labels under the plot stand below that."""
 
@@ -308,14 +320,15 @@ class Panels:
         return np.array(
             [
                 self._low + (column + 0.5) / _KEY_COLUMNS * self._width,
-                -(sum(_PANELS) + 2 * _GAP + (row + 1) * _KEY_ROW) * self._width,
+                -(sum(self._heights) + 2 * _GAP + (row + 1) * _KEY_ROW) * self._width,
             ],
             dtype=np.float32,
         )
 
     def _panel(self, points: FloatArray, number: int) -> NDArray[np.float32]:
-        base = -self._width * (sum(_PANELS[number + 1 :]) + (2 - number) * _GAP)
-        return np.stack([points[:, 0], base - _PANELS[number] * self._width * points[:, 1]], axis=1, dtype=np.float32)
+        base = -self._width * (sum(self._heights[number + 1 :]) + (2 - number) * _GAP)
+        height = self._heights[number] * self._width
+        return np.stack([points[:, 0], base - height * points[:, 1]], axis=1, dtype=np.float32)
 
 
 def _predicted(sensor: Sensor, edges: FloatArray, path: FloatArray) -> FloatArray:
@@ -342,7 +355,7 @@ def _ticks(low: float, high: float) -> list[float]:
     unit = 10.0 ** np.floor(np.log10(rough))
     step = unit * min((1, 2, 5, 10), key=lambda m: abs(m * unit - rough))
     first, last = np.ceil(low / step - 1e-9), np.floor(high / step + 1e-9)
-    return [float(k * step) for k in np.arange(first, last + 1)]
+    return [float(k * step) + 0.0 for k in np.arange(first, last + 1)]  # -0.0 would be written as it is
 
 
 @lru_cache(maxsize=8)

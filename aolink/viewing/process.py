@@ -123,30 +123,38 @@ def serving(files: Sequence[str] = (), port: int | None = None) -> Iterator[Serv
 
     Raises `ViewerError` where the requested port is in use.
     """
-    if port is None:
-        port = WEB_PORT if is_free(WEB_PORT) else free_port()
-    elif not is_free(port):
+    if port is not None and not is_free(port):
         raise ViewerError(f"port {port} is in use: stop what uses it or choose another one")
-    data_port = free_port()
-    options = [*files, "--serve-web", "--web-viewer-port", str(port), "--port", str(data_port)]
-    with tempfile.TemporaryFile() as said, running_rerun(options, said) as process:
-        yield Server(process, said, data_port, port)
+    with free_port() as another, free_port() as data_port, tempfile.TemporaryFile() as said:
+        port = port or (WEB_PORT if is_free(WEB_PORT) else another)
+        options = [*files, "--serve-web", "--web-viewer-port", str(port), "--port", str(data_port)]
+        with running_rerun(options, said) as process:
+            yield Server(process, said, data_port, port)
 
 
 @contextmanager
 def window() -> Iterator[Server]:
     """The native viewer, empty, on the screen. Raises `ViewerError` where there is none."""
     check_display()
-    port = free_port()
-    with tempfile.TemporaryFile() as said, running_rerun(["--port", str(port)], said) as process:
+    with (
+        free_port() as port, tempfile.TemporaryFile() as said, running_rerun(["--port", str(port)], said) as process,
+    ):  # fmt: skip
         yield Server(process, said, port)
 
 
-def free_port() -> int:
-    """A port on which no program listens."""
-    with socket.socket() as probe:
-        probe.bind((HOST, 0))
-        return int(probe.getsockname()[1])
+@contextmanager
+def free_port() -> Iterator[int]:
+    """A port on which no program listens, and which no other is given until the block ends.
+
+    It is bound, and Linux lets Rerun listen there all the same, because both allow its reuse.
+    """
+    with socket.socket() as held:
+        held.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        held.bind((HOST, 0))
+        port = int(held.getsockname()[1])
+        if sys.platform != "linux":
+            held.close()
+        yield port
 
 
 @contextmanager

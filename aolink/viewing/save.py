@@ -15,6 +15,7 @@ from aolink.errors import ViewerError
 from aolink.estimation.estimate import Estimate
 from aolink.estimation.score import Scorer
 from aolink.exposure import Exposure
+from aolink.plotting.overview import limits_of
 from aolink.plotting.pupil import has_pupil
 from aolink.recording import topics
 from aolink.recording.side_files import check_stands_alone
@@ -122,10 +123,14 @@ class Sender:
         check_stands_alone(recording)
         self._recording, self._look, self._rig = recording, look, recording.rig
         self._numbers = range(len(recording)) if look.exposures is None else look.exposures
-        few = len(self._numbers) <= 2 * PATH_WINDOW + 1
-        chosen = Chosen.of(recording.rig, look.spot)
-        self._drawing = Drawing(stream=stream, chosen=chosen, root=root, points=None if few else POINTS)
         self._names = by_rank(list(recording.estimators))
+        chosen = Chosen.of(recording.rig, look.spot)
+        self._about = None if look.about is None else recording[look.about]
+        near = self._near(chosen.outputs[0])
+        every_step = near is not None or len(self._numbers) <= 2 * PATH_WINDOW + 1
+        self._drawing = Drawing(
+            stream=stream, chosen=chosen, root=root, points=None if every_step else POINTS, near=near
+        )
         self._skipped = {name: recording.skipped(name) for name in self._names}
         self._scorers = {name: Scorer() for name in self._names}
         self._measuring: set[str] = set()
@@ -140,6 +145,14 @@ class Sender:
         self._finished = False
         self.done = 0
         """Exposures that have been sent."""
+
+    def _near(self, output: int) -> tuple[float, float] | None:
+        """The part of the field that the paths of the exposure that the layout is about, and their blur, are in."""
+        if (about := self._look.about) is None:
+            return None
+        exposure, found = next(iter(self._recording[about : about + 1].with_estimates(self._names)))
+        paths = [each.path[output] for each in (exposure.truth, *found) if each is not None]
+        return limits_of(self._rig.sensor.profile, paths)
 
     def parts(self) -> Iterator[int]:
         """Send the exposures with all that belongs to them, then the devices; gives after each part how many exposures
@@ -293,9 +306,15 @@ class Sender:
             scenes=[each for each in entities.SCENES if each in known],
             restored_spots=entities.RESTORED_SPOTS in known, loops=list(self._look.loops),
             topics=frozenset(known.intersection(self._shown) if self._finished else self._shown), drawn=self._drawing,
-            maps=self._scales, warnings=self._warnings > 0, alone=len(self._numbers) == 1,
+            maps=self._scales, warnings=self._warnings > 0, alone=len(self._numbers) == 1, about=self._row(),
             compared=other.contents() if other else None,
         )  # fmt: skip
+
+    def _row(self) -> int | None:
+        """The row, on its page, of the exposure that the layout is about."""
+        if self._about is None or self._timebase is None:
+            return None
+        return (self._about.frame_id - self._timebase.frame_id) % camera.HISTORY
 
     def _summary(self) -> str:
         """A page of Markdown about a session, with the data that it lacks and, where the truth is known, the
@@ -385,7 +404,7 @@ def send_camera(
     }
     line, seen = sensor.profile, camera.one_profile(sensor, exposures, output)
     if top is None:
-        top = camera.density_top(line, seen)
+        top = camera.density_top(line, seen, alone=drawing.near is not None)
         camera.log_profile_axes(drawing, line, top, names)
     first, at = timebase.frame_id, seen[-1] if live else None
     pages: dict[int, list[Exposure]] = {}

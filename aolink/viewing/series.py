@@ -56,6 +56,9 @@ class Drawing:
     """Prefix of every entity's name, with its slash, where a recording is shown beside another."""
     points: int | None = POINTS
     """Points with which a path of one exposure is drawn; None: every fast step."""
+    near: tuple[float, float] | None = None
+    """The part of the field that is drawn of one exposure's intensity profile, where the layout is about that exposure:
+    its path and histogram are then not drawn beside it."""
     extents: dict[str, tuple[float, float]] = field(default_factory=dict)
     """The least and the largest value of each entity's lines."""
     swinging: dict[str, bool] = field(default_factory=dict)

@@ -35,8 +35,10 @@ _LEAST_COLOURS = 50
 """A picture with fewer is blank: an empty viewer has about a dozen."""
 
 
-def screenshot(rrd_path: str | Path, png_path: str | Path, *, size: tuple[int, int] = PICTURE_SIZE) -> Path:
-    """Take a picture of the viewer with a file in it, at a time well inside the session; no display is needed.
+def screenshot(
+    rrd_path: str | Path, png_path: str | Path, *, size: tuple[int, int] = PICTURE_SIZE, at_ns: int | None = None
+) -> Path:
+    """Take a picture of the viewer with a file in it; no display is needed.
 
     Parameters
     ----------
@@ -46,6 +48,8 @@ def screenshot(rrd_path: str | Path, png_path: str | Path, *, size: tuple[int, i
         The picture to write; an older one is replaced.
     size:
         Width and height, pixels.
+    at_ns:
+        The time that is shown, ns since the first exposure began; by default one well inside the session.
 
     Raises
     ------
@@ -57,6 +61,8 @@ def screenshot(rrd_path: str | Path, png_path: str | Path, *, size: tuple[int, i
     png_path = Path(png_path)
     check_target(png_path, overwrite=True, suffix=".png", error=ViewerError)
     with headless_viewer(rrd_path, size) as client:
+        if at_ns is not None:
+            client.set_time(TIME, duration=np.timedelta64(at_ns, "ns"), play_state="paused")
         picture = settled_picture(client)
     # Headless too, the viewer keeps the place of its title bar free.
     inside = picture[:, _CORNER:-_CORNER]
@@ -78,9 +84,11 @@ def headless_viewer(rrd_path: str | Path, size: tuple[int, int] = PICTURE_SIZE) 
         The viewer ended because the machine has no driver to draw with.
     """
     path = existing(rrd_path)
-    port = free_port()
-    options = ["--headless", "--port", str(port), "--window-size", f"{size[0]}x{size[1]}", "--hide-welcome-screen"]
-    with tempfile.TemporaryFile() as said, running_rerun(options, said) as process:
+    more = ["--headless", "--window-size", f"{size[0]}x{size[1]}", "--hide-welcome-screen"]
+    with (
+        free_port() as port, tempfile.TemporaryFile() as said,
+        running_rerun([*more, "--port", str(port)], said) as process,
+    ):  # fmt: skip
         try:
             client = _connected(process, port, said)
             client.open(str(path))

@@ -16,10 +16,10 @@ from typing import TypeVar
 from google.protobuf.message import Message
 
 from aolink.errors import DeviceError
+from aolink.polling import wait_readable
 from aolink.wire import messages_pb2 as pb
 from aolink.wire.link import Link, Received
-from aolink.wire.port import Served, Transport, is_local, wait_readable
-from aolink.wire.signing import Signing
+from aolink.wire.port import Served, Transport, is_local
 
 ANSWER_S = 1.0
 """How long an answer may take before a request is sent again, and the longest wait for an answer after a stop, s."""
@@ -73,9 +73,9 @@ class Hub:
         """Wait from now on as if a stop had been asked for: the session ends with an error."""
         self._hurried = True
 
-    def connect(self, name: str, transport: Transport, key: bytes | None = None) -> Link:
-        """Add a line; with ``key`` its packets are signed."""
-        link = Link(name, transport, self.now_ns, Signing(key, name, to_host=False) if key else None)
+    def connect(self, name: str, transport: Transport) -> Link:
+        """Add a line."""
+        link = Link(name, transport, self.now_ns)
         self.links.append(link)
         return link
 
@@ -140,7 +140,7 @@ class Hub:
         before = self._memory_bytes()
         sequences: list[int] = []
         for attempt in range(tries):
-            if attempt and (self._hurried or self._stop() or link.refusal):  # it will be refused again
+            if attempt and (self._hurried or self._stop() or link.foreign_version is not None):
                 break
             sequences.append(link.send(request))
             deadline_ns = self.now_ns() + round(answer_s * 1e9)

@@ -10,9 +10,16 @@ from google.protobuf.message import DecodeError, Message
 
 from aolink.errors import PortError
 from aolink.wire import messages_pb2 as pb
-from aolink.wire.packet import DELIMITER, MessageDecoder, Packet, PacketDecoder, PacketType, encode_packets
+from aolink.wire.packet import (
+    DELIMITER,
+    PROTOCOL_VERSION,
+    MessageDecoder,
+    Packet,
+    PacketDecoder,
+    PacketType,
+    encode_packets,
+)
 from aolink.wire.port import Transport
-from aolink.wire.signing import Signing, refusal
 
 _REMEMBERED = 64
 """Number of sequence numbers that are remembered to find duplicates."""
@@ -49,16 +56,12 @@ class Link:
     at its time.
     """
 
-    def __init__(
-        self, name: str, transport: Transport, now_ns: Callable[[], int], signing: Signing | None = None
-    ) -> None:
+    def __init__(self, name: str, transport: Transport, now_ns: Callable[[], int]) -> None:
         self.name = name
         self.transport = transport
         self.counts = LinkCounts()
         self.foreign_version: int | None = None
-        """Version of the last packet that was refused for its version or its signature, if one came."""
-        self.refusal = ""
-        """The reason of the refusal, as the end of a sentence about it."""
+        """Version of the last packet that was refused for its version, if one came."""
         self.handed: pb.VirtualTime | None = None
         """The last `VirtualTime` that came."""
         self.virtual = False
@@ -82,7 +85,6 @@ class Link:
         self.before_send: Callable[[], None] = lambda: None
         """Called before anything is sent; the hub keeps the lines in step with it on virtual time."""
         self._now_ns = now_ns
-        self.signing = signing
         self._decoder = PacketDecoder()
         self._messages = MessageDecoder()
         self._next_sequence = 0
@@ -100,7 +102,7 @@ class Link:
         if isinstance(message, pb.Identify):
             self._next_sequence = self.sent_packets = self.sent_bytes = 0
             self._write(DELIMITER)  # ends a packet that an earlier host has left on the line
-        for data in encode_packets(message, self._next_sequence, self.signing):
+        for data in encode_packets(message, self._next_sequence):
             self._write(data)
             self.sent_bytes += len(data)
             self._next_sequence = (self._next_sequence + 1) & 0xFFFF
@@ -119,12 +121,10 @@ class Link:
         received = []
         self.counts.bytes_received += len(data)
         for packet in self._decoder.feed(data):
-            if why := refusal(packet, self.signing):
-                self.refusal, self.foreign_version = why, packet.version
+            if packet.version != PROTOCOL_VERSION:
+                self.foreign_version = packet.version
                 self.counts.bad_payload += 1
                 continue
-            if self.signing is not None:
-                packet = self.signing.take(packet)
             if _begins_identity(packet):  # the device counts anew: the packets before belong to another session
                 self._recent.clear()
                 self._last_sequence = None

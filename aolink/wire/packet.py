@@ -2,8 +2,7 @@
 
 A packet is COBS([version u8 | type u8 | sequence u16 | payload | CRC-32 u32]) 0x00, little-endian, the
 CRC zlib's over everything before it. CRC-32 finds every burst of up to 32 bits and all but 2^-32 of
-other damage. A message that does not fit goes in parts, each in a packet of its own. Version 1 has the
-message alone as its payload; in version 2 a signature follows it (`aolink.wire.signing`).
+other damage. A message that does not fit goes in parts, each in a packet of its own.
 """
 
 from __future__ import annotations
@@ -16,7 +15,6 @@ from dataclasses import dataclass
 from enum import IntEnum
 from functools import cache
 from importlib import resources
-from typing import Protocol
 
 from cobs import cobs
 from google.protobuf.message import DecodeError, Message
@@ -25,9 +23,11 @@ from aolink.wire import messages_pb2 as pb
 
 PROTOCOL_VERSION = 1
 SIGNED_VERSION = 2
-"""Protocol version of a packet whose payload ends with link, time stamp and signature."""
-TRAILER_BYTES = 13
-"""Bytes of link, time stamp and signature."""
+"""Protocol version of signed packets, which there were once."""
+NO_SIGNING = (
+    "packets are no longer signed, and a simulated rig serves its own machine only: use no key at either end, and let"
+    " other machines in through a tunnel, such as ssh -N -L 5000:127.0.0.1:5000 -L 5001:127.0.0.1:5001 USER@MACHINE"
+)
 MAX_PAYLOAD = 4608
 """The longest payload in bytes: 4 KiB of data and the fields around it."""
 MAX_CHUNK = 4096
@@ -37,7 +37,7 @@ MAX_MESSAGE = 262_144
 HEADER = struct.Struct("<BBH")
 _CRC = struct.Struct("<I")
 _MIN_DECODED = HEADER.size + _CRC.size
-_MAX_DECODED = _MIN_DECODED + MAX_PAYLOAD + TRAILER_BYTES
+_MAX_DECODED = _MIN_DECODED + MAX_PAYLOAD
 _MAX_ENCODED = _MAX_DECODED + _MAX_DECODED // 254 + 1
 DELIMITER = b"\0"
 
@@ -81,27 +81,16 @@ class Packet:
     payload: bytes
 
 
-def _most_payload(version: int) -> int:
-    return MAX_PAYLOAD + (TRAILER_BYTES if version == SIGNED_VERSION else 0)
-
-
 def encode_packet(packet: Packet) -> bytes:
     """The bytes of a packet, delimiter included. Raises ValueError if the payload is too long."""
-    if len(packet.payload) > (most := _most_payload(packet.version)):
-        raise ValueError(f"a payload of {len(packet.payload)} bytes does not fit into a packet, at most {most}")
+    if len(packet.payload) > MAX_PAYLOAD:
+        raise ValueError(f"a payload of {len(packet.payload)} bytes does not fit into a packet, at most {MAX_PAYLOAD}")
     body = HEADER.pack(packet.version, packet.type, packet.sequence) + packet.payload
     encoded: bytes = cobs.encode(body + _CRC.pack(zlib.crc32(body)))
     return encoded + DELIMITER
 
 
-class Signer(Protocol):
-    """Signs packets; see `aolink.wire.signing`."""
-
-    def sign(self, packet: Packet) -> Packet:
-        """The packet of version 2 with the content of a packet of version 1."""
-
-
-def encode_packets(message: Message, sequence: int, signer: Signer | None = None) -> list[bytes]:
+def encode_packets(message: Message, sequence: int) -> list[bytes]:
     """The packets that carry ``message``, whole or in parts, numbered from ``sequence`` on.
 
     Raises ValueError if it is longer than `MAX_MESSAGE`.
@@ -119,12 +108,12 @@ def encode_packets(message: Message, sequence: int, signer: Signer | None = None
     else:
         payloads = [payload]
     packets = [Packet(PROTOCOL_VERSION, type_, (sequence + k) & 0xFFFF, each) for k, each in enumerate(payloads)]
-    return [encode_packet(signer.sign(packet) if signer else packet) for packet in packets]
+    return list(map(encode_packet, packets))
 
 
-def encode_message(message: Message, sequence: int, signer: Signer | None = None) -> bytes:
+def encode_message(message: Message, sequence: int) -> bytes:
     """All bytes of `encode_packets`."""
-    return b"".join(encode_packets(message, sequence, signer))
+    return b"".join(encode_packets(message, sequence))
 
 
 class MessageDecoder:
@@ -200,7 +189,7 @@ class PacketDecoder:
             decoded = b"" if overlong else cobs.decode(piece)
         except cobs.DecodeError:
             decoded = b""
-        if len(decoded) < _MIN_DECODED or len(decoded) - _MIN_DECODED > _most_payload(decoded[0]):
+        if len(decoded) < _MIN_DECODED or len(decoded) > _MAX_DECODED:
             self.bad_framing += 1
             return None
         if zlib.crc32(decoded[: -_CRC.size]) != _CRC.unpack(decoded[-_CRC.size :])[0]:

@@ -1,4 +1,4 @@
-"""Ports: everything that pyserial opens, behind five methods. No other module uses pyserial."""
+"""Ports: device paths and plain addresses that pyserial opens, behind five methods. No other module uses pyserial."""
 
 from __future__ import annotations
 
@@ -6,18 +6,18 @@ import contextlib
 import errno
 import ipaddress
 import os
-import select
 import socket
 import stat
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Protocol
 from urllib.parse import urlsplit
 
 import serial
 
 from aolink.errors import PortError
+from aolink.polling import HasFileno, wait_readable
 
 BAUD_RATE = 921_600
 """The baud rate of ports that have one; USB and pseudo terminals ignore it."""
@@ -25,7 +25,7 @@ _WRITE_TIMEOUT_S = 5.0
 _STOPPED_TIMEOUT_S = 1.0
 """The write time-out once a stop is requested, s."""
 _SLICE_S = 0.1
-_SOCKET_READ = 65_536
+_MOST_READ = 65_536
 _REOPEN_S = 0.05
 """Time between two tries to open a port that has vanished, s."""
 
@@ -51,45 +51,57 @@ class Transport(Protocol):
 
 
 class SerialPort:
-    """A `Transport` over pyserial. Once ``stop()`` gives True, it does not wait for a device that takes nothing."""
+    """A `Transport` over pyserial, or over a socket. Once ``stop()`` gives True, it does not wait for a device that
+    takes nothing."""
 
     def __init__(self, url: str, baud_rate: int = BAUD_RATE, *, stop: Callable[[], bool] = lambda: False) -> None:
         self.url = url
         self._stop = stop
-        _check_address(url)
+        check_address(url)
+        self._port: serial.SerialBase | socket.socket
         try:
-            self._serial = serial.serial_for_url(
-                url, baudrate=baud_rate, timeout=0, write_timeout=_WRITE_TIMEOUT_S, exclusive=True
-            )
+            if url.lower().startswith("socket://"):
+                address = urlsplit(url)
+                self._port = socket.create_connection((address.hostname, address.port), timeout=_WRITE_TIMEOUT_S)
+                self._port.setblocking(False)
+            else:
+                self._port = serial.serial_for_url(
+                    url, baudrate=baud_rate, timeout=0, write_timeout=_WRITE_TIMEOUT_S, exclusive=True
+                )
         except Exception as error:  # pyserial raises errors of many kinds for an address that it cannot read
             raise _open_error(url, error) from None
         try:
-            self._serial.fileno()
-        except (OSError, AttributeError):
-            self._serial.close()
+            self._port.fileno()
+        except OSError:
+            self._port.close()
             raise PortError(
                 f"{url} is a port that cannot be waited on: use a device path or socket://host:port"
             ) from None
-        # in_waiting of a socket is only ever 0 or 1: read those with a size.
-        self._is_device = type(self._serial) is serial.Serial
-        if self._is_device:
+        if isinstance(self._port, serial.Serial):
             # Only some drivers know it; USB adapters otherwise hold bytes back for 16 ms.
             with contextlib.suppress(OSError, ValueError, NotImplementedError, AttributeError):
-                self._serial.set_low_latency_mode(True)
+                self._port.set_low_latency_mode(True)
 
     def read_some(self) -> bytes:
+        # pyserial's own read waits with ``select``, which takes no descriptor above 1,023.
         try:
-            size = max(1, self._serial.in_waiting) if self._is_device else _SOCKET_READ
-            data: bytes = self._serial.read(size)
-        except (OSError, TypeError) as error:  # TypeError: pyserial's port closed under it
+            descriptor = self._port.fileno()
+            if not wait_readable([descriptor], 0):
+                return b""
+            data = os.read(descriptor, _MOST_READ)
+        except BlockingIOError:
+            return b""
+        except (OSError, ValueError) as error:  # ValueError: it is closed
             raise self._lost(error) from None
+        if not data:
+            raise self._lost(OSError("the other end is gone"))
         return data
 
     def write(self, data: bytes) -> None:
         # pyserial's own write cannot be interrupted and does not say how much went out before a time-out.
         start = time.monotonic()
         try:
-            descriptor = self._serial.fileno()
+            descriptor = self._port.fileno()
             while data:
                 with contextlib.suppress(BlockingIOError):
                     data = data[os.write(descriptor, data) :]
@@ -97,31 +109,28 @@ class SerialPort:
                 waited_s = time.monotonic() - start
                 if waited_s > (_STOPPED_TIMEOUT_S if self._stop() else _WRITE_TIMEOUT_S):
                     raise PortError(f"{self.url} took no data for {waited_s:.0f} s; is the device running?")
-                select.select([], [descriptor], [], _SLICE_S)
-        except (OSError, TypeError, serial.SerialException) as error:
+                wait_readable([], _SLICE_S, [descriptor])
+        except (OSError, ValueError) as error:
             raise self._lost(error) from None
 
     def _lost(self, error: Exception) -> PortError:
-        other = "" if self._is_device else " Does it serve another host?"
+        other = " Does it serve another host?" if isinstance(self._port, socket.socket) else ""
         return PortError(f"lost {self.url}: {_plain(error)}; is the device still there?{other}")
 
     def unsent(self) -> int:
-        if not self._is_device:
+        if not isinstance(self._port, serial.Serial):
             return 0
         try:
-            return int(self._serial.out_waiting)
+            return int(self._port.out_waiting)
         except (OSError, TypeError):  # a driver that does not know; a port that is lost says so when it is read
             return 0
 
     def fileno(self) -> int:
-        return self._serial.fileno()
+        return self._port.fileno()
 
     def close(self) -> None:
-        socket = getattr(self._serial, "_socket", None)  # pyserial leaves it open where the other end has closed it
         with contextlib.suppress(OSError):
-            self._serial.close()
-        if socket is not None:
-            socket.close()
+            self._port.close()
 
 
 class Reopening:
@@ -159,12 +168,6 @@ class Reopening:
             return
 
 
-class HasFileno(Protocol):
-    """An object that the operating system can wait for."""
-
-    def fileno(self) -> int: ...
-
-
 class Served(HasFileno, Protocol):
     """An object beside the serial lines that a session serves while it waits."""
 
@@ -180,11 +183,6 @@ class Served(HasFileno, Protocol):
         """Send and receive as much as possible without waiting."""
 
 
-def wait_readable(some: Sequence[HasFileno], timeout_s: float, writable: Sequence[HasFileno] = ()) -> None:
-    """Wait until one of ``some`` can be read or one of ``writable`` can be written, or for ``timeout_s``."""
-    select.select(some, writable, [], max(0.0, timeout_s))
-
-
 def is_local(transport: Transport) -> bool:
     """Whether a program of this machine is at the other end: of a pseudo terminal, or of a socket on loopback."""
     mode = os.fstat(transport.fileno())
@@ -197,11 +195,14 @@ def is_local(transport: Transport) -> bool:
     return False
 
 
+_SCHEMES = ("socket", "rfc2217")
+"""The others of pyserial write files, search for devices, or import code."""
 _FORMS = "a port is a device path such as /dev/ttyACM0, or an address such as socket://192.168.1.5:5000"
 
 
-def _check_address(url: str) -> None:
-    """Raise PortError for a text that cannot be a port: an address without host or number, a folder, a file of data."""
+def check_address(url: str) -> None:
+    """Raise PortError for a text that cannot be a port: a folder, a file of data, an address of another kind, one
+    without host or number, or one with options, by which pyserial can be made to write files."""
     scheme, slashes, _ = url.partition("://")
     if not slashes:
         try:
@@ -212,16 +213,17 @@ def _check_address(url: str) -> None:
             what = "a folder" if stat.S_ISDIR(mode) else "a file, not a device"
             raise PortError(f"{url} is {what}: `aolink devices` lists the ports of this machine; {_FORMS}")
         return
-    if scheme not in ("socket", "rfc2217"):
-        return
+    if scheme.lower() not in _SCHEMES:
+        raise PortError(f"{url!r} is not a port that aolink opens: {_FORMS}")
     try:
         parts = urlsplit(url)
-        host, number = parts.hostname, parts.port
+        host, number, more = parts.hostname, parts.port, parts.path.strip("/") + parts.query + parts.fragment
     except ValueError:  # a number that is none, or above 65535
-        host, number = "", None
-    if not host or not number:
+        host, number, more = "", None, ""
+    if not host or not number or more:
         raise PortError(
-            f"{url} is not an address: expected {scheme}://HOST:PORT with a number from 1 to 65535; {_FORMS}"
+            f"{url!r} is not an address: expected {scheme.lower()}://HOST:PORT with a number from 1 to 65535 and"
+            f" nothing behind it; {_FORMS}"
         )
 
 
@@ -244,13 +246,10 @@ def _open_error(url: str, error: Exception) -> PortError:
         return PortError(f"no permission to open {url}: on Debian, add yourself to the group dialout and log in again")
     if number == errno.ECONNREFUSED or "refused" in str(error):
         return PortError(f"nothing listens at {url}: start the device or its server first")
-    if "://" in url and number is None:
-        return PortError(f"{url} is not an address that pyserial can open ({_plain(error)}); {_FORMS}")
     return PortError(f"cannot open {url}: {_plain(error)}")
 
 
 def _plain(error: Exception) -> str:
     if isinstance(error, OSError) and error.errno:
         return os.strerror(error.errno).lower()
-    text = str(error)
-    return "the other end is gone" if "returned no data" in text or isinstance(error, TypeError) else text
+    return "it is closed" if isinstance(error, ValueError | serial.PortNotOpenError) else str(error)

@@ -12,6 +12,7 @@ import pytest
 
 from aolink.batch import Settings, estimate_file
 from aolink.errors import ExportError, RecordingError
+from aolink.extensions import install_command
 from aolink.recording.reader import Recording
 from tests.recording.small import write_small
 
@@ -35,7 +36,7 @@ def test_a_package_that_is_missing_is_named_with_its_extra(
     done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, timeout=60)
     (line,) = done.stderr.splitlines()
     assert done.returncode == ExportError.exit_code
-    assert line.endswith(f"needs {module}: pip install 'aolink[{extra}]'")
+    assert line.endswith(f"needs {module}: {install_command(extra)}")
     assert not list(tmp_path.iterdir())
 
 

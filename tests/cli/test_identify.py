@@ -5,10 +5,10 @@ from pathlib import Path
 
 import pytest
 
-from aolink.jobs.demo import simulated_rig
 from aolink.rig import load_rig
 from aolink.rig.disturbance import Disturbance, DisturbanceModel
 from aolink.session import record
+from tests.commands import simulated_rig
 from tests.kinds import must_be
 
 REFERENCE = Path(__file__).parents[2] / "recordings"

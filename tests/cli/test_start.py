@@ -31,6 +31,7 @@ def test_help_and_the_package_itself_load_nothing_heavy(tmp_path: Path) -> None:
     assert loaded_by("import aolink", tmp_path) == set()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("part", [("--exposure", "3"), ("--start", "0", "--end", "5")])
 def test_looking_at_a_recording_that_holds_its_estimates_loads_rerun_and_no_estimator(
     tmp_path: Path, part: tuple[str, ...]

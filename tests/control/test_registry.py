@@ -11,14 +11,14 @@ from pathlib import Path
 import pytest
 
 from aolink.errors import ControlError
-from aolink.jobs.demo import simulated_rig
 from aolink.recording.reader import Recording
+from tests.commands import simulated_rig
 from tests.control.rigs import DRIFT, small_rig
 
 Run = Callable[..., "subprocess.CompletedProcess[str]"]
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_an_installed_package_adds_a_controller(aolink: Run, with_example: dict[str, str], tmp_path: Path) -> None:
     path = tmp_path / "rig.toml"
     path.write_text(small_rig(DRIFT).toml)
@@ -77,7 +77,6 @@ def test_the_commands_say_what_they_need(aolink: Run, tmp_path: Path) -> None:
     (tmp_path / "rig.toml").write_text(small_rig(control="gain = 4.0").toml)
     ports = ("--camera", "/dev/none", "--mirror", "/dev/none", "--rig", "rig.toml", "-o", "a.mcap")
     for arguments, why in (
-        (("--control", "lqg"), "the controller lqg needs an estimator's state: give one, such as moments"),
         (("--control", "pid"), "there is no controller 'pid': use one of integrator, lqg"),
         (("--control", "integrator"), "is unstable: by the model"),
         (("--control", "integrator", "--calibration", "still"), "a controller gives the inputs itself"),

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from aolink.errors import ControlError
-from aolink.jobs.demo import simulated_rig
 from aolink.recording.reader import Recording
 from aolink.rig import load_rig
 from aolink.session import record
+from tests.commands import simulated_rig
 from tests.control.unfit import EXPOSURES, installed
 
 Run = Callable[..., "subprocess.CompletedProcess[str]"]
@@ -50,6 +50,7 @@ def one_line(done: subprocess.CompletedProcess[str]) -> str:
     return line
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "message", "force"), [(*each, ()) for each in UNFIT] + [(*each, ("--force",)) for each in UNFIT[:3]]
 )
@@ -63,6 +64,7 @@ def test_a_session_with_it_ends_before_a_port_is_opened(
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "message"), UNFIT[:3])
 def test_a_replay_with_it_is_one_line(
     aolink: Run, with_unfit: dict[str, str], session: Path, name: str, message: str
@@ -72,13 +74,14 @@ def test_a_replay_with_it_is_one_line(
     assert "parked" not in line
 
 
+@pytest.mark.slow
 def test_inputs_that_grow_beyond_numbers_are_an_unstable_loop(aolink: Run, with_unfit: dict[str, str]) -> None:
     ports = ("--camera", "/dev/none", "--mirror", "/dev/none", "--rig", "loop", "-o", "a.mcap")
     line = one_line(aolink("record", *ports, "--control", "huge", env=with_unfit))
     assert "the loop of huge on loop is unstable: by the model a disturbance is inf times as large" in line
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_one_that_fails_in_a_session_parks_the_mirror_and_says_so(
     aolink: Run, with_unfit: dict[str, str], session: Path, tmp_path: Path
 ) -> None:

@@ -65,7 +65,7 @@ def errors(exposures: list[Exposure], estimates: list[Estimate], truth: Truth, l
     return float(np.sqrt(np.mean(np.square(relative))))
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_session_is_aligned_by_the_clocks_recorded_estimated_and_replayed(tmp_path: Path) -> None:
     with mixed_bench(tmp_path, rig_with()) as mixed:
         rig = both(mixed)
@@ -97,7 +97,7 @@ def test_a_session_is_aligned_by_the_clocks_recorded_estimated_and_replayed(tmp_
         assert np.array_equal(again.path, found.path)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("faults", "what"),
     [

@@ -26,7 +26,7 @@ MIRRORS_OF = {
 }
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("number", SIGNALS, ids=lambda number: number.name)
 def test_a_mirror_is_left_at_its_safe_input(
     start_aolink: Callable[..., subprocess.Popen[str]], tmp_path: Path, number: signal.Signals

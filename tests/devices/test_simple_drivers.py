@@ -327,6 +327,15 @@ def test_a_frame_that_comes_as_the_camera_stops_is_given_once(camera: AdaptedCam
     assert [event.frame_id for event in camera.poll() if isinstance(event, Frame)] == [1]
 
 
+def test_no_more_frames_are_given_than_were_asked_for(camera: AdaptedCamera, bench: CameraBench) -> None:
+    """A camera that runs until it is stopped takes more where the host is held up."""
+    first_step = (bench.host_ns - EPOCH_NS) // STEP_NS + 1
+    assert camera.start(first_step, 2)
+    bench.host_ns += 10**10
+    bench.taken = [frame(first_step * STEP_NS + k * PERIOD_NS) for k in range(-1, 3)]
+    assert [event.frame_id for event in camera.poll() if isinstance(event, Frame)] == [1, 2]
+
+
 def test_a_step_that_has_gone_by_is_too_late_to_start_at(camera: AdaptedCamera) -> None:
     assert not camera.start(200, 0)
 

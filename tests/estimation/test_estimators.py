@@ -127,6 +127,7 @@ def test_the_truth_changes_nothing_and_a_pixel_does(rig, estimates, exposures):
 # What the paper's plant gives (estimation.md's table, whose runs are others; errors of the mean some 5 %)
 
 
+@pytest.mark.slow
 def test_looking_helps_on_the_lively_plant(rig):
     series = simulate(rig, 600, seed=5, inputs=np.zeros((120_000, 1)))
     scores = {n: score(series, e, skip=10) for n, e in run(rig, series, ["open-loop", "o1", "o3"]).items()}
@@ -141,6 +142,7 @@ def test_off_centre_the_second_moment_reads_the_position_again(rig, exposures, e
     assert o3.path_rmse < 0.95 * o1.path_rmse
 
 
+@pytest.mark.slow
 def test_looking_adds_nothing_at_the_printed_noise():
     rig = load_rig("section-vi")
     series = simulate(rig, 120, seed=4)
@@ -339,7 +341,7 @@ def test_drivers_keep_the_order_of_their_names(rig, exposures):
     assert [e.estimator for e in driver.step(exposures[0])] == ["o3", "open-loop"]
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("flux", ["known", "measured"])
 @pytest.mark.parametrize("name", ["section-vi-lively", "sh-4x4"])
 def test_it_does_not_matter_how_many_exposures_are_handed_over_at_once(name, flux):

@@ -28,7 +28,7 @@ def ensemble(rig, n_steps, exposures, seed):
     return np.sqrt(np.mean(np.square(path[20:]))), np.sqrt(np.mean(np.square(end[20:])))
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "n_steps", "dead"), [
     ("section-vi-lively", 50, 0), ("section-vi-lively", 400, 30), ("single-lenslet", 200, 0), ("jitter", 30, 0),
 ])  # fmt: skip

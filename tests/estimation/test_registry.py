@@ -12,9 +12,10 @@ from aolink.colours import by_rank, estimator_colour
 from aolink.errors import EstimatorError
 from aolink.estimation import ESTIMATOR_NAMES, estimator_rows, make_estimator
 from aolink.estimation.options import with_options
-from aolink.jobs.demo import possible_estimators, simulated_rig
+from aolink.jobs.demo import usual_estimators
 from aolink.rig import load_rig
 from aolink.simulation.model import simulate
+from tests.commands import simulated_rig
 
 
 def test_names_come_by_rank():
@@ -71,7 +72,7 @@ def test_an_option_that_makes_no_sense_is_named(text, message):
         make_estimator(load_rig("section-vi-lively"), text)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_options_of_a_session_go_with_the_recording(aolink, tmp_path):
     """Beside the loop in real time; and all that reads the recording has the same estimator."""
     names = ("-e", "o3:second_order", "-e", "o3")
@@ -89,12 +90,14 @@ def test_options_of_a_session_go_with_the_recording(aolink, tmp_path):
         assert made.returncode == 0, made.stderr
 
 
-def test_the_demo_runs_what_is_fast_on_the_rig():
-    assert possible_estimators(load_rig("section-vi")) == tuple(n for n in ESTIMATOR_NAMES if n != "sampled")
-    assert possible_estimators(load_rig("tip-tilt")) == ("open-loop", "o1", "o2", "o3", "moments")
+def test_the_demo_runs_what_works_on_the_rig():
+    rig = load_rig("moving-scene")
+    assert usual_estimators(rig) == ["open-loop", "o1", "moments"]
+    assert usual_estimators(rig, "lqg") == ["moments", "o1", "open-loop"]
+    assert usual_estimators(load_rig("sh-30x30")) == ["open-loop", "o1"]
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_an_installed_package_adds_an_estimator(aolink, with_example, tmp_path):
     """In a session, when it is estimated again, in the list of all, and in the viewer's palette."""
     with simulated_rig("section-vi-lively") as (camera, mirror):
@@ -124,7 +127,7 @@ def test_an_installed_package_adds_an_estimator(aolink, with_example, tmp_path):
     assert "there is no estimator 'threshold'" in alone.stderr
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("value", "why"),
     [

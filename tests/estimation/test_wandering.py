@@ -120,6 +120,7 @@ def test_frames_that_cannot_be_used_leave_the_frequency_as_uncertain_as_it_was(o
     assert np.isfinite(after.path_sd).all()
 
 
+@pytest.mark.slow
 def test_pixels_find_it_as_well():
     rig = dataclasses.replace(
         JITTER, plant=dataclasses.replace(
@@ -138,6 +139,7 @@ def test_pixels_find_it_as_well():
     assert judged(exposures[10:], estimates[10:])[1] > 0.88
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("parameter", "truth", "name", "drive", "within"),
     [

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import math
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ import aolink
 from aolink.errors import ExportError
 from aolink.exporting.arrays import arrays
 from aolink.exporting.files import WRITERS, export
+from aolink.files import write_csv
 from aolink.notebook import NotebookRecording
 from aolink.recording import topics
 from aolink.recording.editing import RecordingCopy
@@ -23,6 +25,7 @@ from aolink.recording.schemas_pb2 import ExposureInfo
 from aolink.rig import load_rig, parse_rig
 from aolink.series import Series
 from aolink.wire.messages_pb2 import Truth
+from tests.exporting.conftest import RECORDINGS
 from tests.needs import needed
 from tests.recording.small import write_small
 
@@ -69,6 +72,25 @@ def test_python_reads_the_table(series: Series, tmp_path: Path) -> None:
             assert float(row["truth_start_x1"]) == exposure.truth.start_state[axis, 0]  # type: ignore[union-attr]
             assert row["recording"] == series.path.name
     assert not [name for name in table[0] if name.startswith("o1_")]
+
+
+def test_a_spreadsheet_runs_nothing_of_a_table(tmp_path: Path) -> None:
+    """The file's name, the rig's and the estimators' are other people's texts; numbers stay numbers."""
+    shutil.copy(RECORDINGS / "section-vi.mcap", path := tmp_path / "=1+1.mcap")
+    series = aolink.read(path)
+    export(series, tmp_path / "out.csv", ["o3"])
+    with (tmp_path / "out.csv").open(newline="") as file:
+        table = list(csv.DictReader(file))
+    assert {row["recording"] for row in table} == {"'=1+1.mcap"}
+    assert any(float(row["truth_end_x2"]) < 0 for row in table)
+    names = ["=a", "@b", "+c", "-d", "\t=e", "\uff1df", "g=1", "'h"]
+    with (tmp_path / "all.csv").open("w+", newline="") as file:
+        write_csv(file, names, [dict.fromkeys(names, -1.5), {"g=1": "-2+3"}])
+        file.seek(0)
+        head, numbers, texts = csv.reader(file)
+    assert head == ["'=a", "'@b", "'+c", "'-d", "'\t=e", "'\uff1df", "g=1", "'h"]
+    assert numbers == ["-1.5"] * len(names)
+    assert texts == ["", "", "", "", "", "", "'-2+3", ""]
 
 
 def test_pandas_reads_the_same_of_csv_and_parquet_as_a_notebook_has(series: NotebookRecording, tmp_path: Path) -> None:
@@ -145,7 +167,7 @@ def test_frames_of_other_sizes_go_into_a_table_only(tmp_path: Path, recording_wi
         assert [row["n_steps"] for row in csv.DictReader(file)] == ["200", "200", "100"]
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_what_would_fill_the_memory_is_refused_before_it_is_read(tmp_path: Path) -> None:
     """A recording of 20,000 frames of 900 spots, as far as the check sees it: its pictures have one pixel each."""
     large = tmp_path / "large.mcap"

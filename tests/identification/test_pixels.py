@@ -58,7 +58,7 @@ def cycles_of(found):
     return [pytest.approx(math.exp(each.x[2]) * EXPOSURE_S) for each in found]
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("cycles", [1.51, 2.4])
 def test_the_pixels_decide_whatever_the_likelihood_of_centroid_and_width_says(cycles):
     """One of the two aliases is a cycle below, and one as far from a whole or half number of cycles, on the other
@@ -72,7 +72,7 @@ def test_the_pixels_decide_whatever_the_likelihood_of_centroid_and_width_says(cy
 
 def test_without_evidence_the_order_stays():
     def refused(x):
-        raise EstimatorError("profile follows the posterior's modes for at most 24 states")
+        raise EstimatorError("profile takes at most 24 states")
 
     found = [candidate(2.6, 0.0), candidate(2.4, -1.0)]
     assert by_pixels(found, shaken, []) == found
@@ -82,7 +82,7 @@ def test_without_evidence_the_order_stays():
     np.testing.assert_array_equal(refined(of, found[0].x, refused, []), found[0].x)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_scan_finds_a_vibration_far_from_every_maximum():
     """The maximum that it is given is at another frequency, and its vibration never changes."""
     exposures = frames(2.4, 64)
@@ -107,7 +107,7 @@ def test_a_scan_finds_a_vibration_far_from_every_maximum():
 
 def test_nothing_is_scanned_where_one_vibration_is_alone_or_there_are_no_pixels():
     def refused(x):
-        raise EstimatorError("profile follows the posterior's modes for at most 24 states")
+        raise EstimatorError("profile takes at most 24 states")
 
     def unasked(x):
         raise AssertionError("no rig is wanted")
@@ -141,7 +141,7 @@ def test_a_maximum_whose_vibration_lasts_for_longer_than_the_recording_is_tried_
         np.testing.assert_array_equal(np.delete(each.x, 3), np.delete(at.x, 3))
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_frequency_and_damping_move_to_where_the_pixels_see_them():
     exposures = frames(2.4, 48)
     of, _ = space(exposures)

@@ -12,13 +12,15 @@ from aolink.identification.likelihood import Likelihood
 from aolink.identification.search import climb
 from aolink.jobs.closed_loop import closed_loop
 from aolink.rig import load_rig
+from tests.needs import needed
 
+needed("pyrtc")
 sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
-from bench_rows.identification import DisturbanceChange, changed
-from bench_rows.loop_worth import Cell
+from bench_rows.identification import DisturbanceChange, changed  # noqa: E402 # where that is installed
+from bench_rows.loop_worth import Cell  # noqa: E402
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_sharp_vibration_beside_a_drift_is_found_although_only_an_alias_is_found_at_first():
     """The vibration is at 14.4 Hz; the best that the grid and its aliases lead to is at 34.4 Hz, 20 nats below."""
     rig = load_rig("loop")
@@ -31,7 +33,7 @@ def test_a_sharp_vibration_beside_a_drift_is_found_although_only_an_alias_is_fou
     assert found == sorted(found, key=lambda each: -each.log_likelihood)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("cycles", "seed"), [(2.4, 703), (2.7, 705)], ids=["between the points of the grid", "an alias of the second best"]
 )

@@ -23,10 +23,10 @@ from aolink.identification import (
 )
 from aolink.identification.models import SensorFit
 from aolink.identification.simulate import simulated
-from aolink.jobs.demo import simulated_rig
 from aolink.recording.reader import Recording
 from aolink.session import record
 from aolink.session.excitation import excitation
+from tests.commands import simulated_rig
 
 
 def space(kinds, seen, rig, **more):
@@ -39,7 +39,7 @@ def shaken():
     return exposures.rig, [readings(exposures.rig, list(exposures))]
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_sets_hold_the_truth_and_the_aliases_that_remain(shaken):
     """The spot swings at 12 Hz; to centroids at 5 Hz, 2, 3, 7, 8 and 13 Hz look the same."""
     rig, seen = shaken
@@ -51,14 +51,14 @@ def test_the_sets_hold_the_truth_and_the_aliases_that_remain(shaken):
     assert sets["sd"].holds(0.2)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_resonance_is_chosen_where_there_is_one(shaken):
     rig, seen = shaken
     names = ("random-walk", "ornstein-uhlenbeck", "resonance")
     assert chosen([tried(name, lambda kinds: space(kinds, seen, rig), seen) for name in names]).name == "resonance"
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_sets_hold_a_noise_and_a_kernel_that_differ_from_the_rig_files(shaken):
     """The kernel is wider, and changes from exposure to exposure: noise of the blur's extent, not of the centroid."""
     _, (like,) = shaken
@@ -112,7 +112,7 @@ period_s = 1.5
 """
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_plant_that_is_driven_is_identified():
     rig = aolink.rig.parse_rig(SLOW)
     seen = [readings(rig, list(aolink.simulate(rig, 48, seed=2)), plant_known=False)]
@@ -123,7 +123,7 @@ def test_a_plant_that_is_driven_is_identified():
     assert best["sd"] == pytest.approx(np.sqrt(1e-6 / (1 - 0.995**2)), rel=0.5)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_plant_is_identified_from_a_session_that_plays_a_pseudo_random_sequence(tmp_path):
     (tmp_path / "slow.toml").write_text(SLOW)
     rig, path = aolink.load_rig(tmp_path / "slow.toml"), tmp_path / "a.mcap"

@@ -78,6 +78,7 @@ def spots(rig: Rig, change: float, seed: int = 3) -> tuple[Exposures, np.ndarray
     return simulated, np.rint(black + (frames - black) * light[:, None, None]).astype(np.uint16)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "estimator"), [("sh-4x4", "moments"), ("section-vi-lively", "o1")])
 @pytest.mark.parametrize(("change", "said"), [(-0.4, "fades by (3[6-9]|4[0-4])%"), (0.5, "grows by (4[2-9]|5[0-8])%")])
 def test_a_film_of_the_rigs_own_camera_that_fades_is_scaled_to_its_light(
@@ -101,6 +102,7 @@ def test_a_film_of_the_rigs_own_camera_that_fades_is_scaled_to_its_light(
     assert errors[2] > 1.1 * errors[1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["sh-4x4", "section-vi-lively", "single-lenslet", "jitter"])
 @pytest.mark.parametrize("seed", range(3))
 def test_a_film_whose_light_is_constant_is_left_as_it_is(tmp_path: Path, name: str, seed: int) -> None:
@@ -117,6 +119,7 @@ def test_a_film_whose_light_is_constant_is_left_as_it_is(tmp_path: Path, name: s
             assert (each.pixels == frame)[each.mask].all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("slope", [0.0, 3.0])
 def test_the_ground_does_not_hide_that_light_fades(slope: float) -> None:
     """A ground of the same light under the tracker's weight as an object's, or one that is brighter to one side."""
@@ -132,7 +135,7 @@ def test_the_ground_does_not_hide_that_light_fades(slope: float) -> None:
     assert (known.beside < 1 / 3).all()
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("background", [True, False])
 def test_exposures_of_a_film_that_fades_are_scaled_to_the_same_light(background: bool, tmp_path: Path) -> None:
     """By 30 %: exposures have the light and the errors of those of the same film that does not fade."""

@@ -34,6 +34,7 @@ def test_a_film_of_every_kind_becomes_a_recording(kind, aolink, rig, tmp_path):
     np.testing.assert_array_equal(pixels, FRAMES.astype(int) * 256)
 
 
+@pytest.mark.slow
 def test_the_recording_is_one_like_any_other(aolink, rig, tmp_path):
     source = others.written_npy(tmp_path, FRAMES)
     start = ["--start", "2026-09-21T10:30:00.25"]
@@ -178,6 +179,7 @@ def test_bad_input_gets_one_line_and_leaves_nothing(source, options, code, says,
     assert not list(tmp_path.rglob("*.mcap")) + list(tmp_path.rglob("*.partial"))
 
 
+@pytest.mark.slow
 def test_a_first_rig_file_has_the_films_name_where_none_is_given(aolink, tmp_path):
     at = np.stack([np.full(60, 20.0), 20 + np.cumsum(np.random.default_rng(3).normal(0, 0.4, 60))], axis=1)
     along_x, along_y = np.exp(-(((np.arange(40) - at[..., None]) / 1.6) ** 2) / 2).swapaxes(0, 1)

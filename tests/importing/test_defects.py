@@ -110,6 +110,7 @@ def test_a_hot_pixel_of_a_film_that_nothing_is_followed_in(tmp_path):
     assert np.abs(paths[1] - paths[0]).max() < 0.02
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("frames", [8, 9])
 def test_a_film_too_short_to_find_hot_pixels_says_so(frames):
     film = array_film(
@@ -119,6 +120,7 @@ def test_a_film_too_short_to_find_hot_pixels_says_so(frames):
     assert ("8 frames are too few to find hot and dead pixels: 9 are needed" in notes) == (frames == 8)
 
 
+@pytest.mark.slow
 def test_a_hot_pixel_is_masked_in_a_window_that_moves_over_it(tmp_path):
     """The window follows an object that goes by it; the places are as in the same film without hot pixels."""
     rng = np.random.default_rng(14)

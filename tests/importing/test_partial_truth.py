@@ -57,6 +57,7 @@ def exposures(recorded: tuple[Rig, Path]) -> list[Exposure]:
     return list(aolink.read(recorded[1]).exposures())
 
 
+@pytest.mark.slow
 def test_the_truth_of_an_object_does_not_need_the_other_one(exposures: list[Exposure]) -> None:
     for k, exposure in enumerate(exposures):
         gone = (k + 1) * K > GONE

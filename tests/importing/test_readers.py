@@ -494,7 +494,7 @@ def test_a_file_without_pictures_says_what_it_has(tmp_path):
     assert "no pictures that can be read on any topic: it has /said (std_msgs/String" in refused(path)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_our_own_recording_is_an_mcap_film(recorded):
     film = open_film(recorded.path, topics.IMAGE)
     exposures = list(Recording(recorded.path).exposures())
@@ -631,6 +631,7 @@ def two_sensors(tmp_path):
     return tmp_path / "a.fits", frames
 
 
+@pytest.mark.slow
 def test_of_two_wavefront_sensors_one_is_chosen(two_sensors):
     path, (low, high) = two_sensors
     first = open_film(path)

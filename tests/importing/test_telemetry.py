@@ -121,7 +121,7 @@ def test_slopes_that_are_not_the_rigs_are_refused(
         imported(path, load_rig(rig), rate_hz=5, **settings)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_slopes_go_through_every_command_and_back_to_aot(aolink, tmp_path):
     rig = tmp_path / "my.toml"
     rig.write_text(small_rig(20, 20).toml)

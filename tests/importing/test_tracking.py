@@ -45,7 +45,7 @@ SETTINGS = FilmSettings(
 )
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_objects_are_found_and_followed_to_a_tenth_of_a_pixel(walkers: SpotFilm) -> None:
     film = array_film(walkers.frames, "walkers")
     objects = find_objects(film, SETTINGS)
@@ -55,7 +55,7 @@ def test_objects_are_found_and_followed_to_a_tenth_of_a_pixel(walkers: SpotFilm)
     assert known.sd == pytest.approx(1.8, rel=0.05)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_light_beside_an_object_is_said_with_its_frames(tmp_path: Path) -> None:
     """A second object sticks to the first one in the second half of the film; a fainter one is no matter."""
     rng = np.random.default_rng(6)
@@ -89,10 +89,10 @@ def passing(frames: int, least: float) -> np.ndarray:
     return walk
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_objects_beside_each_other_are_measured_apart(seed: int) -> None:
+@pytest.mark.slow
+def test_objects_beside_each_other_are_measured_apart() -> None:
     """Down to three standard deviations, where a centroid of one moves with the light of the other."""
-    film = spot_film(np.random.default_rng(seed), passing(160, 4.0), MIDDLES)
+    film = spot_film(np.random.default_rng(0), passing(160, 4.0), MIDDLES)
     source = array_film(film.frames, "film")
     known = survey(source, SETTINGS, find_objects(source, SETTINGS))
     assert np.linalg.norm(film.places[:, 0] - film.places[:, 1], axis=1).min() < 4 * 1.8
@@ -101,7 +101,7 @@ def test_objects_beside_each_other_are_measured_apart(seed: int) -> None:
     assert np.sqrt(np.mean((known.places - film.places) ** 2)) < 0.1
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_objects_that_meet_are_left_out_until_they_part(tmp_path: Path) -> None:
     rng = np.random.default_rng(4)
     film = spot_film(rng, passing(320, 0.0), MIDDLES)
@@ -134,6 +134,7 @@ def test_objects_that_meet_are_left_out_until_they_part(tmp_path: Path) -> None:
     assert np.mean(inside) > 0.85
 
 
+@pytest.mark.slow
 def test_objects_that_stay_together_on_a_long_way_are_found_again() -> None:
     """They go together for forty of their standard deviations, a third of the film."""
     rng = np.random.default_rng(4)
@@ -165,6 +166,7 @@ def test_an_object_that_moves_by_more_than_its_width_is_followed() -> None:
     assert np.abs(places - film.places).max() < 0.3
 
 
+@pytest.mark.slow
 def test_an_object_that_passes_a_faded_one_is_followed_on() -> None:
     """The track of an object that has faded ends on the light of the other one: only the other one is seen."""
     rng = np.random.default_rng(4)
@@ -180,7 +182,7 @@ def test_an_object_that_passes_a_faded_one_is_followed_on() -> None:
     assert np.sqrt(np.mean((known.places[:, 0] - film.places[:, 0]) ** 2)) < 0.1
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_an_object_that_leaves_is_said_and_its_window_left_out(walkers: SpotFilm, tmp_path: Path) -> None:
     rng = np.random.default_rng(2)
     frames = walkers.frames.copy()
@@ -196,13 +198,7 @@ def test_an_object_that_leaves_is_said_and_its_window_left_out(walkers: SpotFilm
     assert all(each.mask[:, columns:].any() == (k < 20) for k, each in enumerate(exposures))
 
 
-def test_a_scale_is_said_not_to_be_used(walkers: SpotFilm, tmp_path: Path) -> None:
-    source = array_film(walkers.frames[:80], "film")
-    rig = parse_rig(first_rig(source, SETTINGS, "film").text)
-    account = import_film(source, rig, replace(SETTINGS, scale=2.0), tmp_path / "a.mcap")
-    assert "--scale is not used" in account.notes[-1]
-
-
+@pytest.mark.slow
 def test_a_drift_of_all_objects_is_said() -> None:
     rng = np.random.default_rng(2)
     motion = random_walk(rng, 160, 2, 0.1)
@@ -212,6 +208,7 @@ def test_a_drift_of_all_objects_is_said() -> None:
     assert "by 0.0" in note
 
 
+@pytest.mark.slow
 def test_pixels_beyond_the_picture_are_no_darkness(tmp_path: Path) -> None:
     """An object at the edge: its window hangs over, and what is there is unknown, not dark."""
     rng = np.random.default_rng(2)
@@ -230,6 +227,7 @@ def test_pixels_beyond_the_picture_are_no_darkness(tmp_path: Path) -> None:
     assert np.mean((np.abs(errors) < 1.96 * spread)[known]) > 0.9
 
 
+@pytest.mark.slow
 def test_a_bright_object_keeps_its_light() -> None:
     """What an exposure lacks of it, taken as light of others, is less than twice the noise of its light."""
     rng = np.random.default_rng(6)
@@ -258,6 +256,7 @@ def leaving() -> tuple[NDArray[np.uint16], FloatArray]:
     return film.frames[:, :, :80], film.places
 
 
+@pytest.mark.slow
 def test_an_object_that_goes_out_of_the_picture_is_not_seen_at_its_edge() -> None:
     """Light beyond the edge is missing, and a centroid of the rest is off."""
     frames, places = leaving()
@@ -271,7 +270,7 @@ def test_an_object_that_goes_out_of_the_picture_is_not_seen_at_its_edge() -> Non
     assert np.nanmax(errors[:, 0]) < 0.25
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_saturated_pixels_do_not_widen_the_kernel(walkers: SpotFilm) -> None:
     flat = np.minimum(walkers.frames, np.uint16(1700))
     full = np.where(flat == 1700, np.uint16(65535), flat)
@@ -285,6 +284,7 @@ def test_saturated_pixels_do_not_widen_the_kernel(walkers: SpotFilm) -> None:
     assert not first_rig(array_film(walkers.frames, "film"), SETTINGS, "film").notes
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 def test_a_motion_that_is_none_of_them_is_said(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -329,6 +329,7 @@ def test_a_vibration_is_fitted_as_its_means_over_frames(period: float, lasts: fl
     assert found == pytest.approx(later, rel=1e-5, abs=1e-6)
 
 
+@pytest.mark.slow
 def test_a_drift_is_found_beside_a_walk_and_a_bound_motion() -> None:
     rng = np.random.default_rng(8)
     walk = random_walk(rng, 400, 3, 0.3).mean(axis=1).reshape(400, 6)
@@ -395,6 +396,7 @@ def test_the_path_in_an_exposure_has_the_covariances_of_means_over_frames(forget
     assert next_ == pytest.approx(((1 - a) / rate) ** 2, abs=0.02)
 
 
+@pytest.mark.slow
 def test_a_lost_frame_is_no_step_of_the_motion() -> None:
     """Every fifth frame of a vibration is lost: the other frames are fitted with their own times."""
     rng = np.random.default_rng(14)
@@ -420,14 +422,9 @@ def short_memory(rng: np.random.Generator) -> np.ndarray:
     return 0.8 * moments.reshape(160, 8, 2, 2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
-    "motion",
-    [
-        lambda rng: random_walk(rng, 160, 2, 0.45),
-        short_memory,
-        lambda rng: resonance(rng, 160, 2, 1.5, 5.3),
-        lambda rng: resonance(rng, 160, 2, 1.5, 3.7),
-    ],
+    "motion", [lambda rng: random_walk(rng, 160, 2, 0.45), short_memory, lambda rng: resonance(rng, 160, 2, 1.5, 3.7)]
 )
 def test_the_error_of_the_truth_is_as_large_as_said(motion: Callable[[np.random.Generator], np.ndarray]) -> None:
     """Whatever the motion: it is that of finding an object in its noise, and larger of one that is fainter."""
@@ -444,7 +441,7 @@ def test_the_error_of_the_truth_is_as_large_as_said(motion: Callable[[np.random.
     assert known.place_sd[0] > known.place_sd[1]
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_path_of_walkers_is_found_and_its_intervals_hold(walkers: SpotFilm, tmp_path: Path) -> None:
     rig, recording = imported_film(walkers, tmp_path / "walkers.mcap")
     exposures = list(recording.exposures())
@@ -469,7 +466,7 @@ def test_the_path_of_walkers_is_found_and_its_intervals_hold(walkers: SpotFilm, 
     assert 0.9 < np.mean(np.abs(errors) < 1.96 * spread) < 0.98
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_resonance_inside_the_exposure_is_found(tmp_path: Path) -> None:
     """The first rig file has the resonance: half of what the path's own mean leaves, or less."""
     rng = np.random.default_rng(11)
@@ -488,15 +485,19 @@ def test_a_resonance_inside_the_exposure_is_found(tmp_path: Path) -> None:
     assert 0.88 < np.mean(np.abs(errors) < 1.96 * spread) < 0.99
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_rig_whose_inputs_do_not_shift_its_spots_keeps_its_windows(walkers: SpotFilm, tmp_path: Path) -> None:
+    """And a scale is said not to be used."""
     text = first_rig(array_film(walkers.frames, "film"), SETTINGS, "film").text.replace("\nB = [[1.0]", "\nB = [[0.0]")
     rig = parse_rig(text)
-    import_film(array_film(walkers.frames, "film"), rig, SETTINGS, tmp_path / "a.mcap")
+    settings = replace(SETTINGS, scale=2.0)
+    account = import_film(array_film(walkers.frames, "film"), rig, settings, tmp_path / "a.mcap")
+    assert "--scale is not used" in account.notes[-1]
     assert not any(each.inputs.any() for each in Recording(tmp_path / "a.mcap").exposures())
 
 
-@pytest.mark.parametrize(("length", "turns", "said"), [(1.0, 0.0, 0), (1.5, 0.0, 2), (1.5, 0.05, 2)])
+@pytest.mark.slow
+@pytest.mark.parametrize(("length", "turns", "said"), [(1.0, 0.0, 0), (1.5, 0.05, 2)])
 def test_an_object_that_is_longer_than_wide_is_said(length: float, turns: float, said: int) -> None:
     """Gaussians 1.5 times as long as wide, as sums of round ones along a line; some of them turn."""
     rng = np.random.default_rng(9)

@@ -155,6 +155,7 @@ def several(recorded: Session, folder: Path) -> list[batch.Job]:
     return batch.jobs([recorded.path], models, ["o1"], folder)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("workers", [1, 2])
 def test_stopped_no_job_is_begun_and_those_on_the_way_count(recorded: Session, tmp_path: Path, workers: int) -> None:
     todo, done = several(recorded, tmp_path), list[batch.Done]()
@@ -176,6 +177,7 @@ def runs(pid: int) -> bool:
         return False
 
 
+@pytest.mark.slow
 def test_stopped_twice_the_processes_end_at_once_and_leave_nothing_half(recorded: Session, tmp_path: Path) -> None:
     """The second Ctrl-C is raised where the pool is waited for."""
 
@@ -190,6 +192,7 @@ def test_stopped_twice_the_processes_end_at_once_and_leave_nothing_half(recorded
     assert not [*tmp_path.glob("*.partial"), *tmp_path.glob(".*")]
 
 
+@pytest.mark.slow
 def test_a_process_that_is_killed_costs_its_own_jobs(recorded: Session, tmp_path: Path) -> None:
     killed = list[int]()
 
@@ -220,7 +223,7 @@ def test_a_rig_of_another_camera_is_refused(recorded: Session, tmp_path: Path) -
         Recording(recorded.path, rig=load_rig("single-lenslet"))
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_command_on_two_processes(aolink: Run, recorded: Session, tmp_path: Path) -> None:
     """A bad file among good ones; the table is that of one process."""
     for name in ("a", "b"):
@@ -258,6 +261,7 @@ def test_rows_are_in_the_order_of_the_numbers_in_their_names() -> None:
     assert [(row["recording"], row["model"]) for row in found] == [(row["recording"], row["model"]) for row in rows]
 
 
+@pytest.mark.slow
 def test_values_are_drawn_in_the_order_of_the_table(aolink: Run, recorded: Session, tmp_path: Path) -> None:
     shutil.copy(recorded.path, tmp_path / "s.mcap")
     result = aolink("estimate", "s.mcap", "-e", "o1", "--set", "plant.process_noise=20,5,10", "-o", "out/")
@@ -265,7 +269,7 @@ def test_values_are_drawn_in_the_order_of_the_table(aolink: Run, recorded: Sessi
     assert re.findall(r"process_noise=(\d+)", result.stdout) == ["5", "10", "20"]
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_one_file_and_one_model_need_no_folder(aolink: Run, recorded: Session, tmp_path: Path) -> None:
     """With --set or --rig as without: the table is printed, and is that of the batch."""
     shutil.copy(recorded.path, tmp_path / "s.mcap")

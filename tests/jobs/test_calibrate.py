@@ -22,12 +22,12 @@ from numpy.typing import NDArray
 from aolink.calibration import Calibration, Frames, Kind, Measured, calibrate, calibrated_text
 from aolink.calibration.measure import pixel_statistics
 from aolink.errors import CalibrationError
-from aolink.jobs.demo import simulated_rig
 from aolink.optics.sensor import Kernel
 from aolink.recording.reader import Recording
 from aolink.rig import Rig, load_rig, parse_light, parse_rig
 from aolink.session import record
 from aolink.simulation.model import RigPhysics
+from tests.commands import simulated_rig
 
 Run = Callable[..., subprocess.CompletedProcess[str]]
 LIVELY = load_rig("section-vi-lively")
@@ -340,7 +340,7 @@ def rig_texts(draw: st.DrawFn) -> str:
     return text if draw(st.booleans()) else text.rstrip("\n").replace("\n", "\r\n")
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @given(text=rig_texts())
 @settings(max_examples=60)
 def test_only_the_values_change(text: str) -> None:
@@ -422,7 +422,7 @@ def assert_calibrated(path: Path) -> None:
         assert abs(value - true) < 4.1 * sd
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_device_form_asks_records_and_writes_the_rig_file(aolink: Run, tmp_path: Path) -> None:
     (tmp_path / "true.toml").write_text(TRUE)
     (tmp_path / "my.toml").write_text(WRONG)
@@ -453,7 +453,7 @@ def test_the_device_form_asks_records_and_writes_the_rig_file(aolink: Run, tmp_p
     assert "dark.mcap is of another rig: its timing.exposure_steps is 20, the rig file has 200" in aside.stderr
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_kinds_can_be_skipped_and_nobody_there_is_an_error(aolink: Run, tmp_path: Path) -> None:
     (tmp_path / "true.toml").write_text(TRUE)
     common = ["--rig", "true.toml", "--frames", "40"]
@@ -490,7 +490,7 @@ def test_kinds_can_be_skipped_and_nobody_there_is_an_error(aolink: Run, tmp_path
     assert aolink("calibrate", *common[:2], "-o", "b.toml").returncode == 2
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_nobody_is_asked_for_anything_before_the_ports_are_tried(aolink: Run, tmp_path: Path) -> None:
     (tmp_path / "tmp").mkdir()
     own_tmp = {**os.environ, "TMPDIR": str(tmp_path / "tmp")}
@@ -552,7 +552,7 @@ def test_a_mirror_is_poked_no_faster_than_its_rig_file_allows(aolink: Run, tmp_p
     assert held.max() == pytest.approx(0.5, abs=1e-4)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_mirror_is_poked_for_its_interaction_matrix(aolink: Run, tmp_path: Path) -> None:
     """Recorded over the wire, and compared with the plant of the rig file, which is that of the simulated rig."""
     arguments = ("calibrate", "--interaction", "--rig", "tip-tilt", "--poke", "0.25", "--repeats", "6")

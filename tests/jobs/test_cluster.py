@@ -84,7 +84,7 @@ def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
                 os.sched_yield()
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_worker_is_killed_and_nothing_is_lost_or_doubled(cluster: Cluster, tmp_path: Path) -> None:
     """Its work is done again by the other; the row and the file of each recording are those of one process."""
     sources = [str(write_small(tmp_path / f"{k}.mcap", 100 + k)) for k in range(10)]
@@ -113,7 +113,7 @@ def test_a_worker_is_killed_and_nothing_is_lost_or_doubled(cluster: Cluster, tmp
         assert [m.data for m in there.raw_messages()] == [m.data for m in Recording(job.output).raw_messages()]
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_worker_with_another_aolink_is_one_clear_line(cluster: Cluster, aolink: Run, tmp_path: Path) -> None:
     other = tmp_path / "other" / "aolink-0.0.9.dist-info"
     other.mkdir(parents=True)
@@ -132,7 +132,7 @@ def test_a_worker_with_another_aolink_is_one_clear_line(cluster: Cluster, aolink
     assert not [*(tmp_path / "out").iterdir()]
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_command_on_a_cluster(cluster: Cluster, aolink: Run, tmp_path: Path) -> None:
     """Names may be relative: the workers have other folders. A second time, everything was done before."""
     names = [write_small(tmp_path / f"s{k}.mcap", 3 + k).name for k in range(3)]
@@ -147,7 +147,7 @@ def test_the_command_on_a_cluster(cluster: Cluster, aolink: Run, tmp_path: Path)
     assert {each.name for each in (tmp_path / "out").glob("*.mcap")} == {f"s{k}.o3.mcap" for k in range(3)}
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("address", ["127.0.0.1:1", "nonsense"])
 def test_no_scheduler_is_one_clear_line(address: str) -> None:
     with pytest.raises(AolinkError, match="no Dask scheduler answers at"):

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from aolink.exposure import residual_rms
 from aolink.recording.reader import Recording
@@ -17,6 +18,7 @@ LOOPS = {"open": "open", "integrator": "integrator", "lqg": "session"}
 """The recording's name by what closed the loop."""
 
 
+@pytest.mark.slow
 def test_the_demo_shows_what_each_loop_leaves(
     aolink: Callable[..., subprocess.CompletedProcess[str]], tmp_path: Path
 ) -> None:

@@ -54,7 +54,7 @@ def test_a_model_that_fits_is_said_to_fit_at_intervals():
     assert not job.offers
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_after_a_line_has_moved_its_new_frequency_is_offered_and_then_fits():
     rig, moved = with_line(12.0), with_line(14.0)
     change, count = 70, 40 + FITTED + HELD_OUT + 2
@@ -86,7 +86,7 @@ def test_after_a_line_has_moved_its_new_frequency_is_offered_and_then_fits():
     assert "identified.toml does not fit" in missed.text
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_what_does_not_foretell_better_is_not_offered():
     """The line moves while a new model is fitted, and is back where the rig file has it when that is judged."""
     rig = with_line(12.0)

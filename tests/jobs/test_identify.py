@@ -12,7 +12,7 @@ RIG = load_rig("loop")
 DRIFT_SD, HZ = 0.16, 48.0  # 2.4 cycles an exposure
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_set_of_a_vibration_beside_a_drift_is_without_the_frequencies_that_the_pixels_rule_out():
     """The drift moves the centroid so much more that centroid and width alone rule out few frequencies."""
     drift = Process("ornstein-uhlenbeck", (0.5, 2 * DRIFT_SD**2 / 0.5))
@@ -27,6 +27,7 @@ def test_the_set_of_a_vibration_beside_a_drift_is_without_the_frequencies_that_t
     assert not any(frequency.holds(hz) for hz in np.arange(6.0, 18.0))
 
 
+@pytest.mark.slow
 def test_changes_of_the_kernel_are_fitted_but_have_no_place_in_the_rig_file():
     rig = load_rig("jitter")
     exposures = list(aolink.simulate(rig, 24, seed=1))

@@ -22,6 +22,7 @@ from tests.recording.small import write_small
 Run = Callable[..., subprocess.CompletedProcess[str]]
 
 
+@pytest.mark.slow
 @given(st.lists(st.text(min_size=1), unique=True, max_size=40), st.integers(1, 12), st.randoms())
 def test_the_parts_are_disjoint_and_all_of_them_are_all(names: list[str], count: int, random: object) -> None:
     shuffled = sorted(names, key=lambda _: random.random())  # type: ignore[attr-defined]
@@ -45,7 +46,7 @@ def test_thousands_of_names_are_no_matter_and_two_that_are_one_are_refused() -> 
         batch.side_jobs(["a/s.mcap", "b/s.mcap"], batch.models(None, []), ["o3"], Path("out"))
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_command_in_parts_and_then_as_a_whole(aolink: Run, tmp_path: Path) -> None:
     """A part has its own table; the run over all finds everything done, and gives the tables of all."""
     names = [write_small(tmp_path / f"s{k}.mcap", 3 + k).name for k in range(5)]
@@ -69,6 +70,7 @@ def test_the_command_in_parts_and_then_as_a_whole(aolink: Run, tmp_path: Path) -
     assert Recording(tmp_path / "s4.mcap", side=[tmp_path / "out" / "s4.o1.mcap"]).estimators == ["o1"]
 
 
+@pytest.mark.slow
 def test_parts_with_a_table_of_a_name_have_one_each(aolink: Run, tmp_path: Path) -> None:
     names = [write_small(tmp_path / f"s{k}.mcap", 2).name for k in range(2)]
     for part in ("1/2", "2/2"):
@@ -79,6 +81,7 @@ def test_parts_with_a_table_of_a_name_have_one_each(aolink: Run, tmp_path: Path)
     assert not (tmp_path / "all.parquet").exists()
 
 
+@pytest.mark.slow
 def test_the_folder_of_the_table_is_made(aolink: Run, tmp_path: Path) -> None:
     """As that of the side files is, which may be the same; where it cannot be made, nothing is done."""
     write_small(tmp_path / "s.mcap", 2)
@@ -93,6 +96,7 @@ def test_the_folder_of_the_table_is_made(aolink: Run, tmp_path: Path) -> None:
     assert not (tmp_path / "none").exists()
 
 
+@pytest.mark.slow
 def test_both_tables_in_parquet(aolink: Run, tmp_path: Path) -> None:
     """A failed recording is in the first; models by their names."""
     names = [write_small(tmp_path / f"s{k}.mcap", 3 + k).name for k in range(2)]
@@ -129,6 +133,7 @@ def test_a_part_that_is_started_twice_is_one_clear_line(aolink: Run, tmp_path: P
         assert aolink(*arguments[:-1], "2/3").returncode == 0, "another part is its own matter"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "arguments"),
     [

@@ -28,8 +28,8 @@ def test_the_row_has_the_scores_that_estimate_prints(tmp_path: Path) -> None:
     row = estimate_file(source, tmp_path / "out.mcap")
     assert tuple(row) == COLUMNS
     recording = Recording(source)
-    scores, _ = scored_and_compared(recording, reestimated(recording, ["o3"]), ["o3"])
-    assert (row["path_rmse"], row["nis"]) == (scores["o3"].path_rmse, scores["o3"].nis.mean)
+    scores, _ = scored_and_compared(recording, reestimated(recording, ["moments"]), ["moments"])
+    assert (row["path_rmse"], row["nis"]) == (scores["moments"].path_rmse, scores["moments"].nis.mean)
     assert (row["recording"], row["output"], row["error"]) == (str(source), "out.mcap", None)
 
 
@@ -42,7 +42,7 @@ def test_the_table_of_exposures_has_a_row_for_each(tmp_path: Path) -> None:
     found = table.to_pydict()
     for key in ("path_rmse", "start_rmse", "end_rmse"):
         assert np.sqrt(np.mean(np.square(found[key]))) == pytest.approx(row[key])
-    estimates = Recording(source, side=[tmp_path / "out.mcap"]).estimates("o3")
+    estimates = Recording(source, side=[tmp_path / "out.mcap"]).estimates("moments")
     assert found["frame_id"] == [each.frame_id for each in estimates] == [1, 2, 3, 4, 5, 6]
     assert found["nis"] == [pytest.approx(each.nis.sum()) for each in estimates]
     assert found["time_ns"] == [1_700_000_000_000_000_000 + k * 200_000_000 for k in range(6)]
@@ -113,6 +113,7 @@ def test_what_cannot_be_estimated_leaves_nothing(tmp_path: Path, settings: Setti
             estimate_file(tmp_path / missing, tmp_path / "out.mcap")
 
 
+@pytest.mark.slow
 def test_any_engine_can_call_it(tmp_path: Path) -> None:
     """Threads and processes of the standard library, on the same recordings, give the same files."""
     sources = [write_small(tmp_path / f"{k}.mcap", 3 + k) for k in range(4)]
@@ -131,6 +132,7 @@ def test_any_engine_can_call_it(tmp_path: Path) -> None:
     assert found[0] == found[1]
 
 
+@pytest.mark.slow
 def test_killed_in_the_middle_it_leaves_nothing_under_the_name(tmp_path: Path) -> None:
     """And the next call does it, and clears away what was left."""
     source = write_small(tmp_path / "s.mcap", 400)

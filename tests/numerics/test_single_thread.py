@@ -1,5 +1,9 @@
 """Linear algebra by one thread, against NumPy's; and who else is given one."""
 
+import os
+import subprocess
+import sys
+from pathlib import Path
 from threading import Thread
 
 import numpy as np
@@ -83,9 +87,15 @@ def blas_threads() -> set[int]:
 
 
 def test_one_thread_as_long_as_anybody_is_inside() -> None:
-    before, seen = blas_threads(), []
-    if before == {1}:
-        pytest.skip("BLAS was told to have one thread when it was loaded")
+    """In a process whose BLAS has two threads otherwise: a worker of the tests has one."""
+    program = "from tests.numerics.test_single_thread import see_who_is_inside; see_who_is_inside()"
+    environment = os.environ | {"OPENBLAS_NUM_THREADS": "2"}
+    subprocess.run([sys.executable, "-c", program], env=environment, cwd=Path(__file__).parents[2], check=True)
+
+
+def see_who_is_inside() -> None:
+    before, seen = {2}, []
+    assert blas_threads() == before
 
     def other() -> None:
         with by_one_thread:

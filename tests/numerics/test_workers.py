@@ -9,7 +9,8 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import psutil
@@ -32,9 +33,14 @@ def all_end(processes: list[psutil.Process]) -> bool:
     return True
 
 
-def started(folder: Path, *words: str) -> subprocess.Popen[bytes]:
+@contextmanager
+def started(folder: Path, *words: str) -> Iterator[subprocess.Popen[bytes]]:
     command = [sys.executable, "-m", "aolink", *words]
-    return subprocess.Popen(command, cwd=folder, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    with subprocess.Popen(command, cwd=folder, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
 
 
 def wait_for(true: Callable[[], object], process: subprocess.Popen[bytes]) -> None:
@@ -45,7 +51,7 @@ def wait_for(true: Callable[[], object], process: subprocess.Popen[bytes]) -> No
         time.sleep(0.005)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_workers_of_a_killed_batch_end_and_the_next_run_does_it_all(
     aolink: Run, recorded: Session, tmp_path: Path
 ) -> None:
@@ -141,7 +147,7 @@ def test_a_pool_ends_with_calls_waiting_that_are_larger_than_a_pipe(tmp_path: Pa
     assert subprocess.run([sys.executable, "program.py"], cwd=tmp_path, timeout=_PATIENCE_S).returncode == 7
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP])
 def test_what_a_terminal_sends_to_all_is_for_the_parent_alone(
     recorded: Session, tmp_path: Path, number: signal.Signals
@@ -164,7 +170,7 @@ def test_what_a_terminal_sends_to_all_is_for_the_parent_alone(
     assert not [*tmp_path.glob("out/.*")]
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_simulated_rig_of_a_killed_demo_ends(tmp_path: Path) -> None:
     with started(tmp_path, "demo", "--rig", "tip-tilt", "--exposures", "100000") as process:
         wait_for(lambda: [*tmp_path.glob("demo-*/session.mcap")], process)

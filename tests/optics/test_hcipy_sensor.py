@@ -2,7 +2,6 @@
 
 from typing import Any
 
-import hcipy
 import numpy as np
 import pytest
 
@@ -10,8 +9,10 @@ from aolink.optics.lattice import find_lattice, match
 from aolink.optics.lenslets import Lenslets
 from aolink.optics.wavefront import SpotReconstructor, lenslet_zernike_slopes, modal_reconstructor, wavefront_rms
 from aolink.optics.zernike import zernike, zernike_gradient
+from tests.needs import needed
 from tests.spot_frames import square_lattice
 
+hcipy = needed("hcipy")
 DIAMETER, N, PIXELS, WAVELENGTH, F_NUMBER = 5e-3, 12, 384, 700e-9, 40
 PITCH = DIAMETER / N
 LENSLETS = Lenslets(grid=(13, 13), pitch_m=PITCH, focal_length_m=F_NUMBER * PITCH, pupil_diameter_m=DIAMETER)

@@ -35,6 +35,7 @@ def displacements(lattice):
     return lattice.spots - lattice.node_positions(lattice.nodes)
 
 
+@pytest.mark.slow
 @given(pitch=st.floats(12, 24), turn=st.floats(-20, 20), missing=st.floats(0, 0.2), seed=st.integers(0, 99))
 @example(pitch=12, turn=0, missing=0.1875, seed=87)  # what is missing parts the spots in two groups
 @settings(max_examples=15)
@@ -69,6 +70,7 @@ def check(lattice, kind, pitch, turn, nodes, places, most_missed=0.05):
     assert abs(np.linalg.det(counted[:2])) == pytest.approx(1)
 
 
+@pytest.mark.slow
 @given(
     kind=st.sampled_from(["square", "hexagonal"]),
     pitch=st.floats(8, 30),

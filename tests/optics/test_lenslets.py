@@ -2,12 +2,12 @@
 
 import math
 
-import hcipy
 import numpy as np
 import pytest
 
 from aolink.optics.lenslets import Lenslets
 from aolink.optics.zernike import noll_to_orders, zernike, zernike_gradient
+from tests.needs import needed
 
 SQUARE = Lenslets(grid=(5, 7), pitch_m=2e-4, focal_length_m=5e-3)
 ROUND = Lenslets(grid=(10, 10), pitch_m=0.1, focal_length_m=1.0, pupil_diameter_m=0.97, obstruction=0.3)
@@ -61,6 +61,7 @@ def test_what_cannot_be_lenslets_is_refused(change):
 
 
 def test_zernikes_are_those_of_another_library():
+    hcipy = needed("hcipy")
     grid = hcipy.make_pupil_grid(41, 0.99)
     points = np.stack([grid.x, grid.y], axis=1)
     radius = np.linalg.norm(points, axis=1)

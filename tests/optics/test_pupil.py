@@ -87,6 +87,7 @@ def test_the_plant_has_the_rows_of_the_lit_lenslets():
     assert np.abs(ours[~full] - theirs[~full]).max() > 0.01 * np.abs(theirs).max()
 
 
+@pytest.mark.slow
 def test_turbulence_is_averaged_over_the_lit_part():
     lenslets = Lenslets(grid=(5, 5), pitch_m=0.1, focal_length_m=1.0, pupil_diameter_m=0.41, obstruction=0.1)
     flow = FrozenFlow(Layer(r0_m=0.1, wind_m_s=(1.0, 0.0)), np.random.default_rng(3), shortest_m=0.05, waves=100)
@@ -158,6 +159,7 @@ def test_every_estimator_works_and_moments_knows_how_well():
     assert scores["o1"].path_rmse == pytest.approx(expected.path_rms, rel=0.15)
 
 
+@pytest.mark.slow
 def test_a_plant_of_few_lit_spots_is_seen_by_moments_too():
     text = load_rig("tip-tilt").toml
     a, b = text.index("[disturbance]"), text.index("[simulation]")

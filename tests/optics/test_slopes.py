@@ -183,6 +183,7 @@ def test_the_picture_has_each_lenslet_where_it_lies():
     assert np.corrcoef(picture[lit], focus)[0, 1] > 0.98  # each hexagon has one value
 
 
+@pytest.mark.slow
 def test_the_command_takes_a_hexagonal_sensor(aolink, tmp_path):
     frame, reference, places = pair("hexagonal", 25, lambda p: 0.01 * p, dtype="uint8")
     np.save(tmp_path / "frame.npy", frame)
@@ -207,7 +208,7 @@ def test_the_command_takes_a_hexagonal_sensor(aolink, tmp_path):
         assert says in refused.stderr
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_command_prints_and_writes(aolink, mmirs, tmp_path):
     reference = str(mmirs / "mmirs_camera2_ref.fits.gz")
     done = aolink(

@@ -12,7 +12,7 @@ LAYER = Layer(r0_m=0.15, wind_m_s=(8.0, -3.0), outer_scale_m=20.0)
 LENSLETS = Lenslets(grid=(4, 4), pitch_m=0.1, focal_length_m=1.0)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_screens_have_the_analytic_structure_function():
     separations = np.array([0.05, 0.15, 0.5, 1.5, 5.0, 15.0])
     turn = np.linspace(0, np.pi, 8, endpoint=False)

@@ -15,11 +15,11 @@ import pytest
 
 import aolink
 from aolink.errors import ExportError
-from aolink.jobs.demo import simulated_rig
 from aolink.plotting import FIGURES, save_figure, write_report
 from aolink.recording.reader import Recording
 from aolink.rig import load_rig
 from aolink.session import record
+from tests.commands import simulated_rig
 from tests.needs import needed
 from tests.recording.small import write_small
 
@@ -101,7 +101,7 @@ def test_two_recordings_stand_side_by_side_and_many_in_a_table(tmp_path: Path) -
     assert len(many.sources) == 4
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_live_session_has_latencies(tmp_path: Path) -> None:
     rig = load_rig("section-vi-lively")
     with simulated_rig("section-vi-lively", "--real-time") as ports:
@@ -152,7 +152,7 @@ def test_a_report_needs_a_recording_and_never_replaces_one(tmp_path: Path) -> No
         write_report([aolink.read(copy)], copy, overwrite=True)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_commands_write_their_files_and_say_what_is_wrong(aolink: Aolink, tmp_path: Path) -> None:
     source = RECORDINGS / "tip-tilt.mcap"
     (tmp_path / "some").mkdir()
@@ -186,7 +186,7 @@ def test_every_figure_is_a_file_of_its_size(tmp_path: Path) -> None:
             assert picture.width == pytest.approx(88 / 25.4 * 300, abs=1)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_figure_is_a_vector_graphic_too_and_the_same_each_time(aolink: Aolink, tmp_path: Path) -> None:
     small = write_small(tmp_path / "small.mcap", 2, rig="single-lenslet", truth=True)
     for ending, begins in ((".svg", b"<?xml"), (".pdf", b"%PDF")):

@@ -128,6 +128,7 @@ def test_nan_is_equal_to_nan_and_to_nothing_else() -> None:
     assert differ([([np.nan], [1.0])], 1, 1) == [True]
 
 
+@pytest.mark.slow
 def test_a_recording_is_compared_with_itself_without_a_copy(aolink: Run, recorded: Session, tmp_path: Path) -> None:
     def change(topic: str, message: Message) -> list[Message]:
         if topic == "/estimate/o1" and isinstance(message, pb.Estimate):

@@ -109,7 +109,7 @@ def test_an_impossible_size_of_a_chunk_costs_no_other_one(
     assert [loss.offset for loss in Recording(path, check=True).losses] == [chunks[2][0]]
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_flipped_bits_cost_no_more_than_their_chunks(
     many_chunks: tuple[bytes, list[tuple[int, int]]], tmp_path: Path
 ) -> None:
@@ -135,7 +135,7 @@ def test_flipped_bits_cost_no_more_than_their_chunks(
         assert sequences(tmp_path / "whole.mcap") == set(range(1, len(found) + 1))
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.data())
 def test_garbage_anywhere_is_one_error_or_less_to_read(
@@ -286,7 +286,7 @@ def test_records_inside_each_other_cost_a_few_readings_of_the_file(kind: str) ->
     assert file.count < 8 * size + (len(losses) + 100) * 64
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_small_messages_in_a_large_chunk_cost_no_memory() -> None:
     message = struct.pack("<BQHIQQ", 5, 22, 1, 1, 1, 1)
     data = message * ((8 << 20) // len(message))

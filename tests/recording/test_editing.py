@@ -110,7 +110,7 @@ def test_the_source_is_never_the_target(recorded: Session) -> None:
     assert recorded.path.read_bytes() == before
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_editing_commands_say_what_they_did_and_lost(aolink: Run, recorded: Session, tmp_path: Path) -> None:
     data = recorded.path.read_bytes()
     (tmp_path / "broken.mcap").write_bytes(data[: len(data) * 2 // 3])
@@ -148,7 +148,7 @@ def test_no_command_writes_over_what_it_reads(aolink: Run, recorded: Session, tm
     assert {(tmp_path / name).read_bytes() for name in ("a.mcap", "b.mcap", "link.mcap")} == {data}
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_command_that_fails_leaves_the_target_as_it_was(aolink: Run, recorded: Session, tmp_path: Path) -> None:
     import resource
 

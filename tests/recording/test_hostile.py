@@ -110,7 +110,7 @@ def in_place_of_the_end(path: Path) -> tuple[bytes, int]:
     return data, data.rindex(struct.pack("<BQ", Opcode.DATA_END, 4))
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_small_file_with_millions_of_messages_is_refused_at_once(
     aolink: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -130,6 +130,7 @@ def test_a_small_file_with_millions_of_messages_is_refused_at_once(
     assert sum(Recording(path).counts.values()) == 0  # of a channel that the file does not name
 
 
+@pytest.mark.slow
 def test_chunks_that_grow_without_end_are_refused(tmp_path: Path) -> None:
     """Twenty chunks of one message of zeros: together more than what is free, and than LZ4 could come to."""
     data = struct.pack("<BQHIQQ", Opcode.MESSAGE, 127 << 20, 1, 1, 1, 1) + bytes((127 << 20) - 22)
@@ -141,6 +142,7 @@ def test_chunks_that_grow_without_end_are_refused(tmp_path: Path) -> None:
         Recording(path)
 
 
+@pytest.mark.slow
 def test_attachments_that_are_holes_are_refused(tmp_path: Path) -> None:
     """Twelve gigabytes that take no room on the disk."""
     _, end = in_place_of_the_end(rig_only(path := tmp_path / "a.mcap"))
@@ -201,6 +203,7 @@ def test_no_text_of_a_file_steers_the_terminal(aolink: Run, tmp_path: Path) -> N
     assert not {"\x1b", "\x07", "\x9b"} & set(done.stdout + done.stderr)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("value", "said"), [("records=5", "is no limit"), ("chunk_bytes=much", "is no limit")])
 def test_limits_that_are_none_are_one_error(tmp_path: Path, value: str, said: str) -> None:
     done = subprocess.run(
@@ -229,6 +232,7 @@ def test_damage_outside_the_chunks_is_said_without_a_check(recorded: Session, tm
         assert same or not found.complete
 
 
+@pytest.mark.slow
 def test_no_flip_is_silent_to_a_check(recorded: Session, tmp_path: Path) -> None:
     """The checksum of all data is written, and compared with `check`: a flip anywhere is said, or changed nothing."""
     data = recorded.path.read_bytes()

@@ -13,7 +13,6 @@ import zstandard
 from aolink.estimation import run
 from aolink.estimation.estimate import as_recorded, motion
 from aolink.estimation.model.factored import FactoredModel
-from aolink.jobs.demo import simulated_rig
 from aolink.numerics.covariance import from_correlation_steps, in_correlation_steps, psd_root
 from aolink.recording import convert
 from aolink.recording.reader import Recording
@@ -22,6 +21,7 @@ from aolink.rig import load_rig
 from aolink.session import record
 from aolink.simulation.model import simulate
 from aolink.wire.truth import truth_message
+from tests.commands import simulated_rig
 from tests.conftest import Session
 from tests.kinds import must_be
 
@@ -39,7 +39,7 @@ def pupil(tmp_path_factory: pytest.TempPathFactory) -> Session:
         return Session(path, record(load_rig(rig), camera, mirror, path, estimators=NAMES, exposures=5))
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_online_and_offline_estimates_agree_bit_for_bit(pupil: Session) -> None:
     recording = Recording(pupil.path)
     for name, again in reestimate(recording, NAMES).items():
@@ -50,6 +50,7 @@ def test_online_and_offline_estimates_agree_bit_for_bit(pupil: Session) -> None:
     assert estimate.innovation_covariance.shape == (1, 192)
 
 
+@pytest.mark.slow
 def test_the_attached_arrays_expand_the_recorded_coefficients(pupil: Session) -> None:
     recording = Recording(pupil.path)
     outputs, basis = (
@@ -63,7 +64,7 @@ def test_the_attached_arrays_expand_the_recorded_coefficients(pupil: Session) ->
         np.testing.assert_allclose(estimate.path, path + response, atol=1e-10)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_plant_of_hundreds_of_states_is_recorded_as_patterns_and_courses(tmp_path: Path) -> None:
     """144 actuators before 100 lenslets: what expands the coefficients takes two megabytes."""
     names, path = ("o3", "profile"), tmp_path / "session.mcap"

@@ -256,7 +256,7 @@ def test_whatever_goes_wrong_in_the_writers_thread_reaches_the_session(tmp_path:
     assert Recording(tmp_path / "a.mcap").metadata.get("ended") is None
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_disk_that_does_not_answer_is_an_error_not_a_hang(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A write that blocks: a pipe whose reader has stopped reading stands for the disk."""
     reader, disk = os.pipe()

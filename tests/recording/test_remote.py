@@ -130,7 +130,7 @@ def test_a_server_that_does_not_answer_is_no_missing_file(tmp_path: Path) -> Non
     assert "SECRET" not in str(error.value)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_no_more_is_read_than_is_needed(s3: S3Server, tmp_path: Path) -> None:
     """All of it is needed once to estimate it; to look at its index, little. No request is for more than a megabyte."""
     source = write_small(tmp_path / "s.mcap", 1500, truth=True)
@@ -195,7 +195,7 @@ def test_a_server_that_gives_no_ranges_is_refused(web: tuple[str, type[_Ranges]]
         Recording(f"{web[0]}/s.mcap")
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_commands_take_urls(s3: S3Server, aolink: Run, tmp_path: Path) -> None:
     source = write_small(tmp_path / "s.mcap", 4)
     s3fs.S3FileSystem().put(str(source), "lab/s.mcap")

@@ -46,7 +46,7 @@ def test_a_recording_with_a_side_file_is_the_copy_with_these_estimates(
 def test_a_side_file_holds_no_frames_and_says_what_it_belongs_to(recorded: Session, tmp_path: Path) -> None:
     estimate_file(recorded.path, tmp_path / "s.mcap")
     side = Recording(tmp_path / "s.mcap", check=True)
-    assert side.counts == {"/estimate/o3": EXPOSURES}
+    assert side.counts == {"/estimate/moments": EXPOSURES}
     assert side.side_of == Recording(recorded.path).digest == Recording(recorded.path, check=True).digest
     assert side.metadata["estimated_from"] == recorded.path.name
 
@@ -70,7 +70,7 @@ def test_what_is_between_two_times_has_its_estimates(tmp_path: Path) -> None:
     recording = Recording(source, side=[tmp_path / "side.mcap"])
     first, last = recording.start_ns + 400_000_000, recording.start_ns + 1_000_000_000
     found = [each.topic for each in recording.raw_messages(start_ns=first, end_ns=last)]
-    assert found == ["/camera/exposure", "/camera/image", "/mirror/applied", "/estimate/o3"] * 3
+    assert found == ["/camera/exposure", "/camera/image", "/mirror/applied", "/estimate/moments"] * 3
 
 
 def test_a_damaged_recording_has_side_files_too(recorded: Session, tmp_path: Path) -> None:
@@ -78,13 +78,13 @@ def test_a_damaged_recording_has_side_files_too(recorded: Session, tmp_path: Pat
     (cut := tmp_path / "cut.mcap").write_bytes(recorded.path.read_bytes()[:-3000])
     row = estimate_file(cut, side := tmp_path / "side.mcap")
     assert row["damage"] == Recording(cut).damage
-    assert len(Recording(cut, side=[side]).estimates("o3")) == row["exposures"]
+    assert len(Recording(cut, side=[side]).estimates("moments")) == row["exposures"]
     recover(cut, tmp_path / "whole.mcap")
     with pytest.raises(RecordingError, match="does not belong to"):
         Recording(tmp_path / "whole.mcap", side=[side])
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_what_does_not_belong_together_is_one_clear_error(aolink: Run, tmp_path: Path) -> None:
     for name, exposures in (("a", 3), ("b", 4)):
         source = write_small(tmp_path / f"{name}.mcap", exposures)
@@ -105,11 +105,11 @@ def test_what_does_not_belong_together_is_one_clear_error(aolink: Run, tmp_path:
         assert not (tmp_path / "x.rrd").exists()
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_view_and_compare_take_a_recording_and_its_side_file(aolink: Run, recorded: Session, tmp_path: Path) -> None:
     shutil.copy(recorded.path, source := tmp_path / "s.mcap")
     for name, model in (("same", Model()), ("other", OTHER)):
-        estimate_file(source, tmp_path / f"{name}.mcap", Settings(model=model))
+        estimate_file(source, tmp_path / f"{name}.mcap", Settings(estimator="o3", model=model))
     same = aolink("compare", "s.mcap", "same.mcap", "--json")
     assert same.returncode == 0, same.stdout
     assert list(json.loads(same.stdout)["topics"]) == ["/estimate/o3"]
@@ -126,4 +126,4 @@ def test_view_and_compare_take_a_recording_and_its_side_file(aolink: Run, record
 def test_read_takes_side_files(tmp_path: Path) -> None:
     source = write_small(tmp_path / "s.mcap", 3)
     estimate_file(source, tmp_path / "side.mcap")
-    assert aolink.read(source, side=[tmp_path / "side.mcap"]).estimators == ["o3"]
+    assert aolink.read(source, side=[tmp_path / "side.mcap"]).estimators == ["moments"]

@@ -15,13 +15,13 @@ import aolink
 from aolink.errors import DeviceError, RecordingError
 from aolink.estimation import Estimate
 from aolink.exposure import Exposure
-from aolink.jobs.demo import simulated_rig
 from aolink.recording import schemas_pb2 as pb
 from aolink.recording.editing import cut, merge
 from aolink.recording.estimate_pairs import EstimatePairs
 from aolink.recording.reader import Recording
 from aolink.rig import load_rig
 from aolink.session import record
+from tests.commands import simulated_rig
 from tests.conftest import Session
 from tests.recording.small import write_small
 
@@ -135,7 +135,7 @@ def test_an_exposure_that_is_damaged_is_an_error_of_its_own(recorded: Session, t
         recording[11]
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_slice_reads_little_of_a_long_file(long_recording: Path) -> None:
     recording = aolink.read(long_recording)
     whole = bytes_read(lambda: list(recording))

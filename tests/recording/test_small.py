@@ -61,6 +61,20 @@ def test_a_small_recording_is_viewed_and_estimated(name: str, tmp_path: Path) ->
     assert ran("estimate", path, "-e", "open-loop")[1] is None, "it does not look, so there is nothing to complain of"
 
 
+@pytest.mark.slow
+def test_a_recording_without_estimates_gets_the_default_ones(aolink: Run, tmp_path: Path) -> None:
+    write_small(tmp_path / "s.mcap", 3)
+    for command in ("estimate", "replay"):
+        found = json.loads(aolink(command, "s.mcap", "--json").stdout)
+        assert found.keys() - {"differs_from_recorded"} == {"moments"}
+    assert aolink("estimate", "s.mcap", "--side", "-o", "out").returncode == 0
+    assert [each.name for each in (tmp_path / "out").glob("*.mcap")] == ["s.moments.mcap"]
+    assert aolink("estimate", "s.mcap", "-e", "o1", "-o", "with.mcap").returncode == 0
+    again = json.loads(aolink("estimate", "with.mcap", "--json").stdout)
+    assert again.keys() - {"differs_from_recorded"} == {"o1"}
+
+
+@pytest.mark.slow
 def test_the_reason_is_in_the_table_in_info_and_in_json(aolink: Run, tmp_path: Path) -> None:
     """Once for all exposures that have it, with what differs in it from the first."""
     write_small(tmp_path / "dark.mcap", 3, "below black")
@@ -78,6 +92,7 @@ def test_the_reason_is_in_the_table_in_info_and_in_json(aolink: Run, tmp_path: P
     assert (again["estimated"], again["measured"]) == (3, 0)
 
 
+@pytest.mark.slow
 def test_a_batch_in_which_nothing_was_measured_is_no_success(aolink: Run, tmp_path: Path) -> None:
     write_small(tmp_path / "dark.mcap", 2, "black")
     write_small(tmp_path / "lit.mcap", 2)

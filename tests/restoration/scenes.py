@@ -28,7 +28,7 @@ def blurred(scene: FloatArray, values: FloatArray, origin: tuple[int, ...]) -> t
     """The picture that a larger scene gives, and the part of the scene that lies in its frame."""
     taps = np.atleast_2d(values)
     down, right = (0, *origin)[-2:]
-    image = np.asarray(signal.convolve(scene, taps, mode="valid", method="direct"))
+    image: FloatArray = np.asarray(signal.convolve(scene, taps, mode="valid", method="direct"))
     top, left = taps.shape[0] - 1 - down, taps.shape[1] - 1 - right
     rows, columns = image.shape
     return image, scene[top : top + rows, left : left + columns]

@@ -38,7 +38,7 @@ def given_pixels(
     out = []
     for k, line in enumerate(lines[:, :upto]):
         use = np.ones(upto, bool) if seen is None else seen[k, :upto]
-        S = C[use] @ R @ C[use].T + NOISE * np.eye(use.sum())
+        S = C[use] @ R @ C[use].T + NOISE * np.eye(int(use.sum()))
         out.append(R @ C[use].T @ np.linalg.solve(S, line[use]))
     return np.array(out)
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 import subprocess
 from collections.abc import Callable
 from pathlib import Path
@@ -12,7 +11,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-import aolink.restoration
 from aolink.errors import RestorationError
 from aolink.restoration import METHODS, find_method, restore
 from aolink.restoration.deblur import psnr
@@ -32,6 +30,7 @@ def with_packages(with_example: dict[str, str], tmp_path_factory: pytest.TempPat
     return with_example | {"PYTHONPATH": path, "COLUMNS": "200"}
 
 
+@pytest.mark.slow
 def test_a_method_of_another_package_restores_a_picture(
     aolink: Run, with_packages: dict[str, str], tmp_path: Path,
 ) -> None:  # fmt: skip
@@ -47,6 +46,7 @@ def test_a_method_of_another_package_restores_a_picture(
     assert psnr(restored[inside], scene[inside]) > psnr(image[inside], scene[inside]) + 3
 
 
+@pytest.mark.slow
 def test_the_help_names_the_methods_of_other_packages_and_what_is_wrong_with_one(
     aolink: Run, with_packages: dict[str, str],
 ) -> None:  # fmt: skip
@@ -59,6 +59,7 @@ def test_the_help_names_the_methods_of_other_packages_and_what_is_wrong_with_one
     assert "the restoration method gone of broken (no_such_module:method) cannot be loaded: ModuleNotFoundError" in text
 
 
+@pytest.mark.slow
 def test_a_method_that_cannot_be_loaded_is_one_line(
     aolink: Run, with_packages: dict[str, str], tmp_path: Path,
 ) -> None:  # fmt: skip
@@ -84,9 +85,3 @@ def test_a_method_that_cannot_be_loaded_is_one_line(
 def test_a_parameter_that_a_method_does_not_take_is_refused(method: str, parameters: dict[str, Any], says: str) -> None:
     with pytest.raises(RestorationError, match=says):
         restore(np.ones((9, 9)), np.ones(2), method=method, **parameters)
-
-
-def test_the_page_names_every_method() -> None:
-    page = (Path(aolink.restoration.__file__).parent / "README.md").read_text()
-    rows = [line.split("|")[1] for line in page.splitlines() if line.startswith("| `")]
-    assert [name for row in rows for name in re.findall(r"`(\w+)`", row)] == list(METHODS)

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from aolink.jobs.demo import simulated_rig
+from tests.commands import simulated_rig
 from tests.needs import missing
 
 DEVICE = Path(__file__).parents[2] / "tools" / "device"

@@ -37,7 +37,6 @@ from aolink.simulation.server import RigServer
 from aolink.simulation.streams import Stream
 from aolink.wire import messages_pb2 as pb
 from aolink.wire.link import Link, Received
-from aolink.wire.signing import Signing
 from tests.kinds import must_be
 
 _EPOCH_NS = 1_767_225_600_000_000_000
@@ -86,8 +85,6 @@ class Way:
 
 class End:
     """One end of a line, as a host's transport and as a device's stream."""
-
-    signing: Signing | None = None
 
     def __init__(self, name: str, incoming: Way, outgoing: Way) -> None:
         self.name = name

@@ -83,31 +83,26 @@ def check_live_is_recorded(run: Run) -> None:
         assert np.array_equal(live.lead_inputs, again.lead_inputs)
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3])
 @pytest.mark.parametrize(
     "faults",
     [
         {},
-        {"bit_error_rate": 1e-6},
         {"bit_error_rate": 1e-5},
         {"bit_error_rate": 1e-4},
-        {"bit_error_rate": 3e-4},
         {"bit_error_rate": 1e-3},
         {"packet_loss_rate": 0.1, "command_loss_rate": 0.1, "duplicate_rate": 0.1, "bit_flip_rate": 0.1},
         {"packet_loss_rate": 0.4, "command_loss_rate": 0.4, "duplicate_rate": 0.3, "bit_flip_rate": 0.2},
     ],
     ids=str,
 )
-def test_every_commanded_step_ends_once_at_every_error_rate(
-    faults: dict[str, float], seed: int, tmp_path: Path
-) -> None:
+def test_every_commanded_step_ends_once_at_every_error_rate(faults: dict[str, float], tmp_path: Path) -> None:
     rig = rig_with("", **faults)
-    run = run_session(SimulatedTimeHub(rig, seed), rig, tmp_path / "a.mcap", 20)
+    run = run_session(SimulatedTimeHub(rig, 1), rig, tmp_path / "a.mcap", 8)
     check_account(run)
     check_live_is_recorded(run)
     if max(faults.values(), default=0) <= 1e-4:  # then nothing is lost for good
         assert run.error is None
-        assert run.report.steps_commanded == run.report.steps_applied == 4000
+        assert run.report.steps_commanded == run.report.steps_applied == 1600
         assert (run.report.reports_asked > 0) == (
             run.report.connection_faults["sequence_gaps"] > run.report.frames_lost
         )
@@ -115,7 +110,7 @@ def test_every_commanded_step_ends_once_at_every_error_rate(
 
 
 def check_inputs_are_what_was_applied(run: Run, rig: Rig) -> None:
-    exact = rig.mirror.quantise(rig.drive.inputs(0, 4000, rig.timing.fast_step_s))
+    exact = rig.mirror.quantise(rig.drive.inputs(0, run.report.steps_commanded, rig.timing.fast_step_s))
     for exposure in run.exposures:
         since = exposure.first_step - run.first_step
         assert np.array_equal(exposure.inputs, exact[since : since + exposure.n_steps])
@@ -149,9 +144,10 @@ def test_what_the_mirror_no_longer_knows_is_not_reported_and_assumed_as_converte
     assert commands["not_reported"] == run.report.steps_not_reported
 
 
-@pytest.mark.parametrize("loss", [0.5, 0.8])
-def test_a_block_is_sent_again_as_often_as_its_lead_leaves_room_for(loss: float, tmp_path: Path) -> None:
+@pytest.mark.slow
+def test_a_block_is_sent_again_as_often_as_its_lead_leaves_room_for(tmp_path: Path) -> None:
     """The lead is 150 steps of 1 ms, the time-out at least 10 ms: at 0, 10, ... 140 ms, and once more just before."""
+    loss = 0.8
     rig = rig_with("watchdog_s = 10", command_loss_rate=loss)
     run = run_session(SimulatedTimeHub(rig), rig, tmp_path / "a.mcap", 100)
     assert run.error is None
@@ -165,7 +161,7 @@ def test_a_block_is_sent_again_as_often_as_its_lead_leaves_room_for(loss: float,
     assert run.report.steps_late == run.report.steps_parked
 
 
-@pytest.mark.parametrize("when", [0, 20_000])
+@pytest.mark.parametrize("when", [0, 5_000])
 def test_a_host_that_is_held_up_for_less_than_the_queue_lasts_is_late_with_nothing(when: int, tmp_path: Path) -> None:
     """At the start, too: the queue has been filled by then."""
     rig = rig_with("queue_steps = 4000\nwatchdog_s = 8")
@@ -176,10 +172,10 @@ def test_a_host_that_is_held_up_for_less_than_the_queue_lasts_is_late_with_nothi
             hub.hold_up(left.pop())
         return np.zeros((n_steps, 1))
 
-    run = run_session(hub, rig, tmp_path / "a.mcap", 150, inputs=inputs)
+    run = run_session(hub, rig, tmp_path / "a.mcap", 40, inputs=inputs)
     assert run.error is None
     check_account(run)
-    assert (left, run.report.steps_late, run.report.steps_applied) == ([], 0, 30_000)
+    assert (left, run.report.steps_late, run.report.steps_applied) == ([], 0, 8_000)
 
 
 def test_a_slow_line_is_not_flooded(tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ import os
 import pty
 import re
 import resource
+import shutil
 import signal
 import socket
 import subprocess
@@ -28,20 +29,22 @@ from typer.testing import CliRunner
 from aolink.cli.common import app
 from aolink.devices.interfaces import CommandAnswered
 from aolink.errors import DeviceError, PortError, RecordingError
-from aolink.jobs.demo import simulated_rig
+from aolink.polling import wait_readable
 from aolink.recording.reader import Recording
 from aolink.recording.writer import RecordingWriter
 from aolink.rig import load_rig
 from aolink.session import record
 from aolink.wire import messages_pb2 as pb
 from aolink.wire.packet import Packet, PacketDecoder, encode_message, encode_packet, schema_hash
-from aolink.wire.port import SerialPort, wait_readable
+from aolink.wire.port import SerialPort
+from tests.commands import simulated_rig
 from tests.conftest import Session
 from tests.hostile import lying_rig
 from tests.session.native import open_native
 
 Run = Callable[..., subprocess.CompletedProcess[str]]
 Start = Callable[..., "subprocess.Popen[str]"]
+RECORDING = Path(__file__).parents[2] / "recordings" / "section-vi.mcap"
 
 
 def record_arguments(
@@ -125,6 +128,11 @@ def test_another_protocol_version_is_refused(aolink: Run) -> None:
         result = aolink("devices", port)
     assert result.returncode == 4
     assert "speaks protocol version 3, this aolink speaks 1: update the host" in result.stderr
+    with fake_device(lambda packet: encode_packet(Packet(2, 2, packet.sequence, b"\x08\x01" + bytes(13)))) as port:
+        result = aolink("devices", port)
+    assert result.returncode == 4
+    assert "speaks protocol version 2, this aolink speaks 1: packets are no longer signed" in result.stderr
+    assert result.stderr.count("\n") == 1
 
 
 def test_another_schema_is_refused(aolink: Run) -> None:
@@ -138,7 +146,7 @@ def test_another_schema_is_refused(aolink: Run) -> None:
     assert f"built with another messages.proto (6f746865726f6e65, here {schema_hash().hex()})" in result.stderr
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("old", "new", "pattern"),
     [
@@ -156,14 +164,14 @@ def test_a_rig_file_of_another_device(aolink: Run, tmp_path: Path, old: str, new
     assert_refused(result, 4, f"the rig file section-vi does not match the device: {pattern}; give the rig file")
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_ports_of_two_rigs_are_refused(aolink: Run) -> None:
     with simulated_rig("section-vi") as (camera, _), simulated_rig("section-vi", "--seed", "9") as (_, mirror):
         result = aolink(*record_arguments(camera, mirror))
     assert_refused(result, 4, "do not belong to the same rig")
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_an_existing_target_is_kept(aolink: Run, tmp_path: Path) -> None:
     (tmp_path / "a.mcap").write_text("precious")
     with simulated_rig("section-vi") as (camera, mirror):
@@ -178,14 +186,14 @@ def test_an_existing_target_is_kept(aolink: Run, tmp_path: Path) -> None:
         assert "exists and is not overwritten" in aolink(*command).stderr
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_folder_that_does_not_exist(aolink: Run) -> None:
     with simulated_rig("section-vi") as (camera, mirror):
         result = aolink(*record_arguments(camera, mirror, output="no/such/a.mcap"))
     assert_refused(result, 5, "cannot write no/such/a.mcap: there is no folder no/such; make it first")
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_an_unknown_estimator_is_refused_with_those_there_are(aolink: Run) -> None:
     with simulated_rig("section-vi") as (camera, mirror):
         result = aolink(*record_arguments(camera, mirror, "--estimator", "o7"))
@@ -194,7 +202,7 @@ def test_an_unknown_estimator_is_refused_with_those_there_are(aolink: Run) -> No
     assert "open-loop" in result.stderr
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_full_disk_ends_the_session_and_leaves_what_was_recorded(aolink: Run, tmp_path: Path) -> None:
     """A limit on the size of files stands for the disk, and for those that take none over 4 GiB."""
     limit = 200_000
@@ -243,7 +251,7 @@ def wait_for_size(path: Path, size: int, process: subprocess.Popen[str]) -> None
     pytest.fail(f"{path} has not grown to {size} bytes within a minute")
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("how", [[], ["--real-time"]])
 def test_ctrl_c_keeps_the_recording_whole_and_parks_the_mirror(
     aolink: Run, start_aolink: Start, tmp_path: Path, how: list[str]
@@ -265,7 +273,7 @@ def test_ctrl_c_keeps_the_recording_whole_and_parks_the_mirror(
     assert len(list(recording.exposures())) == len(recording.estimates("o3")) > 0
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_rig_killed_in_the_middle(start_aolink: Start, tmp_path: Path) -> None:
     rig = start_aolink("rig", "section-vi", "--json")
     assert rig.stdout is not None
@@ -289,7 +297,7 @@ def test_a_rig_killed_in_the_middle(start_aolink: Start, tmp_path: Path) -> None
     assert len(recording.estimates("o3")) > 0
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_killed_host_leaves_a_readable_recording_and_a_parked_mirror(
     aolink: Run, start_aolink: Start, tmp_path: Path
 ) -> None:
@@ -341,7 +349,7 @@ def test_a_command_beyond_the_limits_is_refused_by_the_host_and_by_the_device() 
         assert mirror.in_flight == 0
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_ctrl_c_while_the_rig_is_held_up(start_aolink: Start, tmp_path: Path) -> None:
     """Nobody answers any more; the session ends all the same, as interrupted, and says what it could not do."""
     rig = start_aolink("rig", "section-vi", "--json")
@@ -373,7 +381,7 @@ def test_a_camera_that_dies_ends_an_unlimited_session(tmp_path: Path) -> None:
     assert Recording(tmp_path / "a.mcap").metadata["ended"].startswith("error: the camera has sent no frame")
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_device_held_up_for_two_seconds_does_not_end_the_session(start_aolink: Start, tmp_path: Path) -> None:
     """As long as twice its watchdog is longer than that."""
     text = load_rig("section-vi").toml.replace("block_steps = 50", "block_steps = 50\nwatchdog_s = 3")
@@ -393,7 +401,7 @@ def test_a_device_held_up_for_two_seconds_does_not_end_the_session(start_aolink:
     assert "exposures, complete" in output
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_killed_parent_takes_its_rig_along(tmp_path: Path) -> None:
     code = (
         "import sys\nfrom aolink.jobs.demo import simulated_rig\n"
@@ -422,10 +430,29 @@ def test_numbers_that_make_no_sense(aolink: Run, tmp_path: Path, arguments: list
     assert not (tmp_path / "a.mcap").exists()
 
 
-def test_a_port_that_cannot_be_waited_on(aolink: Run) -> None:
-    result = aolink("devices", "loop://")
-    assert result.returncode == 3
-    assert "loop:// is a port that cannot be waited on: use a device path or socket://host:port" in result.stderr
+@pytest.mark.parametrize("where", ["devices", "record", "rig file", "check", "replay"])
+def test_a_port_that_would_write_a_file_is_refused_before_it_does(aolink: Run, tmp_path: Path, where: str) -> None:
+    (precious := tmp_path / "precious").write_text("precious")
+    master, slave = pty.openpty()
+    port = f"spy://{os.ttyname(slave)}?file={precious}"
+    text = load_rig("section-vi").toml + f'\n[devices]\nmirror = {{ driver = "native", port = "{port}" }}\n'
+    (tmp_path / "my.toml").write_text(text)
+    shutil.copy(RECORDING, tmp_path / "old.mcap")
+    command = {
+        "devices": ["devices", port],
+        "record": ["record", "--camera", os.ttyname(slave), "--mirror", port, "--rig", "section-vi", "-o", "a.mcap"],
+        "rig file": ["record", "--camera", os.ttyname(slave), "--rig", "my.toml", "-o", "a.mcap"],
+        "check": ["rig", "my.toml", "--check"],
+        "replay": ["replay", "old.mcap", "--to-rig", "--camera", port, "--mirror", port, "-o", "a.mcap"],
+    }[where]
+    result = aolink(*command)
+    os.close(master)
+    os.close(slave)
+    assert precious.read_text() == "precious"
+    assert result.returncode == (2 if where == "check" else 3)
+    said = result.stdout if where == "check" else result.stderr
+    assert f"{port!r} is not a port that aolink opens: a port is a device path" in said
+    assert "Traceback" not in said
 
 
 @pytest.mark.parametrize(
@@ -437,11 +464,25 @@ def test_a_port_that_cannot_be_waited_on(aolink: Run) -> None:
         ("socket://127.0.0.1:99999", "is not an address: expected socket://HOST:PORT"),
         ("socket://127.0.0.1:-5", "is not an address: expected socket://HOST:PORT"),
         ("socket://[::1:5", "is not an address: expected socket://HOST:PORT"),
-        ("socket://127.0.0.1:5?speed=1", "is not an address that pyserial can open"),
+        ("socket://127.0.0.1:5?logging=debug", "number from 1 to 65535 and nothing behind it"),
+        ("socket://127.0.0.1:5/debug", "number from 1 to 65535 and nothing behind it"),
         ("rfc2217://", "is not an address: expected rfc2217://HOST:PORT"),
-        ("hwgrep://[", "is not an address that pyserial can open"),
-        ("spy://", "there is no port spy://"),
-        ("nonsense://1", "there is no port nonsense://1"),
+        ("rfc2217://127.0.0.1:5?ign_set_control&timeout=9", "number from 1 to 65535 and nothing behind it"),
+        ("RFC2217://127.0.0.1:5#logging", "number from 1 to 65535 and nothing behind it"),
+        *(
+            (f"{scheme}://{rest}", "is not a port that aolink opens")
+            for scheme, rest in [
+                ("spy", "loop://?file=a"),
+                ("SPY", "loop://"),
+                (" spy", "loop://"),
+                ("alt", "/dev/null?class=Serial"),
+                ("loop", "?logging=debug"),
+                ("hwgrep", "["),
+                ("cp2110", ""),
+                ("nonsense", "1"),
+                ("", "x"),
+            ]
+        ),
         ("", "there is no port without a name"),
         ("/dev/null", "/dev/null is a device, but no serial port"),
         (".", r"\. is a folder"),
@@ -496,7 +537,7 @@ def test_a_port_that_somebody_else_has_locked() -> None:
         os.close(slave)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_tcp_port_that_another_host_has(aolink: Run) -> None:
     with simulated_rig("section-vi", "--listen", "127.0.0.1:0") as (camera, _):
         held = SerialPort(camera)
@@ -508,7 +549,7 @@ def test_a_tcp_port_that_another_host_has(aolink: Run) -> None:
     assert "lost socket://" in result.stderr or "does another host have it" in result.stderr
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_help_has_an_example_for_every_command() -> None:
     for command in [each.name or each.callback.__name__ for each in app.registered_commands if each.callback]:
         result = CliRunner().invoke(app, [command, "--help"])
@@ -516,7 +557,7 @@ def test_help_has_an_example_for_every_command() -> None:
         assert f"Example: aolink {command}" in result.stdout
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("content", [b"", b"\x89MCAP0\r\n", b"hello, this is a text file, not a recording\n"])
 def test_a_file_that_is_not_a_recording(aolink: Run, tmp_path: Path, content: bytes) -> None:
     (tmp_path / "bad.mcap").write_bytes(content)
@@ -526,6 +567,7 @@ def test_a_file_that_is_not_a_recording(aolink: Run, tmp_path: Path, content: by
     assert_refused(aolink("info", "missing.mcap"), 5, "cannot read missing.mcap: no such file or directory")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "unwanted"),
     [

@@ -26,7 +26,6 @@ from aolink.errors import EstimatorError
 from aolink.estimation import Driver, Estimate, make_estimator
 from aolink.estimation.driver import SkippedInputs
 from aolink.exposure import Exposure
-from aolink.jobs.demo import simulated_rig
 from aolink.recording import schemas_pb2 as pb
 from aolink.recording import topics
 from aolink.recording.reader import Recording
@@ -38,6 +37,7 @@ from aolink.session.report import LatencyBook
 from aolink.session.waiting import Aside, Waiting, most_waiting
 from aolink.simulation.model import simulate
 from aolink.wire import messages_pb2 as wire
+from tests.commands import simulated_rig
 from tests.conftest import Session
 from tests.kinds import messages_of
 
@@ -75,7 +75,7 @@ def loaded(rig_file: Path, tmp_path_factory: pytest.TempPathFactory) -> Session:
     return Session(path, report)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_slow_estimator_costs_no_frame_and_no_command(loaded: Session) -> None:
     report, recording = loaded.report, Recording(loaded.path)
     assert (report.ended, report.exposures, report.frames_received) == ("complete", EXPOSURES, EXPOSURES)
@@ -86,6 +86,7 @@ def test_a_slow_estimator_costs_no_frame_and_no_command(loaded: Session) -> None
         assert recording.counts[topic] == EXPOSURES
 
 
+@pytest.mark.slow
 def test_what_it_had_no_time_for_is_counted_and_recorded(loaded: Session) -> None:
     recording, metadata = Recording(loaded.path), Recording(loaded.path).metadata
     for name in (slow(), "o3"):
@@ -111,7 +112,7 @@ def test_what_was_estimated_online_is_the_same_offline_with_the_same_exposures_s
         assert first_difference(recording.estimates(name), again[name]) is None
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_compare_replay_and_estimate_know_of_the_skipped(
     loaded: Session, aolink: Callable[..., subprocess.CompletedProcess[str]], tmp_path: Path
 ) -> None:
@@ -160,7 +161,7 @@ def outcome_of(beside: BesideTheLoop, name: str, frame_id: int) -> Outcome:
     return pytest.fail(f"{name} is not through with frame {frame_id} within a minute")
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_slow_estimator_makes_no_fast_one_skip(recorded: Session) -> None:
     rig, exposures = load_rig("section-vi-lively"), exposures_of(recorded)
     with BesideTheLoop(rig, [slow(), "o3"]) as beside:
@@ -173,6 +174,7 @@ def test_a_slow_estimator_makes_no_fast_one_skip(recorded: Session) -> None:
     assert all(each.message is None and "the session was over" in each.reason for each in rest)
 
 
+@pytest.mark.slow
 def test_an_estimate_from_beside_is_that_of_the_driver(recorded: Session) -> None:
     rig, exposures = load_rig("section-vi-lively"), exposures_of(recorded)
     ours = []
@@ -186,13 +188,14 @@ def test_an_estimate_from_beside_is_that_of_the_driver(recorded: Session) -> Non
     assert first_difference(ours, Recording(recorded.path).estimates("o3")) is None
 
 
+@pytest.mark.slow
 def test_an_estimator_that_cannot_work_ends_the_session_before_it_begins() -> None:
     why = "the estimator o9 does not start: there is no estimator 'o9'"
     with BesideTheLoop(load_rig("section-vi"), ["o9"]) as beside, pytest.raises(EstimatorError, match=why):
         beside.get_ready(lambda: False)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="it reads /proc")
 def test_the_recording_goes_on_without_an_estimator_that_was_killed(rig_file: Path, tmp_path: Path) -> None:
     rig, path = parse_rig(FAST), tmp_path / "a.mcap"
@@ -253,7 +256,7 @@ def until(true: Callable[[], bool]) -> None:
     pytest.fail("it does not become true within a minute")
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="it reads /proc")
 def test_a_killed_session_takes_its_estimators_along(rig_file: Path, tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
@@ -273,7 +276,7 @@ def is_running(process: int) -> bool:
     return status.rpartition(")")[2].split()[0] != "Z"
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_ctrl_c_waits_for_what_is_under_way_and_records_the_rest_as_skipped(rig_file: Path, tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     with recording_process(
@@ -293,7 +296,7 @@ def test_ctrl_c_waits_for_what_is_under_way_and_records_the_rest_as_skipped(rig_
     assert f"{slow()}: {len(estimated)} of {len(exposures)} exposures".encode() in output
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_terminal_that_takes_nothing_holds_up_no_session(rig_file: Path, tmp_path: Path) -> None:
     """As after Ctrl-S in the middle of a session: the progress bar cannot be drawn."""
     path = tmp_path / "a.mcap"
@@ -317,7 +320,7 @@ def test_a_terminal_that_takes_nothing_holds_up_no_session(rig_file: Path, tmp_p
     assert (report["ended"], report["frames_received"]) == ("complete", str(EXPOSURES))
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_who_watches_or_is_told_and_never_comes_back_holds_up_no_session(rig_file: Path, tmp_path: Path) -> None:
     go_on = threading.Event()
     watched: list[int] = []
@@ -341,7 +344,7 @@ def test_who_watches_or_is_told_and_never_comes_back_holds_up_no_session(rig_fil
     assert any("is not done with an exposure" in each for each in report.warnings)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_who_watches_gets_each_exposure_once_and_each_estimate_once(rig_file: Path, tmp_path: Path) -> None:
     seen: list[int] = []
     estimates: list[tuple[str, int]] = []

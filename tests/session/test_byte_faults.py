@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import secrets
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from aolink.devices.opening import signed
-from aolink.jobs.demo import simulated_rig
 from aolink.recording.reader import Recording
 from aolink.rig import Faults, load_rig, with_faults
 from aolink.session import Report, record
+from tests.commands import simulated_rig
 
 RIG = load_rig("section-vi")
 LINE = [
@@ -28,7 +26,7 @@ def session(path: Path, faults: list[str], exposures: int) -> Report:
         return record(RIG, *ports, path, exposures=exposures)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_damaged_bytes_change_no_pixel_and_no_command_and_are_the_same_again(tmp_path: Path) -> None:
     reports = [session(tmp_path / name, LINE, 40) for name in ("a", "b")]
     session(tmp_path / "good", [], 40)
@@ -47,21 +45,7 @@ def test_damaged_bytes_change_no_pixel_and_no_command_and_are_the_same_again(tmp
         assert each.inputs_assumed or np.array_equal(each.inputs, true.inputs)
 
 
-@pytest.mark.long
-def test_a_signed_session_over_a_bad_line_loses_no_command(tmp_path: Path) -> None:
-    """Packets that come twice are refused by their time stamps; those that are sent anew have new ones."""
-    (key := tmp_path / "rig.key").write_text(secrets.token_hex(32))
-    key.chmod(0o600)
-    with simulated_rig(
-        "section-vi", "--key", str(key), "--fault", "bitflip=1e-4", "--fault", "duplicate_rate=0.1"
-    ) as ports:
-        report = record(signed(RIG, *ports, key), None, None, tmp_path / "a.mcap", exposures=20)
-    assert (report.ended, report.steps_applied) == ("complete", 4000)
-    assert report.connection_faults["bad_crc"] > 0
-    assert report.connection_faults["bad_payload"] > 0
-
-
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("fault", "shows"),
     [

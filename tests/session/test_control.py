@@ -15,7 +15,6 @@ from aolink.devices.native import NativeCamera, NativeMirror
 from aolink.errors import ControlError
 from aolink.estimation import Status
 from aolink.jobs.closed_loop import closed_loop, replayed
-from aolink.jobs.demo import simulated_rig
 from aolink.recording import schemas_pb2 as pb
 from aolink.recording import topics
 from aolink.recording.reader import Recording
@@ -24,6 +23,7 @@ from aolink.rig import Rig, load_rig, parse_rig
 from aolink.session import Report, record
 from aolink.session.replay import would_command
 from aolink.wire import messages_pb2 as wire
+from tests.commands import simulated_rig
 from tests.control.rigs import DRIFT, VIBRATION, small_rig
 from tests.control.test_fall_back import played, vibration
 from tests.kinds import messages_of, must_be
@@ -80,6 +80,7 @@ def test_on_virtual_time_the_session_is_the_loop_in_memory_bit_for_bit(
         )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["tip-tilt", "sh-4x4"])
 def test_spots_close_the_loop_over_the_wire_as_in_memory(tmp_path: Path, name: str) -> None:
     """Two slopes of one mirror; sixteen spots, each with a plant of its own."""
@@ -124,7 +125,7 @@ def test_estimates_of_a_closed_loop_are_the_same_offline(tmp_path: Path) -> None
     assert first_difference(recording.estimates("o1"), reestimate(recording, ["o1"])["o1"]) is None
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_faults_on_the_wire_leave_the_loop_closed_and_every_step_accounted_for(tmp_path: Path) -> None:
     """Frames are lost, commands and reports come again; and the same seed gives the same bytes."""
     path = rig_file(tmp_path, small_rig(VIBRATION), FAULTS)
@@ -143,7 +144,7 @@ def test_faults_on_the_wire_leave_the_loop_closed_and_every_step_accounted_for(t
     assert np.sqrt(np.mean([truth.path**2 for truth in truths if truth is not None])) < 0.07  # 0.1 in the open loop
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_in_real_time_every_step_is_accounted_for_and_within_limits(tmp_path: Path) -> None:
     """Nothing is said about how fast: only that each step ends once, and each exposure has its delay."""
     path = rig_file(tmp_path, small_rig(DRIFT))
@@ -169,7 +170,7 @@ def test_in_real_time_every_step_is_accounted_for_and_within_limits(tmp_path: Pa
     assert len(held) == report.steps_applied
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_an_estimator_that_is_too_slow_to_control_opens_the_loop_and_costs_nothing_else(tmp_path: Path) -> None:
     """`sampled` takes longer for an exposure than six of them last: the mirror holds, and the recording has it all."""
     path = rig_file(tmp_path, small_rig(DRIFT))
@@ -283,19 +284,30 @@ def test_a_controller_that_does_not_pay_is_left_and_the_recording_says_so(tmp_pa
 
 
 @pytest.mark.parametrize(
-    ("controller", "estimators", "rig", "message"),
+    ("controller", "rig", "message"),
     [
-        ("pid", [], small_rig(), "there is no controller 'pid'"),
-        ("lqg", [], small_rig(), "the controller lqg needs an estimator's state: give one, such as moments"),
-        ("integrator", [], small_rig(control="gain = 4.0"), "is unstable: .* close it all the same with --force"),
+        ("pid", small_rig(), "there is no controller 'pid'"),
+        ("integrator", small_rig(control="gain = 4.0"), "is unstable: .* close it all the same with --force"),
     ],
 )
 def test_a_loop_that_cannot_be_closed_is_refused_before_anything_is_opened(
-    tmp_path: Path, controller: str, estimators: list[str], rig: Rig, message: str
+    tmp_path: Path, controller: str, rig: Rig, message: str
 ) -> None:
     with pytest.raises(ControlError, match=message):
-        record(rig, "/dev/none", "/dev/none", tmp_path / "a.mcap", estimators=estimators, control=controller)
+        record(rig, "/dev/none", "/dev/none", tmp_path / "a.mcap", control=controller)
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(("controller", "estimators"), [("lqg", ["moments"]), ("integrator", [])])
+def test_a_controller_that_needs_an_estimator_has_the_default_one(
+    tmp_path: Path, controller: str, estimators: list[str]
+) -> None:
+    path = rig_file(tmp_path, small_rig(DRIFT))
+    with simulated_rig(path) as ports:
+        report = record(load_rig(path), *ports, tmp_path / "a.mcap", exposures=4, control=controller)
+    assert report.control is not None
+    assert report.control.estimator == "".join(estimators)
+    assert Recording(tmp_path / "a.mcap").estimators == estimators
 
 
 def test_an_unstable_loop_that_is_forced_stays_within_the_limits(tmp_path: Path) -> None:
@@ -365,7 +377,7 @@ def test_with_a_queue_the_loop_is_as_good_as_its_delay(tmp_path: Path) -> None:
     assert report.steps_commanded == sum(getattr(report, f"steps_{end}") for end in ends)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_commands_that_are_lost_while_others_replace_them_are_accounted_for(tmp_path: Path) -> None:
     rig = parse_rig(
         small_rig(VIBRATION).toml + "[simulation.faults]\ncommand_loss_rate = 0.2\npacket_loss_rate = 0.05\n"

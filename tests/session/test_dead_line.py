@@ -16,7 +16,6 @@ import pytest
 from foxglove_schemas_protobuf.Log_pb2 import Log
 
 from aolink.errors import DeviceError
-from aolink.jobs.demo import simulated_rig
 from aolink.recording import topics
 from aolink.recording.reader import Recording
 from aolink.rig import Rig, load_rig
@@ -24,6 +23,7 @@ from aolink.session import Report, record
 from aolink.wire import messages_pb2 as pb
 from aolink.wire.packet import MessageDecoder, PacketDecoder
 from aolink.wire.port import SerialPort
+from tests.commands import simulated_rig
 from tests.kinds import messages_of
 
 
@@ -111,7 +111,7 @@ def recorded(
         return None, str(error)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_dead_line_ends_the_session_and_the_mirror_stays_parked_until_it_is_told(
     rig_file: Path, tmp_path: Path, aolink: Callable[..., subprocess.CompletedProcess[str]]
 ) -> None:
@@ -134,7 +134,7 @@ def test_a_dead_line_ends_the_session_and_the_mirror_stays_parked_until_it_is_to
     assert (again.ended, again.rearmed) == ("complete", 1)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_line_that_comes_back_is_told_to_go_on_and_the_gap_is_recorded(rig_file: Path, tmp_path: Path) -> None:
     rig = load_rig(rig_file)
     with line_of(rig_file) as (camera, line):

@@ -10,10 +10,10 @@ from pathlib import Path
 import pytest
 from google.protobuf.message import Message
 
-from aolink.jobs.demo import simulated_rig
 from aolink.rig import load_rig
 from aolink.session.dry_run import dry_run
 from aolink.wire import messages_pb2 as pb
+from tests.commands import simulated_rig
 from tests.hostile import lying_rig
 
 Run = Callable[..., subprocess.CompletedProcess[str]]
@@ -25,6 +25,7 @@ def ports() -> Iterator[tuple[str, ...]]:
         yield "--camera", camera, "--mirror", mirror
 
 
+@pytest.mark.slow
 def test_all_that_was_found_is_said(aolink: Run, ports: tuple[str, ...], tmp_path: Path) -> None:
     arguments = ("record", *ports, "--rig", "section-vi", "--dry-run", "-o", "a.mcap")
     played = aolink(*arguments, "--exposures", "20", "-e", "o3")

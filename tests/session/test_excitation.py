@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 
 from aolink.errors import DeviceError, RigError
-from aolink.jobs.demo import simulated_rig
 from aolink.recording import topics
 from aolink.recording.reader import Recording
 from aolink.rig import load_rig
 from aolink.session.excitation import excitation
 from aolink.wire import messages_pb2 as pb
+from tests.commands import simulated_rig
 from tests.kinds import messages_of
 
 RIG = load_rig("section-vi")
@@ -141,7 +141,7 @@ def test_a_table_beyond_the_limits_is_refused_before_anything_is_sent(tmp_path: 
         excitation([str(tmp_path / "u.npy")], RIG)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_session_plays_what_it_is_told_and_says_so(aolink: Run, tmp_path: Path) -> None:
     text = f"prbs:amplitude={MOST},to=40,seed=3"
     with simulated_rig("section-vi") as (camera, mirror):

@@ -217,7 +217,7 @@ def flood(after: type[Message], begun: threading.Event) -> Lie:
     return lie
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("real_time", [False, True])
 def test_a_flood_ends_the_session_before_it_fills_the_memory(tmp_path: Path, real_time: bool) -> None:
     lies = {"camera": flood(pb.Ack, threading.Event())}
@@ -233,11 +233,13 @@ def test_a_stop_is_heard_in_a_flood(tmp_path: Path) -> None:
     with lying_rig(RIG, mirror=flood(pb.CommandAck, begun)) as ports:
         report = record(RIG, *ports, tmp_path / "a.mcap", stop=begun.is_set)
     assert report.ended == "interrupted"
-    assert any("sends messages without handling those it was sent" in warning for warning in report.warnings)
+    # A busy machine may hold the flood up, or let more of it come, before the session gives up.
+    why = ("sends messages without handling those it was sent", "has said nothing for", "without answering")
+    assert any(each in warning for each in why for warning in report.warnings)
     assert Recording(tmp_path / "a.mcap").complete
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_clock_that_is_set_back_during_a_session(tmp_path: Path) -> None:
     """From the first stamp on the frames say that they are uncertain, until the new clock is known; nothing stops."""
     set_back_ns, path = -50_000_000, tmp_path / "a.mcap"

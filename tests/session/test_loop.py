@@ -7,13 +7,13 @@ from pathlib import Path
 import numpy as np
 
 from aolink.estimation import Driver
-from aolink.jobs.demo import simulated_rig
 from aolink.recording.reader import Recording
 from aolink.recording.writer import RecordingWriter
 from aolink.rig import load_rig
 from aolink.session.commanding import lead_steps
 from aolink.session.loop import SessionLoop
 from aolink.wire import messages_pb2 as pb
+from tests.commands import simulated_rig
 from tests.session.native import open_native
 
 RIG = load_rig("section-vi")

@@ -12,10 +12,10 @@ import pytest
 from google.protobuf.message import Message
 
 from aolink.errors import DeviceError, PortError, RigError
-from aolink.jobs.demo import simulated_rig
 from aolink.recording.reader import Recording
 from aolink.rig import load_rig
 from aolink.session import record
+from tests.commands import simulated_rig
 from tests.session.pulled_line import pulled_line
 from tests.session.test_reconnect import once_latched, pulling
 
@@ -30,7 +30,7 @@ def ports() -> Iterator[tuple[str, str]]:
         yield ports
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("seed", "why"),
     [
@@ -100,7 +100,7 @@ def test_a_session_is_interrupted_while_a_port_is_gone(ports: tuple[str, str], t
     assert Recording(path).complete
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_rig_whose_ports_vanish_by_its_rate(aolink: Run) -> None:
     with simulated_rig("section-vi", "--real-time", "--fault", "vanish=0.01", "--fault", "vanish_s=0.3") as ports:
         camera, mirror = ports

@@ -16,7 +16,7 @@ from bench_rows.parking import RIG, WAYS, parked_after_s
 BY_NAME = {way.name: way for way in WAYS}
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["SIGKILL of the host", "the host is stopped (SIGSTOP)"])
 def test_a_mirror_whose_host_is_gone_is_parked_within_its_watchdog(serve: Ports, name: str) -> None:
     """The host sends nothing any more, so that only the device counts the time."""
@@ -24,7 +24,7 @@ def test_a_mirror_whose_host_is_gone_is_parked_within_its_watchdog(serve: Ports,
         assert parked_after_s(BY_NAME[name], *ports) <= load_rig(RIG).mirror.watchdog_s
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_host_that_fails_parks_the_mirror(serve: Ports) -> None:
     with serve() as ports:
         assert parked_after_s(BY_NAME["an exception"], *ports) == pytest.approx(0.0, abs=2.0)  # a number: it is parked

@@ -12,13 +12,13 @@ from foxglove_schemas_protobuf.Log_pb2 import Log
 from google.protobuf.message import Message
 
 import aolink
-from aolink.jobs.demo import simulated_rig
 from aolink.recording import topics
 from aolink.recording.reader import Recording
 from aolink.recording.reestimate import first_difference, reestimate
 from aolink.rig import load_rig
 from aolink.session import Report, record
 from aolink.wire import messages_pb2 as pb
+from tests.commands import simulated_rig
 from tests.kinds import messages_of
 from tests.session.conftest import Ports
 from tests.session.pulled_line import PulledLine, pulled_line
@@ -75,7 +75,7 @@ def check_whole(path: Path, report: Report, exposures: int) -> None:
     assert {(first - firsts[0]) % PERIOD for first in firsts} == {0}
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_mirror_that_is_pulled_out_and_plugged_in_goes_on(serve: Ports, tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     with serve() as (camera, mirror), pulled_line(mirror, tmp_path / "mirror", once_latched) as line:
@@ -94,7 +94,7 @@ def test_a_mirror_that_is_pulled_out_and_plugged_in_goes_on(serve: Ports, tmp_pa
         assert text in logged(path)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_camera_that_is_pulled_out_loses_exposures_and_goes_on_with_the_others(serve: Ports, tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     with serve() as (camera, mirror), pulled_line(camera, tmp_path / "camera", once_some_frames_are_missed()) as line:
@@ -115,7 +115,7 @@ def test_a_camera_that_is_pulled_out_loses_exposures_and_goes_on_with_the_others
         assert abs(estimate.path.mean() - exposure.truth.path.mean()) < 5 * sigma
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_both_ports_vanish_and_return_on_tcp(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     with (
@@ -132,7 +132,7 @@ def test_both_ports_vanish_and_return_on_tcp(tmp_path: Path) -> None:
     assert report.frames_lost > 2
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_with_a_slew_limit_the_mirror_goes_slowly_from_the_safe_input_to_what_is_commanded(tmp_path: Path) -> None:
     path, slew = tmp_path / "a.mcap", 0.05
     (tmp_path / "rig.toml").write_text(RIG.toml.replace("dac_bits = 16", f"dac_bits = 16\nslew_max_per_s = {slew}"))
@@ -162,7 +162,7 @@ def test_with_a_slew_limit_the_mirror_goes_slowly_from_the_safe_input_to_what_is
     np.testing.assert_allclose(np.diff(after)[after[1:] < 0.01], most)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_closed_loop_with_a_slew_limit_goes_on_after_a_gap(tmp_path: Path) -> None:
     path, slew = tmp_path / "a.mcap", 0.05
     (tmp_path / "rig.toml").write_text(RIG.toml.replace("dac_bits = 16", f"dac_bits = 16\nslew_max_per_s = {slew}"))

@@ -21,7 +21,6 @@ from aolink.cli.common import app
 from aolink.errors import DeviceError, EstimatorError, RecordingError, RestorationError
 from aolink.estimation.estimate import motion
 from aolink.exposure import Exposure, Picture
-from aolink.jobs.demo import simulated_rig
 from aolink.numerics.covariance import psd_root
 from aolink.optics.camera import to_density
 from aolink.optics.scene import SceneSensor, framed
@@ -39,6 +38,7 @@ from aolink.rig import load_rig
 from aolink.rig.scene_table import read_scene_picture
 from aolink.session import Report, record
 from aolink.viewing import LiveView, save_rrd
+from tests.commands import simulated_rig
 from tests.kinds import must_be, truth_of
 from tests.session.test_session import FAULTY
 from tests.viewing.rrd import read_rrd
@@ -118,7 +118,7 @@ def test_who_watches_gets_each_exposure_with_its_scene(tmp_path: Path) -> None:
         np.testing.assert_array_equal(mine.scene.pixels, other.scene.pixels)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_bad_link_costs_scenes_their_own_pixels_and_is_reproducible(tmp_path: Path) -> None:
     rig = tmp_path / "faulty.toml"
     rig.write_text(RIG.toml + FAULTY)  # its picture comes with aolink
@@ -251,6 +251,7 @@ def test_the_truth_is_not_read(session: Path, sharp: Path, tmp_path: Path) -> No
     assert len(again) == 3 * EXPOSURES
 
 
+@pytest.mark.slow
 def test_recorded_estimates_are_used_and_old_results_replaced(session: Path, sharp: Path, tmp_path: Path) -> None:
     again, direct = tmp_path / "again.mcap", tmp_path / "direct.mcap"
     write_deblurred(Recording(sharp), again, estimator="o1")
@@ -341,7 +342,7 @@ def test_spots_are_restored_in_the_windows_that_have_one() -> None:
     assert done.spots.sum() == pytest.approx(done.spots[window].sum())
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_all_spots_of_a_bench_are_restored() -> None:
     """48 of them behind a pupil: each has its light in fewer pixels than it came in."""
     exposures = aolink.simulate("sh-8x8", 2)
@@ -405,6 +406,7 @@ def test_what_cannot_be_restored_says_why(session: Path, tmp_path: Path) -> None
         _ = Recording(broken).true_scene
 
 
+@pytest.mark.slow
 def test_the_command_deblurs_a_recording(aolink: Run, session: Path, tmp_path: Path) -> None:
     shutil.copy(session, tmp_path / "a.mcap")
     done = aolink("deblur", "a.mcap", "-e", "o1", "--method", "gauss_markov", "-o", "b.mcap", "--json")
@@ -430,7 +432,7 @@ def test_a_method_that_does_not_exist(session: Path, tmp_path: Path) -> None:
     assert "there is no restoration method 'best': use one of inverse, predictor" in str(refused.exception)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_demo_from_a_rig_file_with_a_picture_and_slopes_beside_it(aolink: Run, tmp_path: Path) -> None:
     """What a rig file names is relative to it, wherever the demo's folder is."""
     folder = tmp_path / "mine"

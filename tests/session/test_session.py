@@ -14,7 +14,6 @@ import pytest
 
 import aolink
 from aolink.estimation import Driver, run, score
-from aolink.jobs.demo import simulated_rig
 from aolink.recording import topics
 from aolink.recording.compare import compare
 from aolink.recording.facts import recording_facts
@@ -28,6 +27,7 @@ from aolink.recording.reestimate import (
 )
 from aolink.rig import load_rig, parse_rig
 from aolink.session import record
+from tests.commands import simulated_rig
 from tests.conftest import ESTIMATORS, EXPOSURES, Session
 
 
@@ -185,7 +185,7 @@ duplicate_rate = 0.03
 """
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_bad_link_loses_frames_and_nothing_else(tmp_path: Path) -> None:
     """Every command gets through by retransmission, lost frames are bridged, and it is reproducible."""
     rig_file = tmp_path / "faulty.toml"
@@ -230,7 +230,7 @@ def test_a_rig_file_with_other_numbers_is_a_warning(tmp_path: Path) -> None:
     assert Recording(tmp_path / "a.mcap").metadata["warnings"] == warning
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_demo_does_the_main_job(aolink: Callable[..., subprocess.CompletedProcess[str]], tmp_path: Path) -> None:
     result = aolink("demo", "--rig", "section-vi-lively", "--exposures", "20", "--out", tmp_path)
     assert result.returncode == 0, result.stderr
@@ -243,7 +243,7 @@ def test_the_demo_does_the_main_job(aolink: Callable[..., subprocess.CompletedPr
         assert "picture   none: " in result.stdout
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("arguments", [["--exposures", "3"], ["--duration", "0.5"]])
 def test_the_commands_of_a_session_by_hand_work_one_after_the_other(
     aolink: Callable[..., subprocess.CompletedProcess[str]], arguments: list[str]

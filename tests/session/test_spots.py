@@ -12,11 +12,11 @@ import pytest
 import aolink
 from aolink.estimation.estimate import Status
 from aolink.estimation.score import score
-from aolink.jobs.demo import simulated_rig
 from aolink.recording.reader import Recording
 from aolink.recording.reestimate import first_difference, reestimate
 from aolink.rig import load_rig
 from aolink.session import record
+from tests.commands import simulated_rig
 from tests.conftest import Session
 from tests.session.test_session import FAULTY
 
@@ -95,7 +95,7 @@ def test_one_mirror_with_a_tilted_spot_that_is_exposed_between_fast_steps(tmp_pa
     assert rmse["moments"] < 0.6 * rmse["o3"]
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_over_a_bad_link_frames_come_in_part_and_the_rest_of_them_is_used(tmp_path: Path) -> None:
     rig_file, path = tmp_path / "faulty.toml", tmp_path / "a.mcap"
     rig_file.write_text(load_rig("sh-4x4").toml + FAULTY)
@@ -153,7 +153,7 @@ def test_a_row_of_inputs_may_be_longer_than_a_packet(tmp_path: Path, faults: str
     assert first_difference(recording.estimates("o3"), reestimate(recording, ["o3"])["o3"]) is None
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_demo_works(aolink: Callable[..., subprocess.CompletedProcess[str]], tmp_path: Path) -> None:
     result = aolink("demo", "--rig", "single-lenslet", "--exposures", "8", "--out", tmp_path)
     assert result.returncode == 0, result.stderr

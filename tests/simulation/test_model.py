@@ -79,7 +79,7 @@ def test_states_of_consecutive_exposures_join():
         np.testing.assert_array_equal(truth_of(before).end_state, truth_of(after).start_state)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_states_scatter_as_the_lifted_covariance_says():
     transition, noise = lift(RIG.plant, 200)
     exposures = simulate(RIG, 3000, seed=3, inputs=np.zeros((600_000, 1)))

@@ -18,9 +18,7 @@ from aolink.simulation import streams
 from aolink.simulation.streams import PtyStream, TcpStream, open_streams
 from aolink.wire import messages_pb2 as pb
 from aolink.wire.packet import Packet, PacketDecoder, encode_message, encode_packet
-from aolink.wire.signing import Signing
 
-KEY = bytes(range(32))
 IDENTIFY = encode_message(pb.Identify(nonce=7), 0)
 COMMAND = encode_message(pb.CommandBlock(block_id=1, first_step=50, n_steps=300, u=[0.05] * 300), 1)
 POST = b"POST / HTTP/1.1\r\nHost: 127.0.0.1:5000\r\nContent-Type: text/plain\r\nContent-Length: 2500\r\n\r\n"
@@ -77,12 +75,11 @@ def test_a_host_that_identifies_itself_is_served(stream: TcpStream) -> None:
         b"\0\0" + IDENTIFY + COMMAND,
         b"G" + IDENTIFY,
         COMMAND,
-        encode_packet(Packet(2, 1, 0, b"")),
         encode_packet(Packet(1, 1, 0, b"\xff")),
         IDENTIFY[:4] + bytes([IDENTIFY[4] ^ 1]) + IDENTIFY[5:],
         b"x" * 5000,
     ],
-    ids=["a web page", "delimiter", "one byte", "command", "version", "payload", "checksum", "endless"],
+    ids=["a web page", "delimiter", "one byte", "command", "payload", "checksum", "endless"],
 )
 def test_who_begins_with_anything_else_is_dropped_unheard(stream: TcpStream, sent: bytes) -> None:
     with connect(stream) as host:
@@ -133,21 +130,19 @@ def test_a_silent_host_gives_way_to_one_that_identifies_itself(stream: TcpStream
 
 
 @pytest.mark.parametrize("host", ["0.0.0.0", "[::]"])
-def test_other_machines_need_an_explicit_word(host: str) -> None:
-    with pytest.raises(PortError, match=r"lets other machines move the mirror.* 127\.0\.0\.1:0, or add --allow-remote"):
+def test_no_other_machine_can_connect(host: str) -> None:
+    with pytest.raises(PortError, match=r"let every machine that reaches this one move the mirror.* 127\.0\.0\.1:0"):
         open_streams(f"{host}:0")
-    with pytest.raises(
-        PortError, match=r"everybody who reaches this machine move the mirror: add --key FILE.*--unsigned"
-    ):
-        open_streams(f"{host}:0", allow_remote=True)
 
 
-@pytest.mark.parametrize(("key", "unsigned"), [(KEY, False), (None, True)])
-def test_with_the_word_they_may(key: bytes | None, unsigned: bool) -> None:
-    opened = open_streams("0.0.0.0:0", key=key, allow_remote=True, unsigned=unsigned)
-    assert opened["camera"].name.startswith("socket://0.0.0.0:")
-    for each in opened.values():
-        each.close()
+@pytest.mark.parametrize("version", [2, 3])
+def test_an_identify_of_another_version_is_answered_and_not_taken(stream: TcpStream, version: int) -> None:
+    with connect(stream) as host:
+        host.sendall(encode_packet(Packet(version, 1, 0, b"\x08\x07" + bytes(13))) + COMMAND)
+        packet = answer(stream, host)
+        assert packet.version == 1
+        assert f"version {version}, this device speaks version 1".encode() in packet.payload
+        assert taken(stream, lambda data: is_closed(host)) == b""
 
 
 def answer(stream: TcpStream, host: socket.socket) -> Packet:
@@ -159,30 +154,6 @@ def answer(stream: TcpStream, host: socket.socket) -> Packet:
             for packet in packets.feed(host.recv(65_536)):
                 return packet
     raise AssertionError("nobody answers")
-
-
-def test_a_signed_port_serves_only_who_has_the_key() -> None:
-    stream = TcpStream("127.0.0.1", 0, Signing(KEY, "mirror", to_host=True))
-    mirror = Signing(KEY, "mirror", to_host=False)
-    signed = encode_message(pb.Identify(nonce=7), 0, mirror)
-    other = encode_message(pb.Identify(nonce=7), 0, Signing(bytes(32), "mirror", to_host=False))
-    for wrong, why in ((IDENTIFY, b"is not signed"), (other, b"is signed with another key")):
-        with connect(stream) as stranger:
-            stranger.sendall(wrong + COMMAND)
-            packet = answer(stream, stranger)
-            assert (packet.version, mirror.refusal(packet)) == (2, "")
-            assert why in packet.payload
-            stranger.sendall(signed)  # who has made a mistake may try again at once
-            assert taken(stream, lambda data: data != b"") == b"\0" + signed
-    stream.close()
-
-
-def test_a_signed_identify_is_told_where_no_key_is_known(stream: TcpStream) -> None:
-    with connect(stream) as host:
-        host.sendall(encode_message(pb.Identify(nonce=7), 0, Signing(KEY, "mirror", to_host=False)))
-        packet = answer(stream, host)
-    assert packet.version == 1
-    assert b"this Identify is signed" in packet.payload
 
 
 def test_a_host_that_is_not_there_is_refused() -> None:

@@ -39,6 +39,7 @@ def bench(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
     return subprocess.run(list(map(str, command)), capture_output=True, text=True, timeout=300, cwd=TOOLS.parent)
 
 
+@pytest.mark.slow
 def test_a_run_is_written_with_its_machine_and_compared_with_the_next(tmp_path: Path) -> None:
     done = bench("--short", "recording_rate", "--json", tmp_path / "a.json")
     assert done.returncode == 0, done.stderr
@@ -107,7 +108,7 @@ def test_a_curve_knows_its_power_and_is_drawn(tmp_path: Path, monkeypatch: pytes
     assert drawn.read_bytes().count(b'id="axes_') == 4
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_costs_are_measured_and_drawn(tmp_path: Path) -> None:
     done = bench("--plots", tmp_path, "--short")
     assert done.returncode == 0, done.stderr

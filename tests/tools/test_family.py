@@ -93,7 +93,7 @@ def test_the_first_runs_of_a_scene_are_those_of_all(seed: int) -> None:
         assert part.truth.path.shape == first.path.shape
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_it_is_stopped_and_continued(tmp_path: Path) -> None:
     rows = tmp_path / "rows.jsonl"
     command = [TOOLS / "family", "--rows", rows, "--runs", "2", "--exposures", "6"]
@@ -114,7 +114,7 @@ def test_it_is_stopped_and_continued(tmp_path: Path) -> None:
     assert [line.partition('"seconds"')[0] for line in again] == [line.partition('"seconds"')[0] for line in both]
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_rows_that_the_repository_keeps_are_those_of_todays_code() -> None:
     """The rows of two scenes, a line and a spot on a plane, agree to one part in a thousand; other machines and another
     order of sums change them by less."""

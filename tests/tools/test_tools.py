@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
-import inspect
 import os
 import re
 import subprocess
@@ -25,20 +23,6 @@ ROOT = TOOLS.parent
 def run(*command: str | Path, environment: dict[str, str] | None = None) -> subprocess.CompletedProcess[str]:
     arguments = [sys.executable, *map(str, command)]
     return subprocess.run(arguments, capture_output=True, text=True, timeout=600, cwd=ROOT, env=environment)
-
-
-def test_every_program_is_run_somewhere() -> None:
-    """Whoever adds one decides here, or in .ci/run, where it is tried."""
-    programs = {each.name for each in TOOLS.iterdir() if each.is_file() and each.read_bytes()[:2] == b"#!"}
-    by_ci, here, by_their_own_tests = (
-        {"demo", "test", "bench", "fuzz"},
-        {"pictures", "protocol", "recordings", "scene"},
-        {"family", "paper"},
-    )
-    assert programs == by_ci | here | by_their_own_tests
-    ci = (ROOT / ".ci" / "run").read_text()
-    for name in by_ci:
-        assert f"tools/{name}" in ci
 
 
 def test_what_protocol_generates_is_what_is_there(tmp_path: Path) -> None:
@@ -63,7 +47,7 @@ def test_the_scene_is_the_one_that_is_drawn(tmp_path: Path) -> None:
     assert np.abs(made - there).mean() < 0.5
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_reference_recordings_can_be_made_anew(tmp_path: Path) -> None:
     done = run(TOOLS / "recordings", "--out", tmp_path, "--exposures", "2")
     assert done.returncode == 0, done.stderr
@@ -75,7 +59,7 @@ def test_the_reference_recordings_can_be_made_anew(tmp_path: Path) -> None:
         assert recording.estimators == there.estimators
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_bad_inputs_find_nothing() -> None:
     done = run(TOOLS / "fuzz", "--count", "20", "--from", "1000")
     assert done.returncode == 0, done.stdout + done.stderr
@@ -93,7 +77,7 @@ def test_a_kind_of_inputs_that_there_is_not_is_an_error() -> None:
 # The benchmark
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_row_that_fails_says_so_and_the_others_go_on() -> None:
     """Rows of restoration need scikit-image: without it they fail, and the row before and the one after do not."""
     code = (
@@ -111,7 +95,7 @@ def test_a_row_that_fails_says_so_and_the_others_go_on() -> None:
     assert "Traceback" in done.stderr
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_rows_that_work_end_well() -> None:
     done = run(TOOLS / "bench", "--short", "turbulence", "recording_rate")
     assert done.returncode == 0, done.stderr
@@ -123,44 +107,7 @@ def test_a_word_that_no_row_has_is_an_error() -> None:
     assert "no figure has 'turbulense' in its name" in done.stderr
 
 
-@pytest.mark.parametrize(
-    "group",
-    [
-        "estimation",
-        "optics",
-        "wire",
-        "clock",
-        "reach",
-        "parking",
-        "devices",
-        "recording",
-        "start",
-        "batches",
-        "restoration",
-        "moving_scene",
-        "loop",
-        "loop_worth",
-    ],
-)
-def test_every_row_that_is_written_is_in_the_table(group: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.syspath_prepend(str(TOOLS))
-    if group == "restoration":
-        needed("skimage")
-    if group == "loop_worth":
-        needed("pyrtc")
-    groups = importlib.import_module("bench_rows.groups").ROWS
-    module = importlib.import_module(f"bench_rows.{group}")
-    measuring = ("Row", "list[Row]")
-    written = {
-        name
-        for name, function in inspect.getmembers(module, inspect.isfunction)
-        if function.__module__ == module.__name__ and function.__annotations__.get("return") in measuring
-    }
-    written = {name for name in written if not name.startswith("_")}
-    assert written == set(groups[group])
-
-
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["demo", "method", "scene", "pupil", "loop"])
 def test_pictures_are_made_and_are_those_of_the_pages(name: str, tmp_path: Path) -> None:
     """Short ones; README and the gallery show the repository's own, which are small."""

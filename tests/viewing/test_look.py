@@ -10,12 +10,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from aolink.jobs.demo import simulated_rig
+from aolink.optics.kernel import exposure_density
 from aolink.recording.reader import Recording
 from aolink.recording.reestimate import write_reestimated
 from aolink.rig import load_rig
 from aolink.session import record
 from aolink.viewing import Look, save_rrd
+from tests.commands import simulated_rig
 from tests.needs import needed
 from tests.viewing.rrd import read_blueprint, read_rrd, scalars
 
@@ -38,6 +39,38 @@ def test_one_exposure_has_every_step_of_its_paths_and_nothing_of_others(aolink: 
     assert "Latency" not in layout
 
 
+@pytest.mark.slow
+def test_a_layout_about_an_exposure_has_a_few_views_of_it_and_all_exposures_are_there(tmp_path: Path) -> None:
+    recording = Recording(RECORDINGS / "moving-scene.mcap")
+    path = save_rrd(recording, tmp_path / "about.rrd", look=Look(about=9))
+    entities, layout = read_rrd(path), read_blueprint(path)
+    assert len(entities["/camera/image"]["frame"]) == len(recording)
+    estimates = recording.estimates("o1")
+    np.testing.assert_array_equal(
+        scalars(entities["/path/o1/mean"])[:, 0], np.concatenate([e.path[0] for e in estimates])
+    )
+    assert "/profile/path/o1" not in entities
+    drawn = np.array(entities["/profile/predicted/o1"]["LineStrips2D:strips"][-len(recording) :][9][0])
+    kernel, sensor = recording.rig.sensor.profile.kernel, recording.rig.sensor.profile
+    expected = exposure_density(kernel, sensor.edges, estimates[9].path[0])
+    np.testing.assert_allclose(-drawn[:, 1] / -drawn[:, 1].min(), expected / expected.max(), atol=1e-3)
+    names = [str(name) for view in layout.values() for name in view.get("ViewBlueprint:display_name", [])]
+    assert sorted(names) == [
+        "['Camera: 8 exposures (pixels), paths in their blur']",
+        "['Intensity (1/slope unit) over slope: measured, and predicted']",
+        *[f"['Path, {name}, 95 % band (slope units)']" for name in ("moments", "o1", "o2", "o3", "open-loop")],
+        "['Scene as it came (pixels)']",
+        "['Scene at rest (truth) (pixels)']",
+    ]
+    truth = recording[9].truth
+    assert truth is not None
+    columns = (truth.path[0] - sensor.field[0]) / sensor.pixel_width
+    bounds = [each for view in layout.values() for row in view.get("VisualBounds2D:range", []) for each in row]
+    near = [each for each in bounds if each["y_range"] == [5.0, 13.0]]  # rows of the page
+    assert len(near) == 1
+    assert near[0]["x_range"][0] <= columns.min() < columns.max() <= near[0]["x_range"][1] < sensor.pixels
+
+
 def test_a_part_has_the_exposures_that_begin_in_it(aolink: Aolink, tmp_path: Path) -> None:
     done = aolink("view", LIVELY, "--start", "0.3", "--end", "1.25", "--save", "part.rrd")
     assert done.returncode == 0, done.stderr
@@ -47,7 +80,7 @@ def test_a_part_has_the_exposures_that_begin_in_it(aolink: Aolink, tmp_path: Pat
     assert entities["/camera/image"]["time"][0] == 0
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_lenslet_has_its_own_lines_as_x_and_y(tmp_path: Path, aolink: Aolink) -> None:
     recording = Recording(RECORDINGS / "tip-tilt.mcap")
     done = aolink("view", recording.path, "--lenslet", "0,0", "--save", "spot.rrd")
@@ -101,7 +134,7 @@ def test_what_is_not_there_is_one_clear_error(
     assert not (tmp_path / "x.rrd").exists()
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_side_files_are_drawn_and_reported(aolink: Aolink, tmp_path: Path) -> None:
     needed("matplotlib")
     shutil.copy(LIVELY, tmp_path / "a.mcap")

@@ -105,7 +105,7 @@ def test_the_viewer_shows_what_there_is_and_its_page_says_what_there_is_not(
     assert absent_from_views(path) == []
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_every_figure_is_drawn_or_says_what_it_needs(case: tuple[str, Recording], tmp_path: Path) -> None:
     name, recording = case
     refused = {}

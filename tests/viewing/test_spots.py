@@ -127,7 +127,7 @@ def test_no_view_is_empty(saved: Path) -> None:
     assert missing == []
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_windows_in_the_dark_have_no_paths(tmp_path: Path) -> None:
     rig = load_rig("sh-8x8")
     saved = save_rrd(as_recording(Simulated(rig, ["o1"])), tmp_path / "pupil.rrd")

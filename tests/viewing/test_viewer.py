@@ -23,7 +23,7 @@ from aolink.colours import estimator_colour
 from aolink.errors import RendererError, ViewerError
 from aolink.viewing import open_viewer, screenshot, serve_web
 from aolink.viewing.palette import TRUTH
-from aolink.viewing.process import WEB_PORT, free_port
+from aolink.viewing.process import WEB_PORT, free_port, is_free
 from aolink.viewing.save import save_rrd
 from aolink.viewing.viewer import headless_viewer, settled_picture
 from aolink.viewing.vulkan import has_vulkan
@@ -84,7 +84,7 @@ def spread_tabs(layout: dict[str, Any]) -> dict[str, Any]:
     return layout
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_every_view_shows_data(rrd: Path) -> None:
     try:
         with headless_viewer(rrd) as client:
@@ -108,7 +108,7 @@ def test_every_view_shows_data(rrd: Path) -> None:
     assert columns_with(path, estimator_colour("o3")) > 0.4
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_screenshot_shows_the_layout(rrd: Path, tmp_path: Path) -> None:
     try:
         screenshot(rrd, tmp_path / "session.png", size=(1600, 1000))
@@ -121,7 +121,21 @@ def test_a_screenshot_shows_the_layout(rrd: Path, tmp_path: Path) -> None:
     assert coloured_columns(picture) > 0.8
 
 
-@pytest.mark.long
+@pytest.mark.slow
+def test_a_screenshot_is_of_the_time_that_is_asked_for(rrd: Path, tmp_path: Path) -> None:
+    """The camera's view, in the corner, has another exposure's row framed."""
+    try:
+        corners = [
+            pixels(screenshot(rrd, tmp_path / f"{k}.png", at_ns=at_ns).read_bytes())[:300, :400]
+            for k, at_ns in enumerate([100_000_000, 100_000_000, 900_000_000])
+        ]
+    except ViewerError as error:
+        needs_a_renderer(error)
+    np.testing.assert_array_equal(corners[0], corners[1])
+    assert (corners[0] != corners[2]).any()
+
+
+@pytest.mark.slow
 def test_a_viewer_ends_with_its_block_whatever_happens_in_it(rrd: Path) -> None:
     viewers: list[psutil.Process] = []
 
@@ -183,7 +197,7 @@ def test_without_a_display_the_error_says_what_else_works(rrd: Path, monkeypatch
 
 
 def test_the_web_viewer_is_served_on_loopback_until_interrupted(rrd: Path) -> None:
-    port, seen = free_port(), []
+    seen = []
 
     def look(address: str) -> None:
         with urllib.request.urlopen(address) as page:
@@ -191,7 +205,7 @@ def test_the_web_viewer_is_served_on_loopback_until_interrupted(rrd: Path) -> No
         seen.append(listening(*psutil.Process().children(recursive=True)))
         raise KeyboardInterrupt
 
-    with pytest.raises(KeyboardInterrupt):
+    with free_port() as port, pytest.raises(KeyboardInterrupt):
         serve_web(rrd, port, on_ready=look)
     assert b"<canvas" in seen[0]
     assert seen[1] == {"127.0.0.1"}
@@ -216,14 +230,14 @@ def test_a_viewer_that_gets_the_data_over_the_network_shows_the_layout(rrd: Path
         raise KeyboardInterrupt
 
     try:
-        with pytest.raises(KeyboardInterrupt):
-            serve_web(rrd, free_port(), on_ready=look)
+        with free_port() as port, pytest.raises(KeyboardInterrupt):
+            serve_web(rrd, port, on_ready=look)
     except ViewerError as error:
         needs_a_renderer(error)
     assert {"Session", "Log", "Path, all (slope units)"} <= names
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_recording_is_served_while_it_is_read(
     tmp_path: Path, start_aolink: Callable[..., subprocess.Popen[str]]
 ) -> None:
@@ -251,6 +265,15 @@ def test_a_recording_is_served_while_it_is_read(
         serving.communicate(timeout=60)
     assert {"Session", "Path, all (slope units)", "NIS (no unit) with its 95% bounds"} <= names
     assert serving.returncode == 130
+
+
+def test_a_free_port_is_given_to_nobody_else() -> None:
+    """Neither to a program that asks for any port nor to one that asks for this one."""
+    with free_port() as port, contextlib.ExitStack() as stack:
+        assert is_free(port)
+        assert port not in [stack.enter_context(free_port()) for _ in range(50)]
+        with socket.socket() as other, pytest.raises(OSError, match="in use"):
+            other.bind(("127.0.0.1", port))
 
 
 def test_a_port_in_use_is_one_clear_error(rrd: Path) -> None:
@@ -292,7 +315,7 @@ def test_a_rerun_file_is_shown_as_it_is(rrd: Path, start_aolink: Callable[..., s
     assert serving.returncode == 130
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_what_is_no_rerun_file_is_one_clear_error(aolink: Callable[..., Any], rrd: Path, tmp_path: Path) -> None:
     (tmp_path / "text.rrd").write_text("hello")
     for name, message in (("text.rrd", "text.rrd is not a Rerun file"), ("none.rrd", "there is no file none.rrd")):

@@ -4,17 +4,21 @@ from __future__ import annotations
 
 import os
 import pty
+import resource
+import socket
 import tty
 from collections.abc import Iterator
+from contextlib import ExitStack, closing
 
 import pytest
 
 from aolink.errors import PortError
+from aolink.polling import wait_readable
 from aolink.wire import messages_pb2 as pb
 from aolink.wire.hub import Hub
 from aolink.wire.link import Link
 from aolink.wire.packet import Packet, PacketDecoder, encode_message, encode_packet
-from aolink.wire.port import SerialPort, wait_readable
+from aolink.wire.port import SerialPort
 
 
 class Peer:
@@ -106,6 +110,36 @@ def test_what_is_sent_arrives_and_is_numbered_from_identify(peer: Peer, link: Li
     assert [(p.type, p.sequence) for p in packets] == [(7, 0), (1, 0), (7, 1)]
 
 
+@pytest.fixture
+def many_open() -> Iterator[None]:
+    """All descriptors that ``select`` takes are in use."""
+    limit = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (max(limit[0], 2048), limit[1]))
+    with ExitStack() as stack:
+        while stack.enter_context(open(os.devnull)).fileno() < 1024:
+            pass
+        yield
+    resource.setrlimit(resource.RLIMIT_NOFILE, limit)
+
+
+@pytest.mark.usefixtures("many_open")
+def test_descriptors_above_1023_are_waited_for() -> None:
+    peer = Peer()
+    with (
+        closing(peer), closing(SerialPort(peer.path)) as port, socket.create_server(("127.0.0.1", 0)) as server,
+        closing(SerialPort(f"socket://127.0.0.1:{server.getsockname()[1]}")) as host, server.accept()[0] as device,
+    ):  # fmt: skip
+        for each, say in ((port, peer.say), (host, device.sendall)):
+            assert each.fileno() > 1023
+            assert not wait_readable([each], 0.0)
+            assert each.read_some() == b""
+            say(event("a", 0))
+            link = Link("camera", each, lambda: 42)
+            assert receive(link, 1) == [pb.Event(text="a")]
+            link.send(pb.Park())
+        assert device.recv(100) == os.read(peer.master, 100) == encode_message(pb.Park(), 0)
+
+
 def test_a_port_that_is_pulled_is_one_clear_error(peer: Peer, link: Link) -> None:
     descriptor, peer.master = peer.master, os.open(os.devnull, os.O_RDONLY)
     os.close(descriptor)
@@ -116,8 +150,21 @@ def test_a_port_that_is_pulled_is_one_clear_error(peer: Peer, link: Link) -> Non
 def test_a_port_that_is_not_there_is_refused() -> None:
     with pytest.raises(PortError, match=r"there is no port /dev/nowhere: `aolink devices` lists"):
         SerialPort("/dev/nowhere")
-    with pytest.raises(PortError, match="there is no port nonsense://"):
+    with pytest.raises(PortError, match="nonsense://x' is not a port that aolink opens"):
         SerialPort("nonsense://x")
+
+
+def test_a_host_that_has_gone_is_one_clear_error() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = SerialPort(f"socket://127.0.0.1:{server.getsockname()[1]}")
+        server.accept()[0].close()
+    wait_readable([port], 5.0)
+    with pytest.raises(PortError, match=r"lost socket://.*: the other end is gone; .* Does it serve another host"):
+        port.read_some()
+    port.close()
+    for use in (port.read_some, lambda: port.write(b"a")):
+        with pytest.raises(PortError, match="lost socket://"):
+            use()
 
 
 def test_nothing_listens() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import math
 import os
 import statistics
@@ -129,12 +130,9 @@ def _index_bytes(path: Path) -> int:
 def _serving_s3() -> Iterator[list[int]]:
     """A server; gives the bytes of its answers to requests for objects."""
     from moto.moto_server.werkzeug_app import DomainDispatcherApplication, create_backend_app
-    from werkzeug.serving import WSGIRequestHandler, make_server
+    from werkzeug.serving import make_server
 
-    class Quiet(WSGIRequestHandler):
-        def log(self, type: str, message: str, *arguments: Any) -> None:
-            """Do not print requests."""
-
+    logging.getLogger("werkzeug").setLevel(logging.ERROR)  # requests are no news
     sent: list[int] = []
     answer: Callable[..., Iterable[bytes]] = DomainDispatcherApplication(create_backend_app)
 
@@ -146,7 +144,7 @@ def _serving_s3() -> Iterator[list[int]]:
 
         return answer(environment, start)
 
-    server = make_server("127.0.0.1", 0, counted, threaded=True, request_handler=Quiet)
+    server = make_server("127.0.0.1", 0, counted, threaded=True)
     thread = threading.Thread(target=server.serve_forever)
     thread.start()
     known = {

@@ -1,4 +1,4 @@
-"""Rows about plants that nobody tuned for: the goals over scenes drawn by seed."""
+"""Rows about plants of the family: the goals over scenes drawn by seed."""
 
 from __future__ import annotations
 

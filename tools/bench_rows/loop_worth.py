@@ -125,7 +125,7 @@ class Size:
 
 FULL = Size()
 FRESH = Size(seeds=range(910, 914))
-"""Seeds on which nothing was tuned, and which nobody had looked at when the identification was built."""
+"""Other seeds than those with which the identification was built."""
 SHORT = Size(seeds=range(1, 3), past=64, exposures=6, settled=3, gains=GAINS[:1])
 
 
@@ -280,8 +280,8 @@ def _from_path(cell: Cell, whole: DisturbanceRun, past: int) -> ProcessSum:
 
 def worth_headline(effort: Effort) -> list[Row]:
     """Turbulence and a vibration of equal sd at 2.4 and 2.7 times the frame rate, which centroids cannot reach; in a
-    whole run on fresh seeds as well."""
-    fresh = [] if effort.share < 1 else _rows(HEADLINE, effort, FRESH, "fresh seeds")
+    whole run on other seeds as well."""
+    fresh = [] if effort.share < 1 else _rows(HEADLINE, effort, FRESH, "other seeds")
     return [*_rows(HEADLINE, effort), *fresh]
 
 

@@ -18,7 +18,7 @@ from bench_rows.row import Effort
 
 PICTURES = ("camera", "astronaut", "brick", "coins", "text", "moon", "page")
 FRESH = ("chelsea", "coffee", "rocket")
-"""Nothing was tuned on these."""
+"""Other pictures than those of `PICTURES`."""
 NOISE_SD = 0.01
 _MARGIN = 44
 KERNEL = Kernel(shape="gaussian", sigma=0.3)

@@ -330,8 +330,11 @@ def view_first(effort: Effort) -> Row:
 
     times, path = [], hour(effort)
     for _ in range(effort.of(5)):
-        start, port = time.perf_counter(), free_port()
-        with tempfile.TemporaryFile() as said, running_rerun(["--serve-grpc", "--port", str(port)], said) as process:
+        start = time.perf_counter()
+        with (
+            free_port() as port, tempfile.TemporaryFile() as said,
+            running_rerun(["--serve-grpc", "--port", str(port)], said) as process,
+        ):  # fmt: skip
             wait_for_server(port, process, said)
             stream = rr.RecordingStream("aolink")
             stream.connect_grpc(f"rerun+http://127.0.0.1:{port}/proxy")

@@ -21,7 +21,7 @@ _LIMITS_MS = {"smoother": 15.0, "gauss_markov": 25.0, "tv": 200.0}
 
 
 def restoration_quality(effort: Effort) -> list[Row]:
-    """All methods on the seven pictures with noise and weights found by themselves; three fresh pictures."""
+    """All methods on the seven pictures with noise and weights found by themselves; three other pictures."""
     rows = []
     blur = quality([(c.image, c.scene) for c in cases(PICTURES, effort)])
     others = {name: quality([(f(c), c.scene) for c in cases(PICTURES, effort)]) for name, f in peers.PADDED.items()}
@@ -42,7 +42,7 @@ def restoration_quality(effort: Effort) -> list[Row]:
         # A linear method beside the linear ones, one that keeps edges beside all.
         same_kind = {n: v for n, v in fresh.items() if "Wiener" in n or method in ("tv", "pnp")}
         top = max(same_kind, key=lambda name: fresh[name])
-        rows.append(Row(f"restore {method}: {', '.join(FRESH)}, not tuned on", str(found), f"{top} {fresh[top]:.2f} dB",
+        rows.append(Row(f"restore {method}: {', '.join(FRESH)}", str(found), f"{top} {fresh[top]:.2f} dB",
             found.whole / fresh[top], 1))  # fmt: skip
     return rows
 

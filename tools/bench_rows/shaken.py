@@ -113,7 +113,7 @@ def _scico() -> Any:
         import scico.numpy
         import scico.optimize.admm
     except ModuleNotFoundError:
-        lock = "tools/peers.lock"
+        lock = "tools/locks/peers.txt"
         raise ModuleNotFoundError(f"SCICO is missing: .venv/bin/python -m pip install -r {lock}") from None
     return scico
 

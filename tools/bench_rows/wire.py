@@ -20,13 +20,14 @@ from aolink.assembly import Assembler, FrameReassembly
 from aolink.estimation import Driver
 from aolink.jobs.demo import simulated_rig
 from aolink.numerics.workers import end_with_parent
+from aolink.polling import wait_readable
 from aolink.rig import load_rig, parse_rig
 from aolink.session import record
 from aolink.simulation.devices import SimulatedDevices
 from aolink.wire import messages_pb2 as pb
 from aolink.wire.link import Link
 from aolink.wire.packet import encode_message
-from aolink.wire.port import SerialPort, wait_readable
+from aolink.wire.port import SerialPort
 from bench_rows.row import Effort, Row
 
 _MINUTE_EXPOSURES = 300

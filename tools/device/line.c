@@ -8,14 +8,11 @@ bool line_take(struct line *line, uint8_t byte, struct packet *packet)
 {
     if (!decoder_take(&line->decoder, byte, packet))
         return false;
-    const char *refusal = signing_refusal(&line->signing, packet);
-    if (refusal != NULL) {
-        if (packet->type == IDENTIFY && (packet->version == PROTOCOL_VERSION || packet->version == SIGNED_VERSION))
-            line_event(line, LEVEL_WARNING, 0, refusal);
+    if (packet->version != PROTOCOL_VERSION) {
+        if (packet->type == IDENTIFY)
+            line_event(line, LEVEL_WARNING, 0, "this device speaks version 1 (no signed packets)");
         return false;
     }
-    if (line->signing.key != NULL)
-        signing_take(&line->signing, packet);
     /* A new host counts its packets from anew: its Identify is no duplicate of the last host's. */
     if (packet->type == IDENTIFY)
         line->window.begun = false;
@@ -36,8 +33,8 @@ void line_send(struct line *line, enum type type, const struct writer *writer)
     if (writer->overflow || OUT_BYTES - line->out_size < MAX_WIRE)
         line->out_dropped++;
     else
-        line->out_size += signing_encode(&line->signing, line->out + line->out_size, (uint8_t)type, sequence,
-                                         writer->bytes, writer->size);
+        line->out_size +=
+            packet_encode(line->out + line->out_size, (uint8_t)type, sequence, writer->bytes, writer->size);
 }
 
 void line_ack(struct line *line, const struct packet *packet, enum code code, const char *text, uint64_t step)

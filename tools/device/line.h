@@ -4,7 +4,6 @@
 
 #include "messages.h"
 #include "packet.h"
-#include "signing.h"
 
 /* Bytes that wait to be sent. The longest burst is an answer of the mirror to AppliedQuery (two packets of MAX_WIRE) among
  * acknowledgements, or the camera's frame and its truth. What does not fit is dropped as a whole packet: the host sees
@@ -16,7 +15,6 @@ enum { MESSAGE_BYTES = MAX_PAYLOAD };
 
 struct line {
     struct decoder decoder;
-    struct signing signing;
     struct window window;
     struct parts parts;
     uint8_t message[MESSAGE_BYTES];

@@ -102,33 +102,6 @@ static void receive(int fd, bool is_camera)
     }
 }
 
-/* The key of both lines, from a file of 64 hexadecimal digits that only this user may read. */
-static const uint8_t *read_key(const char *path)
-{
-    static uint8_t key[KEY_BYTES];
-    struct stat about;
-    FILE *file = fopen(path, "r");
-    bool good = file != NULL && fstat(fileno(file), &about) == 0 && (about.st_mode & 077) == 0;
-    for (int i = 0; good && i < KEY_BYTES; i++) {
-        unsigned byte;
-        good = fscanf(file, "%2x", &byte) == 1;
-        key[i] = (uint8_t)byte;
-    }
-    if (!good) {
-        fprintf(stderr, "%s: expected 64 hexadecimal digits in a file that only its owner may read\n", path);
-        exit(1);
-    }
-    fclose(file);
-    return key;
-}
-
-static struct signing signing_of(const uint8_t *key, uint8_t link)
-{
-    /* Whatever was signed before this moment is old. Later on the host's time stamps stand for a clock. */
-    uint64_t now = ((uint64_t)time(NULL) - STAMP_EPOCH_S) * STAMPS_PER_S;
-    return (struct signing){.key = key, .link = link, .heard = now};
-}
-
 static void serve(struct port camera_port, struct port mirror_port)
 {
     int camera_fd = camera_port.fd, mirror_fd = mirror_port.fd;
@@ -166,19 +139,16 @@ static void serve(struct port camera_port, struct port mirror_port)
 int main(int argc, char **argv)
 {
     const char *camera_link = NULL, *mirror_link = NULL;
-    const uint8_t *key = NULL;
     unsigned long long seed = SEED;
-    for (int option; (option = getopt(argc, argv, "s:c:m:k:")) != -1;) {
+    for (int option; (option = getopt(argc, argv, "s:c:m:")) != -1;) {
         if (option == 's')
             seed = strtoull(optarg, NULL, 10);
         else if (option == 'c')
             camera_link = optarg;
         else if (option == 'm')
             mirror_link = optarg;
-        else if (option == 'k')
-            key = read_key(optarg);
         else {
-            fprintf(stderr, "usage: device [-s SEED] [-c LINK] [-m LINK] [-k KEYFILE], links to make to camera and mirror\n");
+            fprintf(stderr, "usage: device [-s SEED] [-c LINK] [-m LINK], links to make to camera and mirror\n");
             return 2;
         }
     }
@@ -193,8 +163,6 @@ int main(int argc, char **argv)
     int64_t step_zero_ns = device_ns();
     mirror_begin(&mirror, &rig, step_zero_ns);
     camera_begin(&camera, &rig, step_zero_ns);
-    mirror.line.signing = signing_of(key, LINK_MIRROR);
-    camera.line.signing = signing_of(key, LINK_CAMERA);
     serve(camera_port, mirror_port);
     if (camera_link != NULL)
         unlink(camera_link);

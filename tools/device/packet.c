@@ -43,19 +43,12 @@ static void cobs_put(struct cobs *cobs, const uint8_t *bytes, size_t size)
 
 size_t packet_encode(uint8_t *wire, uint8_t type, uint16_t sequence, const uint8_t *payload, size_t size)
 {
-    return packet_encode_version(wire, PROTOCOL_VERSION, type, sequence, payload, size, payload, 0);
-}
-
-size_t packet_encode_version(uint8_t *wire, uint8_t version, uint8_t type, uint16_t sequence, const uint8_t *payload,
-                             size_t size, const uint8_t *trailer, size_t trailer_size)
-{
-    uint8_t header[HEADER_BYTES] = {version, type, (uint8_t)sequence, (uint8_t)(sequence >> 8)};
+    uint8_t header[HEADER_BYTES] = {PROTOCOL_VERSION, type, (uint8_t)sequence, (uint8_t)(sequence >> 8)};
     struct cobs cobs = {wire, 0, 1};
-    uint32_t crc = crc32(crc32(crc32(0, header, sizeof header), payload, size), trailer, trailer_size);
+    uint32_t crc = crc32(crc32(0, header, sizeof header), payload, size);
     uint8_t tail[CRC_BYTES] = {(uint8_t)crc, (uint8_t)(crc >> 8), (uint8_t)(crc >> 16), (uint8_t)(crc >> 24)};
     cobs_put(&cobs, header, sizeof header);
     cobs_put(&cobs, payload, size);
-    cobs_put(&cobs, trailer, trailer_size);
     cobs_put(&cobs, tail, sizeof tail);
     wire[cobs.code] = (uint8_t)(cobs.size - cobs.code);
     wire[cobs.size++] = 0;
@@ -66,8 +59,7 @@ static bool packet_end(struct decoder *decoder, struct packet *packet)
 {
     const uint8_t *bytes = decoder->bytes;
     size_t body = decoder->size - CRC_BYTES;
-    size_t most = MAX_PACKET - (bytes[0] == SIGNED_VERSION ? 0 : TRAILER_BYTES);
-    if (decoder->broken || decoder->left > 0 || decoder->size < HEADER_BYTES + CRC_BYTES || decoder->size > most) {
+    if (decoder->broken || decoder->left > 0 || decoder->size < HEADER_BYTES + CRC_BYTES) {
         decoder->bad_framing++;
         return false;
     }

@@ -8,14 +8,12 @@
 
 enum {
     PROTOCOL_VERSION = 1,
-    SIGNED_VERSION = 2,                             /* of packets with a signature */
-    TRAILER_BYTES = 13,                             /* link, time stamp and signature, after the message */
     MAX_PAYLOAD = 4608,                             /* bytes of the message in one packet */
     MAX_CHUNK = 4096,                               /* bytes of data in a FrameChunk, a TruthChunk or a Part */
     MAX_MESSAGE = 262144,                           /* bytes of a message in parts */
     HEADER_BYTES = 4,                               /* version, type, sequence */
     CRC_BYTES = 4,
-    MAX_PACKET = HEADER_BYTES + MAX_PAYLOAD + TRAILER_BYTES + CRC_BYTES,
+    MAX_PACKET = HEADER_BYTES + MAX_PAYLOAD + CRC_BYTES,
     MAX_WIRE = MAX_PACKET + MAX_PACKET / 254 + 2    /* COBS adds a byte to each 254 and one; the delimiter */
 };
 
@@ -32,10 +30,6 @@ uint32_t crc32(uint32_t crc, const uint8_t *bytes, size_t size);
 /* Writes one packet and its delimiter; `wire` has room for MAX_WIRE bytes, `size` is at most MAX_PAYLOAD. Returns the
  * number of bytes. */
 size_t packet_encode(uint8_t *wire, uint8_t type, uint16_t sequence, const uint8_t *payload, size_t size);
-
-/* The same of any version, with what follows the message in its payload. */
-size_t packet_encode_version(uint8_t *wire, uint8_t version, uint8_t type, uint16_t sequence, const uint8_t *payload,
-                             size_t size, const uint8_t *trailer, size_t trailer_size);
 
 /* Takes COBS apart while the bytes come, so that it needs one buffer only. */
 struct decoder {

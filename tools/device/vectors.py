@@ -31,9 +31,4 @@ for vector in vectors["parts"]:
     kind, payload = vector["messages"][0] if vector["messages"] else (0, "")
     head = f'"{vector["what"]}", {array(vector["wire"])}'
     print(f"    {{{head}, {kind}, {array(payload)}, {vector['refused']}}},")
-print("};\nstatic const struct with_signature with_signature[] = {")
-for vector in vectors["signed"]:
-    head = f'"{vector["what"]}", {array(vector["key"])}, {vector["link"]}, {vector["heard"]}u'
-    rest = f"{array(vector['payload'])}, {array(vector['wire'])}"
-    print(f"    {{{head}, {vector['type']}, {vector['sequence']}, {rest}, {json.dumps(vector['refused'])}}},")
 print("};\n#endif")

@@ -10,7 +10,7 @@ import dataclasses
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 from scipy import linalg
@@ -50,13 +50,15 @@ _FAST_STEP_S = 0.001
 _KERNEL_SD = 0.05
 
 Geometry = Literal["line", "plane", "plane, one plant"]
+Command = Literal["none", "sine", "steps"]
+Kind = Literal["resonance", "Ornstein-Uhlenbeck", "random walk"]
 
 
 @dataclass(frozen=True, kw_only=True)
 class PlantProcess:
     """One process in a plant, independent of the others."""
 
-    kind: Literal["resonance", "Ornstein-Uhlenbeck", "random walk"]
+    kind: Kind
     swings: float
     """Swings of a resonance in an exposure; for an Ornstein-Uhlenbeck process, 1/(2 pi memory in exposures); for a
     random walk 0."""
@@ -83,7 +85,7 @@ class Scene:
     """Fast steps from one exposure's start to the next one's."""
     kernel_pixels: float
     """sigma, pixels."""
-    command: Literal["none", "sine", "steps"]
+    command: Command
     command_sd: float
     """Largest response to the commands, in sds of the path."""
     command_period: float
@@ -126,11 +128,11 @@ def _of_mode(mode: PlantProcess) -> str:
 def draw(seed: int) -> Scene:
     """The scene of a seed."""
     rng = np.random.default_rng([18, seed])
-    geometry: Geometry = rng.choice(["line", "plane", "plane, one plant"], p=[0.6, 0.2, 0.2])
+    geometry: Geometry = get_args(Geometry)[rng.choice(3, p=[0.6, 0.2, 0.2])]
     steps = round(_between(rng, STEPS))
     period = steps + (round(steps * rng.uniform(0.05, 0.5)) if rng.random() < 0.3 else 0)
     kernel, widths = _between(rng, KERNEL_PIXELS), _between(rng, PATH_WIDTHS)
-    command: Literal["none", "sine", "steps"] = rng.choice(["none", "sine", "steps"], p=[0.6, 0.2, 0.2])
+    command: Command = get_args(Command)[rng.choice(3, p=[0.6, 0.2, 0.2])]
     command_sd = 0.0 if command == "none" else float(rng.uniform(0.3, 1.5))
     while geometry != "line" and _half_pixels(kernel, widths, command_sd) > _LARGEST_WINDOW / 2:
         kernel, widths = _between(rng, KERNEL_PIXELS), _between(rng, PATH_WIDTHS)
@@ -151,7 +153,7 @@ def _between(rng: np.random.Generator, ends: tuple[float, float]) -> float:
 
 def _mode(rng: np.random.Generator, steps: int, period: int, share: float, path_sd: float) -> PlantProcess:
     sd, direction = path_sd * math.sqrt(share), float(rng.uniform(0, math.pi))
-    kind = rng.choice(["resonance", "Ornstein-Uhlenbeck", "random walk"], p=[0.75, 0.15, 0.1])
+    kind: Kind = get_args(Kind)[rng.choice(3, p=[0.75, 0.15, 0.1])]
     if kind == "random walk":
         return PlantProcess(kind=kind, swings=0.0, damping=0.0, sd=sd, direction=direction)
     if kind == "Ornstein-Uhlenbeck":

@@ -39,9 +39,9 @@ def offer_lines(offer: Offer) -> Iterator[str]:
     fitted to."""
     (first, last), (held_first, held_last) = offer.fitted, offer.held_out
     yield (
-        f"{offer.path.name} is offered: log-likelihood {offer.log_likelihood:.1f} nats against {offer.before:.1f} of"
-        f" {offer.before_name} ({offer.before_model}) on frames {held_first} to {held_last}, held out; fitted to frames"
-        f" {first} to {last}"
+        f"{offer.path.name} is offered: it explains frames {held_first} to {held_last}, to which it was not fitted,"
+        f" better than {offer.before_name} ({offer.before_model}) does (log-likelihood {offer.log_likelihood:.1f}"
+        f" against {offer.before:.1f} nats); it was fitted to frames {first} to {last}"
     )
     for one in offer.result.found:
         values = ", ".join(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Container, Mapping
 from dataclasses import asdict
 from typing import Any
 
@@ -18,10 +18,10 @@ _MOST_REASONS = 3
 """How many reasons of one estimator the table shows."""
 
 
-def scores(by_name: Mapping[str, Score]) -> Table:
+def scores(by_name: Mapping[str, Score], only: Container[str] = ()) -> Table:
     """RMSE against truth, NIS and NEES with their 95 % bounds; a mean outside its bounds is marked.
 
-    Where any exposure was gated, a column says how many.
+    Where any exposure was gated, a column says how many. ``only`` names the columns, all by default.
     """
     counted = max((each.exposures for each in by_name.values()), default=0)
     title = f"Estimates of {counted} exposures against the truth" if counted else "No truth in this recording: NIS only"
@@ -37,13 +37,14 @@ def scores(by_name: Mapping[str, Score]) -> Table:
         }  # fmt: skip
     if any(each.gated for each in by_name.values()):
         columns["gated"] = lambda each: f"{each.gated}  "
+    columns = {name: column for name, column in columns.items() if not only or name in only}
     for name in columns:
         table.add_column(name, justify="right", no_wrap=True)
     for name, each in by_name.items():
         table.add_row(name, *(column(each) for column in columns.values()))
     lines = unused_lines(by_name)
     if bounds := _bounds(by_name):
-        of_states = any(math.isfinite(each.start_rmse) for each in by_name.values())
+        of_states = "RMSE start" in columns and any(math.isfinite(each.start_rmse) for each in by_name.values())
         norm = "RMSE of states: norm over the states. " if of_states else ""
         lines = [f"{norm}! outside the 95 % bounds of a consistent filter:", bounds, *lines]
     table.caption = escape("\n".join(lines))

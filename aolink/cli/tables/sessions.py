@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, replace
 from typing import TYPE_CHECKING, Any
 
@@ -11,6 +12,7 @@ from rich.table import Table
 
 from aolink.cli.tables.json import without_nan
 from aolink.cli.tables.scores import unused_lines
+from aolink.estimation.registry import BASELINE_ESTIMATOR
 from aolink.recording import schemas_pb2 as pb
 
 if TYPE_CHECKING:
@@ -47,32 +49,34 @@ def session_as_json(report: Report) -> dict[str, Any]:
 
 
 def session(report: Report) -> Table:
-    """Frames, commands, connections, clock and latencies of a session."""
+    """Frames, commands, clock and latencies of a session; counts of what went wrong only where they are not zero."""
     table = Table(box=None, show_header=False, pad_edge=False)
-    table.add_row(
-        "frames",
-        f"{report.frames_received} received, of them {report.frames_incomplete} with chunks missing;"
-        f" {report.frames_lost} lost whole",
-    )
-    table.add_row(
-        "connections",
-        "discarded: {bad_crc} for their checksum, {bad_framing} for their framing, {bad_payload} for their content;"
-        " {duplicates} duplicates; {sequence_gaps} missing by their sequence numbers".format_map(
-            report.connection_faults
-        ),
-    )
-    table.add_row(
-        "commands",
-        f"{report.steps_commanded} steps commanded: {report.steps_applied} applied ({report.steps_clipped} of them"
-        f" clipped), {report.steps_superseded} superseded, {report.steps_late} late, {report.steps_refused} refused,"
-        f" {report.steps_not_reported} not reported",
-    )
-    table.add_row(
-        "mirror",
-        f"parked in {report.steps_parked} steps of the session, re-armed {report.rearmed} times after its watchdog"
-        f" parked it; {report.blocks_retransmitted} blocks sent again; missing reports requested"
-        f" {report.reports_asked} times",
-    )
+    faults = report.connection_faults
+    frames = (report.frames_incomplete, "with chunks missing"), (report.frames_lost, "lost whole")
+    connections = (
+        (faults["bad_crc"], "discarded for their checksum"), (faults["bad_framing"], "discarded for their framing"),
+        (faults["bad_payload"], "discarded for their content"), (faults["duplicates"], "duplicates"),
+        (faults["sequence_gaps"], "missing by their sequence numbers"),
+    )  # fmt: skip
+    commands = (
+        (report.steps_clipped, "of these clipped"), (report.steps_superseded, "superseded"),
+        (report.steps_late, "late"), (report.steps_refused, "refused"), (report.steps_not_reported, "not reported"),
+    )  # fmt: skip
+    mirror = (
+        (report.steps_parked, "steps of the session parked"), (report.rearmed, "times re-armed after its watchdog"),
+        (report.blocks_retransmitted, "blocks sent again"), (report.reports_asked, "requests for missing reports"),
+    )  # fmt: skip
+    counts = {
+        "frames": [f"{report.frames_received} received", *_counted(frames)],
+        "connections": _counted(connections),
+        "commands": [
+            f"{report.steps_commanded} steps commanded", f"{report.steps_applied} applied", *_counted(commands)
+        ],
+        "mirror": _counted(mirror),
+    }  # fmt: skip
+    for name, parts in counts.items():
+        if parts:
+            table.add_row(name, ", ".join(parts))
     if report.ports_vanished:
         gone = f"vanished {report.ports_vanished} times, and {report.away_s:.2f} s until all had returned"
         table.add_row("ports", gone)
@@ -87,23 +91,26 @@ def session(report: Report) -> Table:
         table.add_row("control", _control(report.control))
     if report.unwatched:
         table.add_row("view", f"{report.unwatched} exposures not shown, for want of time")
-    if report.virtual_time:
-        table.add_row("latency", "n/a on virtual time")
     for name, since, until in () if report.virtual_time else _LATENCY_STEPS:
         table.add_row("latency", f"{name}: {_percentiles(report.latencies, since, until)}")
     return table
 
 
+def _counted(counts: Iterable[tuple[int, str]]) -> list[str]:
+    return [f"{count} {what}" for count, what in counts if count]
+
+
 def _control(report: ControlReport) -> str:
     served = f" with {report.estimator}" if report.estimator else ""
     text = f"{report.controller}{served}: {report.exposures} exposures taken, slopes {report.slope_rms:.4g} rms"
-    if counts := report.counts().get("delay_ms"):
-        text += f"; delay p50 {counts:.3g} ms, longest {report.counts()['longest_delay_ms']:.3g} ms"
-    return (
-        f"{text}, {report.late_exposures} later than control.delay_s; loop open for {report.open_exposures} exposures,"
-        f" model off for {report.misfit_exposures}, fallen back for {report.fall_back_exposures}; limits changed"
-        f" {report.clipped_steps} steps"
-    )
+    if delay := report.counts().get("delay_ms"):
+        text += f"; delay p50 {delay:.3g} ms, longest {report.counts()['longest_delay_ms']:.3g} ms"
+    counts = (
+        (report.late_exposures, "later than control.delay_s"), (report.open_exposures, "with the loop open"),
+        (report.misfit_exposures, "while the model did not fit"), (report.fall_back_exposures, "fallen back"),
+        (report.clipped_steps, "steps changed by the limits"),
+    )  # fmt: skip
+    return ", ".join([text, *_counted(counts)])
 
 
 def _estimation(report: EstimatorReport) -> str:
@@ -162,31 +169,46 @@ def deblurred_lines(summary: RestoredCounts, estimator: str, method: str) -> lis
 
 
 def demo_summary(result: DemoResult, command: str) -> list[str]:
-    """The results of the demo, and what to run next with ``command``."""
+    """The results of the demo, what to run next with ``command``, and the sentence to remember."""
     if result.rrd is None:
         return [f"interrupted; what was recorded is in {result.recording}"]
-    if result.differences:
-        lines = [f"online and offline differ: {name}, {what}" for name, what in result.differences.items()]
-    else:
-        lines = ["online and offline estimates agree bit for bit"]
-    if result.residuals:
-        shown = ", ".join(f"{name} {value:.4g}" for name, value in result.residuals.items())
-        lines.append(f"residual slopes at the fast rate, rms: {shown}")
+    lines = [f"online and offline differ: {name}, {what}" for name, what in result.differences.items()]
+    lines = lines or ["online and offline estimates agree bit for bit"]
     if result.deblurred is not None:
-        from aolink.restoration.registry import DEFAULT_METHOD
-
-        lines += deblurred_lines(result.deblurred, result.deblurred_by, DEFAULT_METHOD)
-    lines.append("times     " + ", ".join(f"{name} {seconds:.1f} s" for name, seconds in result.seconds.items()))
-    lines.append(f"recording {result.recording}")
-    if result.deblurred_recording is not None:
-        lines.append(f"deblurred {result.deblurred_recording}")
-    lines.append(f"rerun     {result.rrd}")
+        lines += [f"{count} not restored: {reason}" for reason, count in result.deblurred.reasons.items()]
     picture = "none" if result.picture is None else str(result.picture)
     if result.not_of_viewer:
         picture += f"{'' if result.picture is None else ', drawn with matplotlib'}: {result.not_of_viewer}"
     return [
-        *lines, f"picture   {picture}",
-        f"next      {command} view {result.deblurred_recording or result.recording}",
-        f"          {command} info {result.recording}",
-        f"          {command} estimate {result.recording} --estimator o3",
+        *lines, "times     " + ", ".join(f"{name} {seconds:.1f} s" for name, seconds in result.seconds.items()),
+        f"shown     {result.shown}", f"picture   {picture}", f"next      {command} view {result.recording}",
+        f"          {command} estimate {result.recording} --estimator profile", "", demo_sentence(result),
     ]  # fmt: skip
+
+
+def demo_sentence(result: DemoResult) -> str:
+    """How well the path is known and the scene restored, and what the closed loop leaves, in one sentence."""
+    errors = {name: score.path_rmse for name, score in result.scores.items() if not math.isnan(score.path_rmse)}
+    parts = [_path_known(errors)] if errors else []
+    if result.residuals:
+        left = ", ".join(f"{name} {value:.4g}" for name, value in result.residuals.items())
+        parts.append(f"the slopes left are, rms, {left}")
+    if result.deblurred is not None and result.deblurred.psnr_restored:
+        facts = deblurred(result.deblurred)
+        parts.append(f"the scene goes from {facts['psnr_blurred_db']:.1f} to {facts['psnr_restored_db']:.1f} dB (PSNR)")
+    text = "; ".join(parts or ["the truth is not known here, and so no error either"])
+    return f"{text[0].upper()}{text[1:]}."
+
+
+def _path_known(errors: Mapping[str, float]) -> str:
+    """The path's error by the estimator of the highest rank, beside that of the centroid."""
+    best, centroid = list(errors)[-1], errors.get(BASELINE_ESTIMATOR)
+    known = f"{errors[best]:#.3g}"
+    if centroid is None or best == BASELINE_ESTIMATOR:
+        return f"the path is known to {known} slope units by {best}"
+    ratio = centroid / errors[best]
+    times = "no better"
+    if not 0.95 < ratio < 1.05:
+        times = f"{ratio:.1f} times better" if ratio > 1 else f"{1 / ratio:.1f} times worse"
+    told = f"the centroid ({BASELINE_ESTIMATOR}) knows the path to {centroid:#.3g} slope units"
+    return f"{told}, its blur ({best}) to {known}, {times}"

@@ -7,7 +7,8 @@ import time
 from serial.tools import list_ports
 
 from aolink.errors import DeviceError
-from aolink.wire.port import SerialPort, wait_readable
+from aolink.polling import wait_readable
+from aolink.wire.port import SerialPort
 
 TIMEOUT_S = 1.0
 """How long a device may take for an answer, unless a request says otherwise."""

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from aolink.devices.mirrors.keys import per_input, scale_per_input, text
 from aolink.devices.simple import Lacks
 from aolink.errors import DeviceError, RigError
-from aolink.extensions import needs_extra
+from aolink.extensions import installed, loaded, needs_extra
 from aolink.rig import Rig
 
 
@@ -23,7 +23,8 @@ class MicroscopeMirror:
     Parameters
     ----------
     device:
-        Path of its class in Python: ``microscope.mirror.alpao.AlpaoDeformableMirror``.
+        Path of its class in python-microscope, such as ``microscope.mirror.alpao.AlpaoDeformableMirror``, or the name
+        under which another package brings one, an entry point of the group ``aolink.microscope``.
     settings:
         The arguments that the class is made with, such as ``serial_number``.
     unit, zero:
@@ -84,17 +85,28 @@ class MicroscopeMirror:
 
 
 def _class_of(path: str) -> Any:
-    """The class of this name. Raises DeviceError, or RigError for a name that is not that of a deformable mirror."""
+    """The class of this name. Raises DeviceError, or RigError for a name that is not that of a deformable mirror.
+
+    No module is imported but those of python-microscope and of packages that offer theirs.
+    """
     with needs_extra("microscope", DeviceError):
         from microscope.abc import DeformableMirror
     module, _, name = path.rpartition(".")
-    try:
-        found = getattr(import_module(module), name)
-    except Exception as error:  # a module that is not there, or the vendor's library that it needs
-        raise DeviceError(
-            f"devices.mirror.device: {path} cannot be had ({error!r}): is the name right, and is the vendor's library"
-            " installed?"
-        ) from error
+    if point := installed("aolink.microscope").get(path):
+        found = loaded(point, "deformable mirror", DeviceError)
+    elif not module.startswith("microscope."):
+        raise RigError(
+            f"devices.mirror.device: {path} is no class of python-microscope (microscope...), and no installed package"
+            " offers a device of this name"
+        )
+    else:
+        try:
+            found = getattr(import_module(module), name)
+        except Exception as error:  # a module that is not there, or the vendor's library that it needs
+            raise DeviceError(
+                f"devices.mirror.device: {path} cannot be had ({error!r}): is the name right, and is the vendor's"
+                " library installed?"
+            ) from error
     if not (isinstance(found, type) and issubclass(found, DeformableMirror)):
         raise RigError(f"devices.mirror.device: {path} is no deformable mirror of python-microscope")
     return found

@@ -161,5 +161,8 @@ def responses_of_two_states(
             )  # fmt: skip
         for i in range(n_steps - n_steps % 4, n_steps):
             _step(A, B, C, rows[0, i], inputs[e, i], x, v, total, squares, first, second)
-        for values in (total, squares, first, second):
-            values[:] = values / n_steps
+        for k in range(axes):  # an array divided at once would compile NumPy's error messages, for four seconds
+            total[k] /= n_steps
+            squares[k] /= n_steps
+            first[k] /= n_steps
+            second[k] /= n_steps

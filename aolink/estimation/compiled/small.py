@@ -13,6 +13,7 @@ from typing import Any
 
 import numba
 
+from aolink.estimation.compiled.kept import folder
 from aolink.numerics.arrays import FloatArray
 from aolink.numerics.covariance import JITTER
 
@@ -40,10 +41,14 @@ def compiled_exactly(function: Callable[..., Any]) -> Any:
 
 def _compiled(function: Callable[..., Any], freedom: set[str]) -> Any:
     options: Any = {"nogil": True, "error_model": "numpy", "fastmath": freedom}
+    if (kept := folder()) is None:
+        return numba.njit(**options)(function)
+    settings: Any = numba.config
+    before, settings.CACHE_DIR = settings.CACHE_DIR, str(kept)  # Numba reads it when a function is decorated
     try:
         return numba.njit(cache=True, **options)(function)
-    except RuntimeError:  # neither the source's folder nor the user's cache can be written
-        return numba.njit(**options)(function)
+    finally:
+        settings.CACHE_DIR = before
 
 
 # Most sweeps of Jacobi's method, which ends where the squares off the diagonal are this share of those on it.

@@ -29,6 +29,7 @@ from typing import Any
 
 import numpy as np
 
+from aolink.errors import EstimatorError
 from aolink.estimation.compiled.likelihoods import log_likelihoods, log_likelihoods_and_gradients
 from aolink.estimation.compiled.line import Line
 from aolink.estimation.compiled.plane import Plane, linearised_light_of_spots
@@ -70,6 +71,8 @@ _PATHS, _FEW_PATHS = 64, 16
 # The table of a pixel's light over the spot's position: points in one standard deviation of the kernel, and its end.
 _POINTS = 16
 _REACH = 5.0
+# The most pairs of a point and a pixel in that table, which has some hundreds.
+_MOST_LIGHT = 1 << 22
 # Where a spot's light falls below this share of a pixel's noise, rough likelihoods leave it out.
 _UNSEEN = 0.03
 # Reductions and tables that are kept: more than the estimators that a scan of frequencies runs side by side.
@@ -406,6 +409,11 @@ def _light_table(
     """
     points = math.ceil(_POINTS * pixel / math.sqrt(variance))
     half = _half(variance, pixel, reach)
+    if points * half > _MOST_LIGHT:
+        raise EstimatorError(
+            f"a spot is {math.sqrt(variance) / pixel:.3g} pixels wide (sd): check sensor.kernel, sensor.field and the"
+            " plant's noise"
+        )
     places = (np.arange(points) + 0.5) * pixel / points
     masses = pixel_masses(variance, pixel * np.arange(-half, half + 1.0), places, order + 3)[order:]
     table = np.stack([mass * pixel ** (k - 1) / math.factorial(k) for k, mass in enumerate(masses)], axis=1)

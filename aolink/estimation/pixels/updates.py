@@ -123,20 +123,24 @@ class ImportanceUpdater:
     def remarks(self, several: BoolArray, poor: BoolArray, reduced: Reduction) -> Iterator[tuple[BoolArray, str]]:
         yield poor, self._when_poor(reduced)
         if self.too_sure:
-            yield several & ~poor, "importance sampling is often too sure on this rig: intervals may be too narrow"
+            missed = "another path may have been missed, as often on this rig: intervals may be too narrow"
+            yield several & ~poor, missed
 
     def _when_poor(self, reduced: Reduction) -> str:
         """Its action where importance sampling is not enough."""
         missed = self._missed(reduced)
         if not self.points:
-            what = "the estimate is wide"
+            what = "the estimate is wider for it, and may still miss a path"
         elif self._tempers(reduced):
             at_most = "up to " if self.left < 1 and not self.too_sure else ""
-            what = f"{self.points} points tempered, and {at_most}{missed:.0%} of windowed moments"
+            what = (
+                f"{self.points} others were sought at length (tempered), and {at_most}{missed:.0%} of the estimate is"
+                " as wide as that of moments, in case they miss one"
+            )
         else:
-            what = "windowed moments"
-        enough = "importance sampling is not enough on this rig"
-        return f"{enough if self._hands_over(reduced) else 'too few importance weights count'}: {what}"
+            what = "the estimate is as wide as that of moments"
+        enough = "the usual search for paths is not enough on this rig"
+        return f"{enough if self._hands_over(reduced) else 'too few of the paths tried fit the blur'}: {what}"
 
     def _missed(self, reduced: Reduction) -> float:
         """The share of a posterior that tempered points may have missed: the number of pairs of coefficients for each

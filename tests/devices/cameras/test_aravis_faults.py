@@ -45,7 +45,7 @@ def test_a_camera_that_stops_ends_the_session_and_the_recording_is_whole(tmp_pat
     assert (recording.complete, 1 <= len(recording) <= 8) == (True, True)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_camera_that_is_pulled_out_is_said_to_be(tmp_path: Path) -> None:
     frames = packed(noise(16, 16), PIXEL_FORMATS["Mono16"])
     with (

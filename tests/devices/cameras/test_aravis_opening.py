@@ -23,7 +23,7 @@ def brief_rig(exposure_steps: int) -> Rig:
     return replace(fast_rig(), timing=replace(timing, fast_step_s=5e-7, exposure_steps=exposure_steps))
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_what_cannot_be_opened_is_said_in_one_line(tmp_path: Path) -> None:
     rig = fast_rig()
     refused: list[tuple[Rig, dict[str, Any], type[AolinkError], str]] = [

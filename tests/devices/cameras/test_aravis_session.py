@@ -23,7 +23,7 @@ from tests.kinds import messages_of, truth_of
 need_aravis()
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("address", "keys", "lacks"),
     [

@@ -38,7 +38,7 @@ def table(folder: Path) -> str:
     return f'driver = "basler"\ndelay_s = 0.0\ndelay_sd_s = 0.002\nfeatures = {{ {listed} }}'
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_session_records_the_counts_that_the_camera_gives(tmp_path: Path) -> None:
     """All 16 bits of them, one frame after the other; the emulator's time stamps are always 0, so it has none."""
     shown = pictures(12)
@@ -146,7 +146,7 @@ def test_block_ids_of_64_bits_do_not_wrap() -> None:
     ]  # fmt: skip
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_camera_that_is_there_is_listed(aolink: Run) -> None:
     environment = {**os.environ, "PYLON_CAMEMU": "1", "COLUMNS": "200"}
     drivers = json.loads(aolink("devices", "--json", env=environment).stdout)["drivers"]

@@ -20,6 +20,7 @@ Run = Callable[..., subprocess.CompletedProcess[str]]
 SHAPE = (1, 40)
 
 
+@pytest.mark.slow
 def test_a_session_records_the_pictures_as_they_are(tmp_path: Path) -> None:
     """They begin again after the last, and each exposure follows the one before without a gap."""
     shown = pictures(5)

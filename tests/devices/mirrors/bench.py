@@ -5,12 +5,14 @@ from __future__ import annotations
 import bisect
 from collections.abc import Callable, Iterable
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from aolink import estimate
+from aolink.devices.outages import Outages
 from aolink.estimation import Estimate
 from aolink.exposure import Exposure
 from aolink.extensions import installed
@@ -20,6 +22,8 @@ from aolink.session import Report
 from tests.devices.simulators import spot_camera
 
 FAST_STEP_S = 0.01
+Measured = TypeVar("Measured")
+_HELD_UP_NS = 100_000_000
 _DRIVE_OF_A_STEP = 0.02
 """More than the drive of these rigs changes an input by from step to step."""
 _CHANGES = (
@@ -123,6 +127,23 @@ def check_ended(report: Report, path: Path) -> None:
     recording = Recording(path)
     assert recording.complete
     assert len(list(recording)) >= report.exposures > 0
+
+
+def undisturbed(measured: Callable[[], Measured]) -> Measured:
+    """What is measured in real time, in a try in which the machine holds this process up for less than a tenth of a
+    second; of five tries one should be so."""
+    for _ in range(5):
+        outages = Outages(2_000_000)
+        try:
+            found = measured()
+            if outages.total_ns() < _HELD_UP_NS:
+                return found
+        except Exception:
+            if outages.total_ns() < _HELD_UP_NS:
+                raise
+        finally:
+            outages.close()
+    pytest.skip("the machine has held this process up each time")
 
 
 def steps_ended(report: Report) -> int:

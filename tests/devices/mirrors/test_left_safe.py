@@ -49,7 +49,7 @@ def test_a_camera_that_fails(tmp_path: Path) -> None:
     with_each(check)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_an_exception_in_the_session(tmp_path: Path) -> None:
     def check(name: str) -> None:
         def stop() -> bool:
@@ -67,7 +67,7 @@ def test_an_exception_in_the_session(tmp_path: Path) -> None:
     with_each(check)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_session_that_stalls(tmp_path: Path) -> None:
     """The host's watchdog parks a mirror that the session's thread has left alone, and the recording says so."""
 

@@ -256,6 +256,7 @@ def session(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Callabl
     installed.cache_clear()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("travel_s", [0.0, 5 * bench.FAST_STEP_S])
 def test_a_session_is_recorded_and_estimated(travel_s: float, session: Callable[..., Report], tmp_path: Path) -> None:
     """Also with a stage that is never on its target in it: what it was told counts, its way there is the plant's."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable
-from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +16,6 @@ from numpy.typing import NDArray
 
 from aolink import estimate
 from aolink.devices.mirrors.playzerx import PlayzerX, codes_of, command, remaining, sample_rate, samples
-from aolink.devices.outages import Outages
 from aolink.devices.simple import Held, Lacks
 from aolink.errors import AolinkError, DeviceError
 from aolink.recording.reader import Recording
@@ -33,7 +31,6 @@ STEP_NS = 2_000_000
 STALL_S = 0.5
 """How long the device's queue lasts in tests: longer than a busy machine holds a test up."""
 PATIENCE_S = 10.0
-HELD_UP_NS = 100_000_000
 """Half of what the queue lasts in the test of a dry one."""
 
 codes = st.lists(st.tuples(st.integers(0, 4095), st.integers(0, 4095)), min_size=1, max_size=40)
@@ -193,16 +190,15 @@ def test_a_command_for_steps_that_are_handed_over_is_late() -> None:
         mirror.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("waiting", [False, True])
 def test_a_queue_that_runs_dry_is_said_and_survived(waiting: bool) -> None:
     """The device does not read its line for longer than its queue lasts, perhaps with samples and a question on it.
 
     Every step is told once, with what was really held.
     """
-    for _ in range(5):
-        reported, out, held_up_ns = ran_dry(waiting)
-        if held_up_ns < HELD_UP_NS:  # else the machine may have stopped the simulator in the middle of its samples
-            break
+    # Otherwise the machine may have stopped the simulator in the middle of its samples.
+    reported, out = bench.undisturbed(lambda: ran_dry(waiting))
     held = np.concatenate([each.u for each in reported])
     late = np.concatenate([each.late for each in reported if each.late is not None])
     assert [each.first_step for each in reported] == [0, *np.cumsum([len(each.u) for each in reported])[:-1]]
@@ -212,11 +208,10 @@ def test_a_queue_that_runs_dry_is_said_and_survived(waiting: bool) -> None:
     assert (~np.any(near, axis=0)).sum() <= 2 * dry  # where the phase of the samples was in doubt, by one at most
 
 
-def ran_dry(waiting: bool) -> tuple[list[Held], NDArray[np.float64], int]:
-    """What the driver told, what the device put out, and for how long this process was held up by the machine."""
+def ran_dry(waiting: bool) -> tuple[list[Held], NDArray[np.float64]]:
+    """What the driver told, and what the device put out."""
     with simulators.PlayzerX(deaf=(600 if waiting else sys.maxsize, 0.4)) as device:
         mirror = opened(device, ahead_s=0.2)
-        outages = Outages(STEP_NS)
         begin = mirror.time_ns() // STEP_NS + 300
         assert mirror.send(begin, np.repeat(np.linspace(0.1, 0.9, 1000), 2).reshape(-1, 2)) == 0
         reported = poll(mirror, reported_until(begin + 30))
@@ -226,10 +221,8 @@ def ran_dry(waiting: bool) -> tuple[list[Held], NDArray[np.float64], int]:
         end = mirror.time_ns() // STEP_NS + (500 if waiting else 200)
         reported += poll(mirror, reported_until(end))
         out = inputs_of(device, sum(len(each.u) for each in reported))
-        held_up_ns = outages.total_ns()
-        outages.close()
         mirror.close()
-    return reported, out, held_up_ns
+    return reported, out
 
 
 def session_rig(device: simulators.PlayzerX) -> Rig:
@@ -240,24 +233,24 @@ def session_rig(device: simulators.PlayzerX) -> Rig:
     return parse_rig(rig.toml.replace("dac_bits = 16", "dac_bits = 12\nqueue_steps = 150"))
 
 
+@pytest.mark.slow
 def test_a_whole_session(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     bench.install(monkeypatch, tmp_path, playzerx=NAMED)
     with simulators.PlayzerX(rate_error=-50e-6) as device:
         spot_camera.mirror.held = device.inputs_at
         report = record(session_rig(device), None, None, tmp_path / "a.mcap", estimators=["o1"], exposures=10)
         assert device.at_rest() == (*simulators.ORIGIN, (0,))  # parked, with the laser off
-    assert report.ended == "complete"
-    assert report.exposures >= 10
+    assert (report.ended, report.exposures) == ("complete", 10)
     ended = report.steps_applied + report.steps_late + report.steps_refused + report.steps_not_reported
     assert ended + report.steps_superseded == report.steps_commanded == 100
     recording = Recording(tmp_path / "a.mcap")
     assert recording.metadata["mirror"] == "Mirrorcle PlayzerX-SX, firmware 1.0.2.0, XYM"
     assert recording.metadata["mirror_lacks"].split("; ") == [*PlayzerX.lacks]
     exposures = list(recording.exposures())
-    assert all(exposure.inputs_assumed == 0 for exposure in exposures[:10])
+    assert all(exposure.inputs_assumed == 0 for exposure in exposures)
     assert max(np.abs(exposure.inputs).max() for exposure in exposures) > 0.1
-    # A frame that came while the mirror was being parked may follow. The drive moves the spot by 0.3.
-    bench.check_paths(recording.rig, islice(zip(exposures, estimate(recording, "o1"), strict=True), 10))
+    # The drive moves the spot by 0.3.
+    bench.check_paths(recording.rig, zip(exposures, estimate(recording, "o1"), strict=True))
 
 
 @pytest.mark.parametrize(

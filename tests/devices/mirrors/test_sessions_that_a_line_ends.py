@@ -16,7 +16,7 @@ from tests.devices.simulators.serial_device import Faults
 Session = Callable[..., Path]
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("faults", "what"),
     [

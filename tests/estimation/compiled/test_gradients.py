@@ -23,6 +23,7 @@ def drawn(view, state, seed=2):
     return t
 
 
+@pytest.mark.slow
 @ALL
 def test_gradients_are_the_twins_and_log_likelihoods_those_without(kind):
     view, in_numpy, state = looked(kind)
@@ -62,6 +63,7 @@ def test_the_gradient_of_several_spots_is_the_sum_of_theirs():
     np.testing.assert_allclose(together, apart, rtol=1e-9, atol=1e-9 * np.abs(apart).max())
 
 
+@pytest.mark.slow
 @ALL
 def test_rough_log_likelihoods_and_gradients_are_near_the_exact_ones(kind):
     view, _, state = looked(kind)

@@ -267,7 +267,7 @@ def test_the_innovation_is_that_of_the_twin(pair):
     np.testing.assert_allclose(ours.covariance, theirs.covariance, rtol=5e-3, atol=1e-3)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_importance_sampling_with_the_same_points(pair):
     view, in_numpy, state = pair
     some = slice(1, 7)  # not the one beyond the sensor, where no point counts

@@ -1,27 +1,126 @@
 """Machine code is made once, and nothing is left to compile in a session."""
 
+import ast
 import os
 import subprocess
 import sys
 
 import pytest
 
-from aolink.estimation.compiled import compile_once, forget_stale
+from aolink.estimation.compiled import kept
 
 
-def test_one_process_compiles_for_all_others_once_for_each_version_of_the_sources(tmp_path):
+@pytest.fixture
+def place(tmp_path, monkeypatch):
+    """A folder of this test that keeps machine code."""
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "kept"))
+    kept.folder.cache_clear()
+    yield tmp_path
+    kept.folder.cache_clear()
+
+
+def test_one_process_compiles_a_group_for_all_others(place, capsys):
     """What a process has compiled itself may differ in the last bit from what the others load."""
-    said, source = tmp_path / "said", tmp_path / "loops.py"
-    source.touch()
-    program = f"open({str(said)!r}, 'a').write('compiled ')"
-    compile_once(tmp_path, program)
-    compile_once(tmp_path, program)
-    assert said.read_text() == "compiled "
-    later = source.stat().st_mtime + 60
-    os.utime(source, (later, later))
-    compile_once(tmp_path, program + "; raise SystemExit(1)")  # it has failed, so that the next one tries again
-    compile_once(tmp_path, program)
-    assert said.read_text() == 3 * "compiled "
+    said = place / "said"
+
+    def program(groups):
+        return f"open({str(said)!r}, 'a').write({' '.join(groups)!r} + ';')"
+
+    kept.compile_once(["a"], program)
+    kept.compile_once(["a", "b", "c"], program)
+    kept.compile_once(["c", "a"], program)
+    assert said.read_text() == "a;b c;"
+    lines = capsys.readouterr().err.splitlines()
+    assert [each.partition(" (once)")[0] for each in lines] == [
+        "aolink: compiling the loops of a", "aolink: compiling the loops of b, c"
+    ]  # fmt: skip
+
+
+def test_a_compilation_that_fails_is_said_and_tried_again(place, capsys):
+    said = place / "said"
+    kept.compile_once(["a"], lambda groups: "import sys; sys.exit('no room is left')")
+    assert capsys.readouterr().err.splitlines()[1:] == [
+        "aolink: this failed, so each process compiles them for itself: no room is left"
+    ]
+    kept.compile_once(["a"], lambda groups: f"open({str(said)!r}, 'w')")
+    assert said.exists()
+
+
+def test_where_nothing_can_be_kept_a_line_says_so_and_what_to_do(place, monkeypatch, capsys):
+    (place / "file").touch()
+    for name in ("NUMBA_CACHE_DIR", "XDG_CACHE_HOME"):
+        monkeypatch.setenv(name, str(place / "file"))
+    monkeypatch.setattr(kept, "HERE", place / "file")
+    assert kept.folder() is None
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "NUMBA_CACHE_DIR" in line
+    assert f"{place / 'file'}: Not a directory" in line
+
+
+PROGRAM = """
+import sys
+from pathlib import Path
+from aolink.estimation.compiled import kept
+
+kept.SOURCES = tuple(sorted(Path(sys.argv[1]).glob("*.py")))
+sys.path.insert(0, sys.argv[1])
+from outer import outer
+print(outer())
+"""
+INNER = """
+from aolink.estimation.compiled.small import compiled
+
+@compiled
+def constant():
+    return {}
+"""
+OUTER = """
+from inner import constant
+from aolink.estimation.compiled.small import compiled
+
+@compiled
+def outer():
+    return constant() + 1
+"""
+
+
+@pytest.mark.slow
+def test_a_source_that_is_older_than_the_code_made_of_another_is_compiled_all_the_same(tmp_path):
+    """Copies that keep time stamps (rsync -a, layers of images) bring changed sources with earlier dates."""
+    for name, text in (("inner.py", INNER.format(1)), ("outer.py", OUTER)):
+        (tmp_path / name).write_text(text)
+
+    def outcome():
+        environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "kept")}
+        command = [sys.executable, "-c", PROGRAM, str(tmp_path)]
+        return int(subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout)
+
+    assert outcome() == 2
+    (tmp_path / "inner.py").write_text(INNER.format(10))
+    os.utime(tmp_path / "inner.py", (0, 0))
+    assert outcome() == 11
+
+
+def test_the_name_of_the_folder_follows_from_what_the_sources_contain(tmp_path):
+    """And not from where they lie or from their dates."""
+    here, there = tmp_path / "here", tmp_path / "there"
+    for place in (here, there):
+        place.mkdir()
+        (place / "a.py").write_text("x = 1")
+    os.utime(there / "a.py", (0, 0))
+    assert kept.key([here / "a.py"]) == kept.key([there / "a.py"])
+    (there / "a.py").write_text("x = 2")
+    assert kept.key([here / "a.py"]) != kept.key([there / "a.py"])
+
+
+def test_what_is_compiled_comes_from_the_sources_that_the_name_follows_from():
+    """A constant or function of another module would be compiled in, and change unnoticed."""
+    names = {str(path.relative_to(kept.HERE.parents[2]).with_suffix("")).replace("/", ".") for path in kept.SOURCES}
+    for path in kept.HERE.glob("*.py"):
+        nodes = [each for each in ast.parse(path.read_text()).body if isinstance(each, ast.ImportFrom)]
+        imported = {each.module for each in nodes if each.module and each.module.startswith("aolink")}
+        # The first has only types, the second the package's own modules.
+        assert imported - {"aolink.numerics.arrays", "aolink.estimation.compiled"} <= names, path
 
 
 FIRST_SESSION = """
@@ -56,7 +155,7 @@ def first_session(rig, name, noise, exposures):
     return map(int, out.split())
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["profile", "mixture"])
 def test_nothing_is_compiled_in_a_session(name):
     before, after, several = first_session("section-vi-lively", name, 0.003, 30)
@@ -64,28 +163,17 @@ def test_nothing_is_compiled_in_a_session(name):
     assert several
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["moments", "moments:flux=measured,basis=fourier"])
 def test_nothing_is_compiled_in_a_session_of_moments(name):
     before, after, _ = first_session("section-vi-lively", name, 0.003, 4)
     assert before == after > 1
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("rig", "name"), [("membrane-12x12", "profile"), ("membrane-12x12", "moments"), ("single-lenslet", "mixture")]
 )
 def test_nothing_is_compiled_in_a_session_of_spots(rig, name):
     before, after, _ = first_session(rig, name, 1e-3, 4)
     assert before == after > 2
-
-
-def test_machine_code_is_not_older_than_any_source(tmp_path):
-    kept = tmp_path / "__pycache__"
-    kept.mkdir()
-    files = kept / "of_old.nbi", tmp_path / "one.py", tmp_path / "two.py", kept / "of_new.nbi"
-    for age, name in enumerate(files):
-        name.touch()
-        os.utime(name, (age, age))
-    forget_stale(tmp_path)
-    assert [each.name for each in kept.iterdir()] == ["of_new.nbi"]
-    forget_stale(tmp_path / "not there")

@@ -64,6 +64,7 @@ def test_filterpy_does_one_axis_of_the_papers_filters(rig):
         make_estimator(many, "o1", engine="filterpy")
 
 
+@pytest.mark.slow
 def test_the_command_line_runs_it_and_says_where_it_cannot(aolink, recorded, tmp_path):
     def scores(*arguments):
         result = aolink("estimate", recorded.path, "-e", "o1", "-e", "o3", "--json", *arguments)

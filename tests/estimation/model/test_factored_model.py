@@ -117,7 +117,7 @@ def test_responses_and_moments_are_those_of_the_dense_model(plant, model, dense,
         np.testing.assert_allclose(getattr(found, name), getattr(expected, name), atol=1e-13, err_msg=name)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_noise_path_is_that_of_the_fast_steps_to_the_share_that_is_stated(plant, model):
     """Exact covariance of the noise path, against what the basis has of it; and the last step's course."""
     exact = noise_of_steps(plant).reshape(32 * N, -1)

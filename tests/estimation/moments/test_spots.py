@@ -102,6 +102,7 @@ def at_prior(rig, observation, prior, model):
 # What is expected, by sampling
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kernel", [Kernel(shape="gaussian", sigma=0.1), TILTED])
 @pytest.mark.parametrize("basis", ["monomial", "fourier"])
 def test_regression_is_that_of_samples(kernel, basis):
@@ -190,7 +191,7 @@ def test_noise_of_the_sums_is_that_of_many_frames(photoelectrons):
 # What it is good for
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("make", [tip_tilt, membrane])
 @pytest.mark.parametrize("kernel", [Kernel(shape="gaussian", sigma=0.1), TILTED])
 def test_coupled_plants_are_seen_better_than_by_o1_and_with_the_certainty_that_is_claimed(make, kernel):

@@ -153,7 +153,7 @@ def test_slopes_are_those_of_finite_differences(rig, frame):
     np.testing.assert_allclose(at.displacement_score, at.score[:, :, 0], rtol=1e-9)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_mode_and_its_covariance_are_those_of_the_dense_search(rig, frame):
     paths = JointPaths(frame.model, rig.sensor)
     before = whole_prior(frame, paths.size)
@@ -253,7 +253,7 @@ def membrane() -> Rig:
     return load_rig("membrane-12x12")
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_288_states_are_told_by_200_slopes_with_the_certainty_that_is_claimed(membrane):
     """Path error after three exposures: o1 0.27, o3 0.24, moments 0.13, profile 0.09 slope units."""
     exposures = simulate(membrane, 9)
@@ -281,7 +281,7 @@ def test_nothing_is_as_large_as_a_dense_basis(membrane):
     assert peak < 60e6
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_frames_in_the_wrong_order_ruin_the_estimate(membrane):
     exposures = simulate(membrane, 6)
     order = [0, 5, 2, 1, 4, 3]
@@ -293,7 +293,7 @@ def test_frames_in_the_wrong_order_ruin_the_estimate(membrane):
     assert right.path_rmse < 0.6 * wrong.path_rmse
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_partly_lit_lenslets_have_their_share_of_the_light():
     """A pupil before the small membrane: what the pixels are expected to hold is what they do."""
     text = load_rig("membrane-12x12").toml.replace("slope_unit_rad", "pupil_m = 3.0e-3\nslope_unit_rad")

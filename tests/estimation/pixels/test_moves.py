@@ -57,6 +57,7 @@ def moved(kind, view, t, power, times):
     return moves.points
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", [Metropolis, Hamiltonian])
 @pytest.mark.parametrize("power", [0.01, 1.0])
 def test_the_distribution_stays(kind, power):

@@ -116,8 +116,8 @@ def ranks(count, particles, seed=5):
     return np.array(found)
 
 
-@pytest.mark.long
-@pytest.mark.parametrize(("count", "particles"), [(25, 200), pytest.param(120, 600, marks=pytest.mark.long)])
+@pytest.mark.slow
+@pytest.mark.parametrize(("count", "particles"), [(25, 200), pytest.param(120, 600, marks=pytest.mark.slow)])
 def test_simulation_based_calibration(count, particles):
     """Talts et al. (2018): ranks of the truth are uniform. Ten bins would need more; five have chi-square of four."""
     r = ranks(count, particles)

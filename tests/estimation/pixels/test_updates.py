@@ -104,6 +104,7 @@ def test_posterior_is_that_of_importance_sampling(photoelectrons):
     assert_near(update.coefficients, mean, covariance, 0.25, 0.15)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [3, 4])
 def test_mixture_is_the_posterior_of_importance_sampling_where_it_is_bent(seed):
     view, state = seen(quiet(RIG, 0.01), width=0.5, seed=seed)
@@ -115,6 +116,7 @@ def test_mixture_is_the_posterior_of_importance_sampling_where_it_is_bent(seed):
     assert_near(after.gaussian, mean, covariance, 0.3, 0.25)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [10, 11])
 def test_profile_is_the_mean_of_the_posterior_where_it_has_several_modes(seed):
     """Gaussians about the modes alone are up to 0.7 standard deviations off."""
@@ -209,6 +211,7 @@ def squared(exposures, estimates, skip=5):
     return np.array([np.mean((e.path - x.truth.path) ** 2) for x, e in zip(exposures, estimates, strict=True)])[skip:]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("V", [0.1, 0.01, 0.001])
 def test_better_than_o1_and_right_about_it(V):
     rig = quiet(RIG, V)
@@ -229,6 +232,7 @@ def test_better_than_o1_and_right_about_it(V):
         assert {e.status for e in found[name]} == {Status.OK}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", PIXEL_ESTIMATORS)
 def test_intervals_are_honest_about_a_phase_that_no_pixel_tells(name):
     """A whole swing in each exposure: the blur tells how far the spot swings, and nothing of when.
@@ -326,6 +330,7 @@ def test_an_axis_does_not_depend_on_those_beside_it(name, axes):
         assert alone.nis.tobytes() == together.nis[some].tobytes()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", PIXEL_ESTIMATORS)
 def test_the_quadrature_of_an_axis_does_not_depend_on_those_beside_it(name):
     """One axis of three is commanded; the others are looked at as coarsely as alone."""
@@ -371,7 +376,7 @@ def test_what_commands_left_in_the_state_is_foreseen(name):
     assert error < 0.01
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("name", PIXEL_ESTIMATORS)
 def test_a_lost_mode_is_found_again(name):
     """Two exposures after a filter was made sure of the opposite; without doubt it takes four."""
@@ -393,6 +398,7 @@ def test_a_lost_mode_is_found_again(name):
     assert sum(found) >= 9
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("updates", [PROFILE, MIXTURE])
 def test_where_few_points_count_others_are_tempered(updates):
     view, state = seen(quiet(RIG, 0.003), width=0.5, seed=11)
@@ -432,7 +438,7 @@ def test_the_posterior_of_a_single_coefficient_is_an_integral_over_a_line(update
     assert np.sqrt(update.coefficients.covariance[0, 0, 0]) == pytest.approx(sd, rel=0.25)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("name", PIXEL_ESTIMATORS)
 def test_an_unstable_plant_does_not_end_in_infinity(name):
     """What it would be without a camera grows without end; what the camera says of it does not."""
