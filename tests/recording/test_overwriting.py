@@ -228,7 +228,7 @@ def seconds(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[float]]:
     monkeypatch.setattr(
         time, "monotonic", lambda: begin + (0.0 if threading.current_thread() is session else clock[-1])
     )
-    yield clock
+    return clock
 
 
 @pytest.mark.parametrize("at_the_end", [False, True])
@@ -250,7 +250,9 @@ def test_a_file_whose_name_is_no_longer_its_own_ends_the_session_and_is_kept(
     if what is folder_removed:
         assert "what was recorded is lost, because a copy cannot be written: no such file or directory" in said
         return
-    place = Path(said.partition("saved as " if what in (removed, replaced) else "the recording is ")[2].split(" now")[0])
+    place = Path(
+        said.partition("saved as " if what in (removed, replaced) else "the recording is ")[2].split(" now")[0]
+    )
     found = Recording(place, check=True)
     assert found.complete
     assert found.metadata["ended"] == "complete"
