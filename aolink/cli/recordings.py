@@ -56,7 +56,6 @@ def compare(
     ] = None,
     relative: Annotated[float, typer.Option(min=0, help="Relative tolerance of numbers.")] = 1e-9,
     absolute: Annotated[float, typer.Option(min=0, help="Tolerance in a number's own unit, added.")] = 1e-12,
-    accept: Annotated[bool, typer.Option("--accept", hidden=True)] = False,
     as_json: JsonOption = False,
 ) -> None:
     """List field by field how two recordings differ. Exit code 1 if they do.
@@ -70,8 +69,6 @@ def compare(
     from aolink.recording.reestimate import Reestimated
     from aolink.recording.side_files import check_is_side_of
 
-    if accept:
-        raise RecordingError("compare replaces no recording; `python tools/recordings` makes the reference ones anew")
     one = open_recording(first)
     if second is None:
         two: Recording = Reestimated(one)

@@ -260,7 +260,9 @@ def first_facts(path: Path) -> dict[str, str]:
     """The facts from a session's start; none where a file is no recording, or they are damaged."""
     try:
         with open_recording(path) as file:
-            for record, _ in scan(file, lambda loss: None):
+            for record, in_chunk in scan(file, lambda loss: None):
+                if in_chunk:
+                    break  # they come before all messages
                 if isinstance(record, Metadata) and record.name == topics.SESSION_METADATA:
                     return next(unsealed([record]))[1] or {}
     except RecordingError:

@@ -153,16 +153,6 @@ def test_a_recording_is_compared_with_itself_without_a_copy(aolink: Run, recorde
     assert path.read_bytes() == before
 
 
-def test_a_comparison_replaces_nothing(aolink: Run, recorded: Session) -> None:
-    before = recorded.path.read_bytes()
-    refused = aolink("compare", recorded.path, recorded.path, "--accept")
-    assert refused.returncode == 5
-    assert refused.stderr == (
-        "aolink: compare replaces no recording; `python tools/recordings` makes the reference ones anew\n"
-    )
-    assert recorded.path.read_bytes() == before
-
-
 def test_exposures_that_were_skipped_are_skipped_again(recorded: Session, tmp_path: Path) -> None:
     def change(topic: str, message: Message) -> list[Message]:
         if topic == "/estimate/o1" and isinstance(message, pb.Estimate) and message.frame_id == 5:

@@ -393,3 +393,33 @@ def test_lists_of_missing_pixels_that_do_not_fit_are_a_loss(tmp_path: Path) -> N
     recording = write_messages(tmp_path / "a.mcap", (topics.EXPOSURE, info, 0), (topics.IMAGE, image, 1))
     assert list(recording.exposures()) == []
     assert "missing_offset and missing_length are not of one length" in recording.damage
+
+
+PICTURE = {"width": 40, "height": 1, "step": 80, "encoding": "mono16", "data": bytes(80)}
+
+
+@pytest.mark.parametrize(
+    ("change", "what"),
+    [
+        ({"step": 79}, "its step is not that of its width"),
+        ({"encoding": "mono8"}, "its encoding is not mono16"),
+        ({"data": bytes(10)}, "its data are not as long as its size says"),
+        ({"width": 20, "step": 40, "data": bytes(40)}, "its size is not the sensor's"),
+    ],
+)
+def test_a_picture_that_lies_is_one_loss_everywhere(tmp_path: Path, change: dict[str, Any], what: str) -> None:
+    """The exposures before and after it are read, with the numbers that they have when it is counted."""
+    messages: list[tuple[str, Message_, int]] = []
+    for k in range(3):
+        info = pb.ExposureInfo(frame_id=k, first_step=200 * k, last_step=200 * k + 199)
+        picture = RawImage(**PICTURE | (change if k == 1 else {}))
+        messages += [(topics.EXPOSURE, info, 10 * k), (topics.IMAGE, picture, 10 * k + 1)]
+    recording = write_messages(path := tmp_path / "a.mcap", *messages)
+    assert [each.frame_id for each in recording.exposures()] == [0, 2]
+    assert [each.frame_id for each in recording.exposures(2)] == [2]
+    said = f"1 message(s) on {topics.IMAGE} cannot be used: {what}"
+    assert recording.damage == said
+    assert [each.what for each in Recording(path, check=True).losses] == [said]
+    edited = recover(path, tmp_path / "b.mcap")
+    assert ([each.what for each in edited.losses], edited.exposures) == ([said], 2)
+    assert not Recording(tmp_path / "b.mcap", check=True).losses

@@ -123,7 +123,7 @@ def test_what_another_program_has_put_there_meanwhile_is_not_replaced(
         old.mkdir()
     else:
         exchanged(old if what == "old" else aside, b"theirs")
-    with pytest.raises(RecordingError, match="another program has put a file in the place|is a symbolic link|a folder"):
+    with pytest.raises(RecordingError, match=r"another program has put a file|is a symbolic link|a folder"):
         writing.write(topics.IMAGE, lambda: writing.writer.write(topics.LOG, Log(), 0) or False)
     there = old if what != "new" else aside
     assert there.is_symlink() or there.is_dir() or there.read_bytes() == b"theirs"
