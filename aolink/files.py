@@ -139,7 +139,7 @@ class NewFile:
         """Its name in the end."""
         self.descriptor = descriptor
         self._error, self._closed = error, False
-        self._old = None if path == target else target.stat()
+        self._old = None if path == target else _identity(target)
 
     @property
     def is_aside(self) -> bool:
@@ -154,7 +154,7 @@ class NewFile:
         """Put it in the place of the old file, unless another program has exchanged one of them. Raises OSError, and
         an error of the class that `create` was given."""
         check_target(self.target, overwrite=True, error=self._error)
-        changed = self.target.exists() and self._old and not os.path.samestat(self.target.stat(), self._old)
+        changed = self.target.exists() and self._old != _identity(self.target)
         if changed or not self.is_there():
             what = self.target if changed else self.path
             raise self._error(f"cannot write {self.target}: another program has put a file in the place of {what}")
@@ -191,6 +191,12 @@ class NewFile:
                 self.path.unlink()
         with suppress(OSError):
             os.close(self.descriptor)
+
+
+def _identity(path: Path) -> tuple[int, int, int]:
+    """What tells a file from another one in its place, which may have got its number."""
+    found = path.stat()
+    return found.st_dev, found.st_ino, found.st_mtime_ns
 
 
 def create(target: Path, *, overwrite: bool = False, error: type[AolinkError] = AolinkError) -> NewFile:

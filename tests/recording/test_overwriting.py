@@ -40,11 +40,19 @@ class Writing:
             self.writer.write(each.topic, each.message, each.log_time_ns)
             if each.topic == until:
                 break
-        for _ in range(20_000):
-            if wait():
-                return
-            time.sleep(0.001)
-        pytest.fail("what was waited for has not happened")
+        wait_until(wait)
+
+    def write_on(self) -> None:
+        """Write until the writer ends it with an error."""
+        wait_until(lambda: self.writer.write(topics.LOG, Log(), 0) or False)
+
+
+def wait_until(condition: Callable[[], bool]) -> None:
+    for _ in range(20_000):
+        if condition():
+            return
+        time.sleep(0.001)
+    pytest.fail("what was waited for has not happened")
 
 
 def in_parts(source: Path, target: Path, session: str = "a") -> list[Path]:
@@ -124,7 +132,8 @@ def test_what_another_program_has_put_there_meanwhile_is_not_replaced(
     else:
         exchanged(old if what == "old" else aside, b"theirs")
     with pytest.raises(RecordingError, match=r"another program has put a file|is a symbolic link|a folder"):
-        writing.write(topics.IMAGE, lambda: writing.writer.write(topics.LOG, Log(), 0) or False)
+        writing.write(topics.IMAGE)
+        writing.write_on()
     there = old if what != "new" else aside
     assert there.is_symlink() or there.is_dir() or there.read_bytes() == b"theirs"
 
@@ -145,26 +154,26 @@ def test_only_parts_of_the_session_of_that_name_are_removed(recorded: Session, t
     """Dated recordings, parts of other names, of other sessions, and what is no recording stay as they are."""
     (elsewhere := tmp_path / "elsewhere").mkdir()
     parts = in_parts(recorded.path, tmp_path / "s.mcap")
-    assert len(parts) == 4
+    assert len(parts) == 5
     in_parts(recorded.path, elsewhere / "s.mcap", "another session")
     in_parts(recorded.path, elsewhere / "t.mcap")
     kept = {
-        "s-20261126.mcap": recorded.path, "s-0002.mcap": parts[1], "s-005.mcap": elsewhere / "s-002.mcap",
-        "s-006.mcap": elsewhere / "t-003.mcap", "s-007.mcap": parts[2],
+        "s-20261126.mcap": recorded.path, "s-0002.mcap": parts[1], "s-006.mcap": elsewhere / "s-002.mcap",
+        "s-007.mcap": elsewhere / "t-003.mcap", "s-008.mcap": parts[2],
     }  # fmt: skip
     for name, source in kept.items():
         shutil.copy(source, tmp_path / name)
-    (tmp_path / "s-008.mcap").write_bytes(b"no recording")
-    os.mkfifo(tmp_path / "s-009.mcap")
+    (tmp_path / "s-009.mcap").write_bytes(b"no recording")
+    os.mkfifo(tmp_path / "s-010.mcap")
     was = {name: (tmp_path / name).read_bytes() for name in kept}
-    with pytest.raises(RecordingError, match=r"s-001\.mcap exists .* or --overwrite to remove all 4 parts"):
+    with pytest.raises(RecordingError, match=r"s-001\.mcap exists .* or --overwrite to remove all 5 parts"):
         RecordingWriter(tmp_path / "s.mcap", Recording(parts[0]).rig, {}, 0, options=PARTS)
     writing = Writing(recorded.path, tmp_path / "s.mcap", WriteOptions(split_s=1e6))
     assert [each for each in parts if each.exists()] == parts
     writing.write()
     writing.writer.close()
     assert writing.writer.paths == parts[:1]
-    assert names(tmp_path) == {*kept, "s-001.mcap", "s-008.mcap", "s-009.mcap", "elsewhere"}
+    assert names(tmp_path) == {*kept, "s-001.mcap", "s-009.mcap", "s-010.mcap", "elsewhere"}
     assert {name: (tmp_path / name).read_bytes() for name in kept} == was
     (note,) = writing.writer.notes
     assert note == f"parts of an older session were removed: {', '.join(map(str, parts[1:]))}"
@@ -176,7 +185,7 @@ def test_parts_go_round_what_is_in_their_way(recorded: Session, tmp_path: Path) 
     writing = Writing(recorded.path, tmp_path / "s.mcap", PARTS)
     writing.write()
     writing.writer.close()
-    assert [each.name for each in writing.writer.paths] == [f"s-{k:03d}.mcap" for k in (1, 4, 5, 6)]
+    assert [each.name for each in writing.writer.paths] == [f"s-{k:03d}.mcap" for k in (1, 4, 5, 6, 7)]
     assert Recording(tmp_path / "s-004.mcap").metadata[topics.PART] == "4"
     assert (tmp_path / "s-002.mcap").read_bytes() == b"theirs"
     assert ["s-002.mcap was there already" in writing.writer.notes[0], len(writing.writer.notes)] == [True, 2]
@@ -243,7 +252,7 @@ def test_a_file_whose_name_is_no_longer_its_own_ends_the_session_and_is_kept(
     seconds.append(0.0 if at_the_end else 2.0)
     if not at_the_end:
         with pytest.raises(RecordingError, match=r"a\.mcap was removed, renamed or replaced by another program"):
-            writing.write(wait=lambda: writing.writer.write(topics.LOG, Log(), 0) or False)
+            writing.write_on()
     with pytest.raises(RecordingError) as caught:
         writing.writer.close({"ended": "complete"})
     said = str(caught.value)
