@@ -83,6 +83,7 @@ def check_live_is_recorded(run: Run) -> None:
         assert np.array_equal(live.lead_inputs, again.lead_inputs)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "faults",
     [
@@ -161,6 +162,7 @@ def test_a_block_is_sent_again_as_often_as_its_lead_leaves_room_for(tmp_path: Pa
     assert run.report.steps_late == run.report.steps_parked
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("when", [0, 5_000])
 def test_a_host_that_is_held_up_for_less_than_the_queue_lasts_is_late_with_nothing(when: int, tmp_path: Path) -> None:
     """At the start, too: the queue has been filled by then."""
@@ -242,6 +244,7 @@ def test_a_dead_mirror_line_ends_the_session_within_twice_the_watchdog(tmp_path:
     assert any("parked by its watchdog in a session before: re-armed" in text for text in log_of(again))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seconds", [0.9, 1.1, 1.9])
 def test_a_mirror_line_that_comes_back_in_time(seconds: float, tmp_path: Path) -> None:
     """After the watchdog it takes a word to go on; before, the queue has run empty and nothing more."""
@@ -407,6 +410,7 @@ def test_the_account_agrees_with_the_device_whatever_it_is_told(
         assert report.steps_not_reported == 0
 
 
+@pytest.mark.slow
 def test_a_piece_of_a_recording_has_the_same_exposures(tmp_path: Path) -> None:
     """Also where reports were asked for again across its edges."""
     rig = rig_with(bit_error_rate=2e-4)  # the first word to start is lost here: the session begins later

@@ -92,6 +92,7 @@ def test_a_port_that_is_not_there_is_refused(aolink: Run) -> None:
     assert_refused(result, 3, "there is no port /dev/nowhere: `aolink devices` lists those of this machine")
 
 
+@pytest.mark.slow
 def test_a_port_in_use_is_refused(aolink: Run) -> None:
     with simulated_rig("section-vi") as (camera, mirror):
         held = SerialPort(camera)

@@ -105,6 +105,7 @@ def test_what_it_had_no_time_for_is_counted_and_recorded(loaded: Session) -> Non
     assert loaded.report.exposures_skipped[slow()] == loaded.report.estimation[slow()].skipped > 0
 
 
+@pytest.mark.slow
 def test_what_was_estimated_online_is_the_same_offline_with_the_same_exposures_skipped(loaded: Session) -> None:
     recording = Recording(loaded.path)
     again = reestimate(recording, [slow(), "o3"], as_recorded=True)

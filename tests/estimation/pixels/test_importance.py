@@ -79,6 +79,7 @@ def test_an_axis_that_misses_nothing_is_not_changed_by_one_that_does():
     assert np.isfinite(found.log_weight[0]).sum() > there.sum()
 
 
+@pytest.mark.slow
 def test_profile_has_density_where_tempered_points_of_another_chance_lie():
     """Its mean log-density there is -15.6; without the points that its fit misses it would be -16.3 (seed 3, taken of
     eight for that)."""
