@@ -19,6 +19,7 @@ import numpy as np
 
 from aolink.errors import EstimatorError
 from aolink.extensions import names_with, row_named
+from aolink.limits import check_room
 from aolink.plant.alike import MANY_STATES, alike_systems
 from aolink.rig import Rig
 
@@ -35,6 +36,8 @@ BASELINE_ESTIMATOR = "o1"
 """The estimator that others are compared with: it takes the centroid of a blurred spot alone."""
 # Spots of one copy of the plant, by `moments`.
 _MOST_SPOTS = 128
+_LOADED_BYTES = 384 << 20
+"""Address space of the libraries and of the compiled code of an estimator. LLVM ends a process that lacks it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,6 +95,7 @@ def make_estimator(rig: Rig, name: str, **options: Any) -> Estimator:
     EstimatorError
         There is no such estimator or option, or it cannot work on this rig.
     """
+    check_room(_LOADED_BYTES, "making an estimator", EstimatorError)
     # Not before: whoever wants no more of a row than its colour and rank waits for none of these.
     from aolink.estimation.compiled import make_ready
     from aolink.estimation.estimator import Estimator
