@@ -71,19 +71,20 @@ def compare(
     from aolink.cli.tables import recordings as tables
     from aolink.recording import topics
     from aolink.recording.compare import compare as compare_recordings
-    from aolink.recording.reestimate import write_reestimated
+    from aolink.recording.reestimate import own_estimators, write_reestimated
     from aolink.recording.side_files import check_is_side_of
 
     one = open_recording(first)
     if accept and topic:
         raise typer.BadParameter(f"--accept would replace the whole of {first}, other topics too: leave --topic out")
-    if second is None and not one.estimators:
+    own = own_estimators(one, warn) if second is None else []
+    if second is None and not own:
         raise RecordingError(f"{first} holds no estimates to make again: give a second recording")
     with TemporaryDirectory(prefix="aolink-") as folder:
         if second is None:
             second = f"{folder}/{one.path.name}"
             with progress("estimate", one.n_frames) as tell:
-                write_reestimated(one, one.estimators, second, progress=tell, as_recorded=True)
+                write_reestimated(one, own, second, progress=tell, as_recorded=True)
         two = open_recording(second)
         if two.side_of and not one.side_of:
             check_is_side_of(two, one)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from importlib.metadata import version
 from pathlib import Path
 
@@ -11,6 +11,7 @@ import numpy as np
 from aolink.errors import RecordingError
 from aolink.estimation import Driver, Engine, Estimate, Score, Scorer
 from aolink.estimation.estimate import COMPARED
+from aolink.estimation.registry import retired
 from aolink.exporting.common import Progress, no_progress
 from aolink.exposure import Exposure
 from aolink.files import writing
@@ -56,6 +57,13 @@ def reestimated(
     for number, done in enumerate(driver.steps(recording.exposures()), 1):
         yield done
         progress(number)
+
+
+def own_estimators(recording: Recording, say: Callable[[str], None]) -> list[str]:
+    """The estimators of a recording that can run again; ``say`` gets a line about each of an earlier version."""
+    for reason in filter(None, map(retired, recording.estimators)):
+        say(f"{recording.path.name} has estimates that are not made again: {reason}")
+    return [name for name in recording.estimators if not retired(name)]
 
 
 def skipped_by(recording: Recording, names: Sequence[str]) -> dict[str, frozenset[int]]:

@@ -56,7 +56,10 @@ class Constants:
     fewest_of_a_share: int = 32
     """And the fewest, whatever share of them is asked for."""
     most_points: int = 2048
-    """The most points of a round, which bounds the work."""
+    """The most points of a round."""
+    work: float = 2.5e6
+    """And as many as about this number of products allow, so that an exposure of a spot on a plane, whose points are
+    three times the work, takes no longer than its frame."""
     enough: float = 100.0
     """The effective sample size at which rounds end."""
     share_of_one_mode: float = 0.25

@@ -51,7 +51,7 @@ def importance_corrected(
 ) -> tuple[GaussianMixture, FloatArray]:
     """A mixture fitted to weighted points, and their effective sample size, (axes,), which is to reach ``enough``."""
     n = view.reduced.size
-    numbers = [quasi_random(points_of_round(n, share), n, k) for k in range(PROFILE.rounds)]
+    numbers = [quasi_random(points_of_round(view, share), n, k) for k in range(PROFILE.rounds)]
     fit = proposal.copy()
     effective = np.empty(len(prior.mean))
     compiled_mixtures.correct_by_importance(
@@ -62,10 +62,11 @@ def importance_corrected(
     return fit, effective
 
 
-def points_of_round(n: int, share: float) -> int:
-    """Points that each round has for n coefficients: this share of the usual number, to a power of two."""
-    wanted = max(PROFILE.fewest_of_a_share, share * max(PROFILE.fewest_points, PROFILE.points * n**2))
-    return min(PROFILE.most_points, 1 << math.ceil(math.log2(wanted)))
+def points_of_round(view: PixelView, share: float) -> int:
+    """Points that each round has: this share of the usual number for so many coefficients, a power of two."""
+    wanted = max(PROFILE.fewest_of_a_share, share * max(PROFILE.fewest_points, PROFILE.points * view.reduced.size**2))
+    most = min(PROFILE.most_points, max(PROFILE.fewest_points, PROFILE.work / view.work))
+    return min(1 << math.ceil(math.log2(wanted)), 1 << int(math.log2(most)))
 
 
 @lru_cache(maxsize=32)

@@ -30,7 +30,7 @@ from aolink.estimation.pixels.gaussian_mixture import log_sum
 from aolink.estimation.pixels.levenberg_marquardt import FIRST_DAMPING, FREE_DAMPING, LARGEST_DAMPING, Points, minimise
 from aolink.estimation.pixels.likelihood import PixelView
 from aolink.numerics import batched
-from aolink.numerics.arrays import FloatArray, Indices
+from aolink.numerics.arrays import BoolArray, FloatArray, Indices
 from aolink.numerics.covariance import cholesky, lower_inverse
 
 _NO_NOISE = 1e-14
@@ -63,6 +63,11 @@ class Modes(NamedTuple):
     def best(self) -> Indices:
         """Index of the mode of least objective, (axes,)."""
         return np.asarray(np.argmin(self.objective, axis=1))
+
+    @property
+    def best_mean(self) -> FloatArray:
+        """That mode, (axes, 1, n)."""
+        return np.asarray(self.mean[np.arange(len(self.mean)), self.best][:, None])
 
 
 def find_modes(view: PixelView, prior: Gaussian, starts: FloatArray) -> Modes:
@@ -103,26 +108,30 @@ def found_compiled(
     return found
 
 
-def modes_of(view: PixelView, prior: Gaussian, wide: Gaussian) -> Modes:
+def modes_of(view: PixelView, prior: Gaussian, wide: Gaussian, at_length: BoolArray) -> Modes:
     """The modes of a posterior; ``wide`` is the posterior of windowed moments, from which searches start.
 
-    Starts are its mean and points on both sides of it (`spread_starts`). After their modes come those that the best
-    mode's reversal and mirror images lead to.
+    A search starts at its mean and, where it is to be ``at_length``, (axes,), at points on both sides of it
+    (`spread_starts`). After their modes come those that the best mode's reversal and mirror images lead to.
     """
     starts, squares = spread_starts(view, prior, wide)
-    many = squares[:, 0] > PROFILE.wide_path * view.kernel_variance
+    many = at_length & (squares[:, 0] > PROFILE.wide_path * view.kernel_variance)
     if (line := view.line) is not None:
-        of_axis = np.where(many, starts.shape[1], 3)
+        of_axis = np.where(many, starts.shape[1], np.where(at_length, 3, 1))
         return found_compiled(line, prior, starts, of_axis, view.whole_nodes, precision_of_reversal(view))
-    found = find_modes(view, prior, starts[:, :3])
-    if len(some := np.flatnonzero(many)):
-        found = with_more(found, some, find_modes(view.part(some), prior.part(some), starts[some, 3:]))
-    return with_reversals(view, prior, found)
+    found = find_modes(view, prior, starts[:, :1])
+    for which, some in ((at_length, starts[:, 1:3]), (many, starts[:, 3:])):
+        if len(rows := np.flatnonzero(which)):
+            found = with_more(found, rows, find_modes(view.part(rows), prior.part(rows), some[rows]))
+    if len(rows := np.flatnonzero(at_length)):
+        back = reversed_starts(view.part(rows), prior.part(rows), found.best_mean[rows])
+        found = with_more(found, rows, find_modes(view.part(rows), prior.part(rows), back))
+    return found
 
 
 def with_reversals(view: PixelView, prior: Gaussian, found: Modes) -> Modes:
     """Modes, and after them those that the best one's reversal and mirror images lead to."""
-    back = reversed_starts(view, prior, found.mean[np.arange(len(found.mean)), found.best][:, None])
+    back = reversed_starts(view, prior, found.best_mean)
     return with_more(found, slice(None), find_modes(view, prior, back))
 
 

@@ -69,14 +69,16 @@ def has_several(modes: Modes, least: float = PROFILE.least_share) -> BoolArray:
 def explored(view: PixelView, prior: GaussianMixture) -> tuple[Modes, GaussianMixture]:
     """The modes for each component of the start state's prior, and the proposal density: a mixture to draw points from.
 
-    The modes' log-evidence includes the weights of the components.
+    The heaviest component is searched at length, the others from one start each. The modes' log-evidence includes the
+    weights of the components.
     """
     before = view.reduced.prior(Gaussian(prior.mean, prior.covariance))
     axes, count, _ = before.mean.shape
     there = np.nonzero(np.isfinite(prior.log_weight))
     rows, own = view.part(there[0]), Gaussian(before.mean[there], before.covariance[there])
     wide = broad(rows, own)
-    found = modes_of(rows, own, wide)
+    heaviest = np.argmax(prior.log_weight, axis=1)[there[0]] == there[1]
+    found = modes_of(rows, own, wide, heaviest)
     found = found._replace(log_evidence=found.log_evidence + prior.log_weight[there][:, None])
     modes = Modes.none(axes, count * found.mean.shape[1], found.mean.shape[2])
     for room, each in zip(modes, found, strict=True):

@@ -6,6 +6,7 @@ import numpy as np
 
 from aolink.estimation import Profile
 from aolink.estimation.pixels import importance
+from aolink.estimation.pixels.constants import PROFILE
 from aolink.estimation.pixels.gaussian_mixture import GaussianMixture, log_sum, with_noise
 from aolink.estimation.pixels.likelihood import PixelView
 from aolink.estimation.pixels.modes import find_modes, whitened
@@ -89,12 +90,12 @@ def settled_modes(view, prior, starts):
 def importance_corrected(view, prior, proposal, share, enough):
     """The twin of `importance.importance_corrected`."""
     n = view.reduced.size
-    points = importance.points_of_round(n, share)
+    points = importance.points_of_round(view, share)
     proposals = list[GaussianMixture]()
     t = np.zeros((len(prior.mean), 0, n))
     target, effective = np.zeros(t.shape[:2]), np.zeros(len(t))
     fit, going_on = proposal, np.ones(len(t), dtype=bool)
-    for k in range(importance.ROUNDS):
+    for k in range(PROFILE.rounds):
         new = _drawn(proposal, points, k)
         proposals.append(proposal)
         t = np.concatenate([t, new], axis=1)
@@ -102,16 +103,16 @@ def importance_corrected(view, prior, proposal, share, enough):
         log_weight = target - log_sum(np.stack([q.log_density(t) for q in proposals], axis=1), axis=1)
         log_weight -= log_sum(log_weight, axis=1)[:, None]
         effective = np.where(going_on, np.exp(-log_sum(2 * log_weight, axis=1)), effective)
-        tempered = _tempered(log_weight, importance.LEAST_EFFECTIVE)
-        scale = importance.LOOSENED if k else importance.TIGHTENED
+        tempered = _tempered(log_weight, PROFILE.least_effective)
+        scale = PROFILE.loosened if k else PROFILE.tightened
         scaled = proposal._replace(covariance=proposal.covariance * scale)
-        last = _refitted(proposal, t, tempered, scaled, n * importance.LAST_PRIOR_POINTS)
+        last = _refitted(proposal, t, tempered, scaled, n * PROFILE.last_prior_points)
         some = np.flatnonzero(going_on)
         fit = fit.replaced(some, last.part(some))
         going_on &= effective < enough
         if not going_on.any():
             break
-        proposal = _refitted(proposal, t, tempered, proposal, n * importance.PRIOR_POINTS)
+        proposal = _refitted(proposal, t, tempered, proposal, n * PROFILE.prior_points)
     return fit, effective
 
 
@@ -120,7 +121,7 @@ def _tempered(log_weight, least):
     least = min(least, log_weight.shape[1] / 2)
     low, high = np.zeros(len(log_weight)), np.ones(len(log_weight))
     power = high
-    for _ in range(importance.HALVINGS):
+    for _ in range(PROFILE.halvings):
         w = power[:, None] * log_weight
         enough = -log_sum(2 * (w - log_sum(w, axis=1)[:, None]), axis=1) >= math.log(least)
         low, high = np.where(enough, power, low), np.where(enough, high, power)
@@ -154,6 +155,6 @@ def _refitted(mixture, points, log_weight, beside, prior_points):
     spread = batched.long_matmul(batched.transpose(away * share[..., None]), away) / safe[..., None]
     trust = (effective / (effective + prior_points))[..., None, None]
     covariance = batched.symmetric(trust * spread + (1 - trust) * beside.covariance)
-    mass = np.where(mass > importance.NEGLIGIBLE * np.add.reduce(mass, axis=1)[:, None], mass, 0.0)
+    mass = np.where(mass > PROFILE.negligible * np.add.reduce(mass, axis=1)[:, None], mass, 0.0)
     with np.errstate(divide="ignore"):
         return GaussianMixture(np.log(mass / np.add.reduce(mass, axis=1)[:, None]), mean, covariance)
