@@ -445,7 +445,7 @@ def test_the_demo_from_a_rig_file_with_a_picture_and_slopes_beside_it(aolink: Ru
     done = aolink("demo", "--rig", "mine/my.toml", "--exposures", "4", "--out", tmp_path / "out")
     assert done.returncode == 0, done.stderr
     (made,) = (tmp_path / "out").glob("demo-*")
-    assert "4 scenes of 4 exposures restored with the path of mixture, tv" in done.stdout
+    assert "4 scenes of 4 exposures restored with the path of moments, tv" in done.stdout
     assert "PSNR of the scene:" in done.stdout
     assert (made / "rig.toml").read_text() == (folder / "my.toml").read_text()
     shutil.rmtree(folder)  # the recording needs nothing but itself

@@ -34,16 +34,18 @@ def proposed(modes: GaussianMixture, wide: GaussianMixture) -> GaussianMixture:
 
 
 def posterior(
-    view: PixelView, prior: GaussianMixture, proposal: GaussianMixture, share: float
+    view: PixelView, prior: GaussianMixture, proposal: GaussianMixture, wide: GaussianMixture, share: float
 ) -> tuple[GaussianMixture, BoolArray]:
     """A mixture that fits the posterior of t by importance sampling, and where too few points count for it, (axes,).
 
     Each round has this ``share`` of the usual number of points, and the effective sample size to reach is the same
-    share of the usual one. With less than half of that the fit is wide, since its weights are flattened.
+    share of the usual one. Where it is less, modes may have been missed, so a part of the posterior is the ``wide``
+    Gaussians of windowed moments: they count as many points as there are coefficients, times what is missing.
     """
-    wanted = np.full(len(prior.mean), share * PROFILE.enough)
+    wanted, n = np.full(len(prior.mean), share * PROFILE.enough), view.reduced.size
     fit, effective = importance_corrected(view, prior, proposal, share, wanted)
-    return fit, np.asarray(effective < PROFILE.too_few * wanted)
+    part = n / (n + effective) * np.maximum(0.0, 1 - effective / wanted)
+    return joined(fit.weighted(1 - part), wide.weighted(part)), np.asarray(effective < PROFILE.too_few * wanted)
 
 
 def importance_corrected(

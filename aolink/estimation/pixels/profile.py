@@ -3,7 +3,8 @@ exposure.
 
 In words: the modes of the posterior are searched for, points are drawn about them and weighted by importance sampling
 (`aolink.estimation.pixels.importance`), the weights are flattened until enough of the points count, and at most four
-Gaussians that fit them go on to the next exposure. Modes alone are not enough, since they are not Gaussian: the blur
+Gaussians that fit them go on to the next exposure. The fewer points count, the larger is the part of the posterior that
+remains the wide Gaussians of windowed moments. Modes alone are not enough, since they are not Gaussian: the blur
 determines how much a path moves but not in which direction, and such a posterior is curved. The work for an axis and
 exposure is bounded, and `aolink.estimation.pixels.constants` has all numbers.
 
@@ -45,14 +46,18 @@ class ProfileUpdater:
         modes, after = explored(view, prior)
         new = innovation(view, reduced.prior(prior.gaussian), modes)
         doubted = np.flatnonzero(new.nis > 2 * special.gammainccinv(new.value.shape[1] / 2, PROFILE.doubted))
+        wide = _wide_part(after, prior)
         if len(doubted):
-            _, more = explored(view.part(doubted), single(unseen.part(doubted)))
+            anew = single(unseen.part(doubted))
+            _, more = explored(view.part(doubted), anew)
             after = after.replaced(doubted, joined(after.part(doubted), more))
+            wide = wide.replaced(doubted, joined(wide.part(doubted), _wide_part(more, anew)))
         before = joined(prior.weighted(1 - PROFILE.doubt), single(unseen).weighted(PROFILE.doubt))
         several, poor = has_several(modes, PROFILE.least_doubted_share), np.zeros(len(prior.mean), dtype=bool)
         for which, share in ((~several, PROFILE.share_of_one_mode), (several, 1.0)):
             if len(rows := np.flatnonzero(which)):
-                fit, poor[rows] = posterior(view.part(rows), before.part(rows), after.part(rows), self.draws * share)
+                parts = (each.part(rows) for each in (before, after, wide))
+                fit, poor[rows] = posterior(view.part(rows), *parts, self.draws * share)
                 after = after.replaced(rows, fit)
         carried = after.mapped(reduced.end_rows, reduced.end_remainder).reduced(PROFILE.carried, PROFILE.free)
         return MixtureUpdate(
@@ -87,3 +92,9 @@ def explored(view: PixelView, prior: GaussianMixture) -> tuple[Modes, GaussianMi
     flat = GaussianMixture(prior.log_weight, np.zeros_like(before.mean), np.zeros_like(before.covariance))
     flat.mean[there], flat.covariance[there] = wide.mean, wide.covariance
     return modes, proposed(GaussianMixture(modes.log_evidence, modes.mean, modes.covariance), flat)
+
+
+def _wide_part(proposal: GaussianMixture, prior: GaussianMixture) -> GaussianMixture:
+    """The Gaussians of windowed moments, the last ones of a proposal density, with the weights of the prior's."""
+    count = prior.mean.shape[1]
+    return GaussianMixture(prior.log_weight, proposal.mean[:, -count:], proposal.covariance[:, -count:])

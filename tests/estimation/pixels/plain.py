@@ -7,7 +7,7 @@ import numpy as np
 from aolink.estimation import Profile
 from aolink.estimation.pixels import importance
 from aolink.estimation.pixels.constants import PROFILE
-from aolink.estimation.pixels.gaussian_mixture import GaussianMixture, log_sum, with_noise
+from aolink.estimation.pixels.gaussian_mixture import GaussianMixture, log_sum
 from aolink.estimation.pixels.likelihood import PixelView
 from aolink.estimation.pixels.modes import find_modes, whitened
 from aolink.numerics import batched
@@ -29,6 +29,13 @@ class PlainView(PixelView):
         twin = cls.__new__(cls)
         twin.__dict__.update(vars(view), on_line=False, sees_line=view.on_line)
         return twin
+
+    @property
+    def work(self):
+        """That of the view, which decides on the number of points."""
+        twin = PixelView.__new__(PixelView)
+        twin.__dict__.update(vars(self), on_line=self.sees_line)
+        return twin.work
 
     def moments(self, about):
         if not self.sees_line:
@@ -77,6 +84,14 @@ class PlainView(PixelView):
 
     def log_likelihoods(self, t):
         return self.log_likelihood(self.predicted(t))
+
+
+def with_noise(prior, t):
+    """Log-densities of t = (start state, standard normal noise coefficients), (axes, points, n) -> (axes, points)."""
+    states = prior.mean.shape[2]
+    rest = t[..., states:]
+    constant = -0.5 * rest.shape[-1] * math.log(2 * math.pi)
+    return prior.log_density(t[..., :states]) - 0.5 * np.add.reduce(rest * rest, axis=-1) + constant
 
 
 def settled_modes(view, prior, starts):

@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from aolink.estimation.pixels.gaussian_mixture import GaussianMixture, with_noise, with_noise_and_gradient
+from aolink.estimation.pixels.gaussian_mixture import GaussianMixture, with_noise_and_gradient
 from aolink.estimation.pixels.likelihood import PixelView
 from aolink.estimation.pixels.moves import Hamiltonian, affordable
 from tests.estimation.compiled.test_pixels import looked_at, looked_at_plane
+from tests.estimation.pixels.plain import with_noise
 
 COUNT, SIZE, RADIUS, WIDTH = 4000, 20, 2.0, 0.1
 STANDARD = GaussianMixture(np.zeros((1, 1)), np.zeros((1, 1, 2)), np.eye(2)[None, None])
