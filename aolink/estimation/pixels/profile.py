@@ -56,8 +56,9 @@ class ProfileUpdater:
         several, poor = has_several(modes, PROFILE.least_doubted_share), np.zeros(len(prior.mean), dtype=bool)
         for which, share in ((~several, PROFILE.share_of_one_mode), (several, 1.0)):
             if len(rows := np.flatnonzero(which)):
-                parts = (each.part(rows) for each in (before, after, wide))
-                fit, poor[rows] = posterior(view.part(rows), *parts, self.draws * share)
+                fit, poor[rows] = posterior(
+                    view.part(rows), before.part(rows), after.part(rows), wide.part(rows), self.draws * share
+                )
                 after = after.replaced(rows, fit)
         carried = after.mapped(reduced.end_rows, reduced.end_remainder).reduced(PROFILE.carried, PROFILE.free)
         return MixtureUpdate(

@@ -130,11 +130,10 @@ def test_places_are_the_same_one_by_one_and_several_at_a_time():
     assert 20 < lit < count - 20
 
 
-@pytest.mark.parametrize("memory", [None, np.linspace(1, 5, AXES)], ids=["alone", "remembered"])
-def test_the_windowed_moments_are_those_of_the_twin(pair, memory):
+def test_the_windowed_moments_are_those_of_the_twin(pair):
     view, in_numpy, state = pair
     prior = view.reduced.prior(state)
-    ours, theirs = broad(view, prior, memory), broad(in_numpy, prior, memory)
+    ours, theirs = broad(view, prior), broad(in_numpy, prior)
     sd = np.sqrt(np.einsum("aii->ai", theirs.covariance))
     # The two error functions differ by 8e-8, and how their sums are rounded depends on the processor.
     np.testing.assert_allclose(ours.mean / sd, theirs.mean / sd, atol=1e-4)
