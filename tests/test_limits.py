@@ -38,6 +38,7 @@ def png(path: Path, width: int, height: int) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_a_small_fits_file_that_holds_gigabytes_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "a.fits.gz"
     with gzip.open(path, "wb", compresslevel=1) as file:

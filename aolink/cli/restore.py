@@ -116,6 +116,7 @@ def _deblur_picture(
 ) -> None:
     import numpy as np
 
+    from aolink.cli.tables.sessions import adds_error
     from aolink.optics.pictures import finite_pixels, read_picture, read_psf, write_picture
     from aolink.restoration import find_method, restore
 
@@ -130,10 +131,14 @@ def _deblur_picture(
     write_picture(out, made, overwrite=overwrite, sources=[image, psf])
     if as_json:
         found = None if math.isnan(restored.noise_sd) else restored.noise_sd
+        gain = None if math.isnan(restored.expected_gain_db) else restored.expected_gain_db
         facts = {"method": method, "noise_sd": found, "direction": restored.direction, "pixels_filled": missing}
+        facts["expected_gain_db"] = gain
         print(json.dumps({"out": str(out), **facts}))
     else:
         noise = "" if math.isnan(restored.noise_sd) else f", noise sd {restored.noise_sd:.3g}"
         scanned = f", scanned {restored.direction}s" if "direction" in find_method(method).parameters else ""
         filled = f", {missing} pixels that are not numbers filled in" if missing else ""
         stdout.print(f"{out}: {method}{noise}{scanned}{filled}", markup=False)
+        for line in adds_error(method, restored.expected_gain_db):
+            stdout.print(line, markup=False)

@@ -46,6 +46,8 @@ class RestoredCounts:
     psnr_blurred: list[float] = field(default_factory=list)
     """Peak signal-to-noise ratio of each scene before restoration, moved back by its mean displacement, dB."""
     psnr_restored: list[float] = field(default_factory=list)
+    expected_gains: list[float] = field(default_factory=list)
+    """`RestoredPictures.expected_gain_db` of each exposure for which the method expects one, dB."""
     motion: Scorer = field(default_factory=Scorer)
     """Score of the estimates whose paths the pictures were restored with."""
 
@@ -167,6 +169,8 @@ def _score(
     summary.exposures += 1
     summary.motion.add(exposure, estimate)
     summary.scenes += done.scene is not None
+    if not np.isnan(done.expected_gain_db):
+        summary.expected_gains.append(done.expected_gain_db)
     if done.reason:
         summary.reasons[done.reason] += 1
     if true_scene is None or rig.scene is None or exposure.scene is None or done.scene is None:

@@ -5,13 +5,13 @@ from typing import TYPE_CHECKING, Any
 
 from aolink.restoration.block_matching import block_matching
 from aolink.restoration.deblur import RestoredPictures, deblur
-from aolink.restoration.inverse import largest_zero, stable_direction
 from aolink.restoration.method import Blurred, Method, Restored
 from aolink.restoration.plug_and_play import non_local_means
 from aolink.restoration.psf import Psf, motion_psf, motion_psf_by_root
 from aolink.restoration.registry import find_method, method_names
 from aolink.restoration.restore import restore
 from aolink.restoration.scanner import Scanner, first_order, from_correlation, measured_correlation
+from aolink.restoration.shahin import largest_zero, stable_direction
 
 if TYPE_CHECKING:
     METHODS: tuple[str, ...]

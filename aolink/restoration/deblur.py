@@ -41,6 +41,8 @@ class RestoredPictures:
     """Standard deviation of the scene's noise, estimated from the scene; NaN where there is no scene."""
     path_noise_sd: float
     """Standard deviation of the additional noise from the path's uncertainty."""
+    expected_gain_db: float = math.nan
+    """`Restored.expected_gain_db` of the scene; without one, the mean of the spots."""
     reason: str
     """The reason why pictures are missing; empty where none is."""
     scene: NDArray[np.float32] | None
@@ -75,20 +77,22 @@ def deblur(rig: Rig, exposure: Exposure, estimate: Estimate, method: str = DEFAU
     `aolink.restoration.METHODS`.
     """
     scene = spots = None
-    noise, added, reasons = math.nan, math.nan, list[str]()
+    noise, added, gain, reasons = math.nan, math.nan, math.nan, list[str]()
     if rig.scene is not None:
         try:
             done = _restored_scene(rig, exposure, estimate, method)
-            scene, noise, added = _unit(done.image), done.noise_sd, done.psf_noise_sd
+            scene, noise, added, gain = _unit(done.image), done.noise_sd, done.psf_noise_sd, done.expected_gain_db
         except RestorationError as error:
             reasons.append(f"scene: {error}")
     try:
-        spots = _unit(_restored_spots(rig, exposure, estimate, method))
+        image, gains = _restored_spots(rig, exposure, estimate, method)
+        spots, gain = _unit(image), float(np.mean(gains)) if rig.scene is None else gain
     except RestorationError as error:
         reasons.append(f"spot: {error}")
     return RestoredPictures(
         frame_id=exposure.frame_id, estimator=estimate.estimator, method=method, scene_noise_sd=noise,
         path_noise_sd=added, reason="; ".join(reasons), scene=scene, spots=spots,
+        expected_gain_db=gain,
     )  # fmt: skip
 
 
@@ -101,17 +105,19 @@ def _restored_scene(rig: Rig, exposure: Exposure, estimate: Estimate, method: st
     return restore(rig.scene.to_intensity(counts), scene_psf(rig, exposure, estimate), method=method, mask=good)
 
 
-def _restored_spots(rig: Rig, exposure: Exposure, estimate: Estimate, method: str) -> FloatArray:
+def _restored_spots(rig: Rig, exposure: Exposure, estimate: Estimate, method: str) -> tuple[FloatArray, list[float]]:
     sensor = rig.sensor
     share = to_density(sensor, exposure.pixels) * sensor.pixel_size
     good = exposure.mask & ~is_saturated(sensor, exposure.pixels)
     mixes = np.eye(rig.n_outputs).reshape(-1, sensor.directions, rig.n_outputs)
     psfs = estimated_psfs(exposure, estimate, mixes, sensor.kernel, sensor.pixel_width)
-    out = np.zeros_like(share)
+    out, gains = np.zeros_like(share), list[float]()
     for spot, psf in zip(range(sensor.spots), psfs, strict=False):
         window = sensor.window_of(spot)
-        out[window] = restore(share[window], psf, method=method, mask=good[window]).image
-    return out
+        done = restore(share[window], psf, method=method, mask=good[window])
+        out[window] = done.image
+        gains.append(done.expected_gain_db)
+    return out, gains
 
 
 def _unit(image: FloatArray) -> NDArray[np.float32]:

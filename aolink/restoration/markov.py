@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from scipy import fft, linalg
 
 from aolink.numerics.arrays import BoolArray
-from aolink.restoration.banded import dense, normal_bands
 from aolink.restoration.psf import Psf, line_matrix
 
 FloatingArray = NDArray[np.floating[Any]]
@@ -99,16 +98,12 @@ def line_solver(psf: Psf, shape: tuple[int, int], kappa: float, single: bool = F
     taps = np.broadcast_to(psf.values, (shape[1], psf.values.shape[-1]))
     single = single and single_is_enough(kappa, float(taps.sum(axis=1).max()))
     dtype = np.float32 if single else np.float64
-    bands = normal_bands(taps, np.ones(shape[1]))
-    bands[0] += 2 * kappa
-    bands[0, 0] -= kappa
-    bands[0, -1] -= kappa
-    bands[1, :-1] -= kappa
+    C = line_matrix(taps, shape[1])
     # NumPy's function, not SciPy's: each library has threads of its own, and SciPy's would be in the way of the
     # products'.
-    values, vectors = np.linalg.eigh(dense(bands))
+    values, vectors = np.linalg.eigh(C.T @ C + kappa * _differences_squared(C.shape[1]))
     return LineSolver(
-        C=line_matrix(taps, shape[1]).astype(dtype), vectors=vectors.astype(dtype),
+        C=C.astype(dtype), vectors=vectors.astype(dtype),
         inverse=(1 / (values + kappa * difference_spectrum(shape[0])[:, None])).astype(dtype),
         first=taps.shape[1] - 1 - psf.origin[0],
     )  # fmt: skip

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,9 +14,10 @@ from scipy import ndimage
 
 from aolink.numerics.arrays import BoolArray, FloatArray
 from aolink.restoration import spectrum
-from aolink.restoration.inverse import Direction
 from aolink.restoration.psf import ProjectedPsf, Psf, along_line
 from aolink.restoration.scanner import Scanner
+
+Direction = Literal["forward", "backward"]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -72,6 +73,9 @@ class Restored:
     """Standard deviation of the picture's white noise, as given or as estimated; NaN for a method that needs none."""
     psf_noise_sd: float = math.nan
     """Root of the variance that the PSF's uncertainty adds to the noise; NaN for a method that ignores it."""
+    expected_gain_db: float = math.nan
+    """By how much the method's own model expects it to lower the error of the blurred picture; below zero it adds to
+    it. NaN for methods whose model never expects that."""
     difference_weight: float = math.nan
     """lambda of gauss_markov, tv and pnp, one over the picture's unit squared; NaN for the other methods."""
     scanner: Scanner | None = None

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import fft
 
 from aolink.numerics.arrays import FloatArray
 from aolink.restoration import spectrum
@@ -16,11 +17,12 @@ from aolink.restoration.markov import PeriodicPlane, make_solver, plane_solver
 from aolink.restoration.method import Blurred, Restored
 from aolink.restoration.plug_and_play import Denoiser, plug_and_play
 from aolink.restoration.tv import plane_total_variation, total_variation
-from aolink.restoration.uncertainty import plane_variance
 
 # Least ratio of the variances of the noise and of the scene's differences for conjugate gradients: below it they need
 # more steps, in proportion to one over the ratio's root, and the picture gets no sharper.
 _SMALLEST_RATIO = 3e-4
+# Frequencies along each side over which the effect of a PSF's error is averaged.
+_GRID = 256
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,6 +83,21 @@ def pnp(picture: Blurred, *, denoise: Denoiser = block_matching) -> Restored:
 
 def why_not_pnp(picture: Blurred) -> str | None:
     return "pnp needs one PSF for the whole picture: use tv" if picture.psf.varies else None
+
+
+def plane_variance(modes: FloatArray, difference_weight: float) -> float:
+    """Added variance for a scene of white differences; PSF modes (modes, taps) or (modes, rows, columns), each of zero
+    sum.
+
+    It is the mean over all frequencies of |m|^2 / (lambda roughness).
+    """
+    if not len(modes):
+        return 0.0
+    plane = modes.reshape(len(modes), -1, modes.shape[-1])
+    power = (np.abs(fft.fft2(plane, (_GRID, _GRID))) ** 2).sum(axis=0)
+    one = 4 * np.sin(np.pi * np.arange(_GRID) / _GRID) ** 2
+    rough = one[:, None] + one
+    return float((power[rough > 0] / rough[rough > 0]).sum() / _GRID**2 / difference_weight)
 
 
 def _with_edges(picture: Blurred, weights: _Weights) -> tuple[FloatArray, tuple[slice, slice]]:

@@ -10,9 +10,9 @@ from functools import partial
 
 from aolink.errors import RestorationError
 from aolink.extensions import names_with, row_named
-from aolink.restoration.lines import inverse, kalman_estimate, why_not_inverse, why_not_lines
 from aolink.restoration.method import Method
 from aolink.restoration.plane import gauss_markov, pnp, tv, why_not_pnp
+from aolink.restoration.shahin import inverse, kalman_estimate, why_not_inverse, why_not_lines
 
 GROUP = "aolink.restorations"
 DEFAULT_METHOD = "tv"
@@ -28,20 +28,20 @@ def _on_lines(name: str, summary: str) -> Method:
 _OURS = {
     row.name: row
     for row in (
+        Method(name="tv", summary="total variation, keeps edges", restore=tv),
+        Method(
+            name="pnp", summary="plug and play with a denoiser: the best, and slow", restore=pnp, why_not=why_not_pnp,
+            parameters=("denoise",),
+        ),
+        Method(name="gauss_markov", summary="linear, for smooth scenes", restore=gauss_markov),
+        _on_lines("smoother", "Kalman smoother, from all pixels of the line"),
+        _on_lines("lag", "Kalman filter, a PSF's length behind"),
         Method(
             name="inverse", summary="on lines: exact, for pictures without noise", restore=inverse,
             why_not=why_not_inverse, parameters=("boundary", "scanner", "direction"),
         ),
-        _on_lines("predictor", "Kalman predictor, from the pixels before each"),
-        _on_lines("filter", "Kalman filter, from the pixels up to each"),
-        _on_lines("lag", "Kalman filter, a PSF's length behind"),
-        _on_lines("smoother", "Kalman smoother, from all pixels of the line"),
-        Method(name="gauss_markov", summary="linear, for smooth scenes", restore=gauss_markov),
-        Method(name="tv", summary="total variation, keeps edges", restore=tv),
-        Method(
-            name="pnp", summary="plug and play with a denoiser, slow", restore=pnp, why_not=why_not_pnp,
-            parameters=("denoise",),
-        ),
+        _on_lines("filter", "Kalman filter, from the pixels up to each; rarely better than the blurred picture"),
+        _on_lines("predictor", "Kalman predictor, from the pixels before each; hardly ever better"),
     )
 }  # fmt: skip
 

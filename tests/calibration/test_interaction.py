@@ -41,6 +41,7 @@ def test_poking_the_rig_gives_the_plants_own_matrix():
     assert np.sqrt((found.offset**2).mean()) > 3 * found.residual_rms / np.sqrt(32)  # the aberration is in the offset
 
 
+@pytest.mark.slow
 def test_pokes_go_no_faster_than_the_rig_file_allows_and_measure_the_same():
     rig = without_turbulence(SH)
     slow = dataclasses.replace(rig, mirror=dataclasses.replace(rig.mirror, slew_max_per_s=300.0))
@@ -78,6 +79,7 @@ def test_a_slow_mirror_is_measured_where_its_pokes_have_been_held_for_long_enoug
     assert apart[16] < 0.02
 
 
+@pytest.mark.slow
 def test_turbulence_costs_accuracy_and_nothing_else():
     found = measure_interaction(SH, poked(SH))
     calm = measure_interaction(without_turbulence(SH), poked(without_turbulence(SH)))

@@ -24,6 +24,7 @@ def lively() -> Recording:
     return Recording(Path(__file__).parents[2] / "recordings" / "section-vi-lively.mcap")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("module", "suffix", "extra"),
     [("pyarrow", ".parquet", "parquet"), ("h5py", ".nc", "tables"), ("aotpy", ".fits", "aot")],
@@ -78,6 +79,7 @@ def test_a_damaged_recording_gives_what_is_whole_and_says_so(aolink: Run, lively
         assert 0 < len(found["time"]) < len(lively)
 
 
+@pytest.mark.slow
 def test_a_side_file_alone_is_refused(aolink: Run, tmp_path: Path) -> None:
     source = write_small(tmp_path / "a.mcap", 2)
     estimate_file(source, tmp_path / "a.o1.mcap", Settings(estimator="o1"))

@@ -34,6 +34,7 @@ def unfinished(path):
     return data[: data.rindex(b"\x0f\x04" + bytes(7))]
 
 
+@pytest.mark.slow
 def test_a_finished_recording_goes_through_once(aolink, steady, tmp_path):
     done = aolink("identify", steady, "--follow", "-o", "identified.toml")
     assert done.returncode == 0
@@ -84,6 +85,7 @@ def test_ctrl_c_ends_it_while_the_session_goes_on(start_aolink, steady, tmp_path
     assert (tmp_path / "session.mcap").read_bytes() == data
 
 
+@pytest.mark.slow
 def test_of_a_session_that_died_it_says_so_and_what_it_found(aolink, steady, tmp_path):
     (tmp_path / "cut.mcap").write_bytes(unfinished(steady))
     done = aolink("identify", "cut.mcap", "--follow", "-o", "identified.toml")
@@ -92,7 +94,7 @@ def test_of_a_session_that_died_it_says_so_and_what_it_found(aolink, steady, tmp
     assert "cut.mcap ended after" in done.stdout
 
 
-@pytest.mark.slow
+@pytest.mark.rare  # a fit of both processes takes minutes
 def test_an_offer_is_written_into_a_rig_file_of_its_own_and_said(aolink, tmp_path):
     """The rig has its vibration at 14.4 Hz, and the session's rig file believes in 12 Hz."""
     believed, moved = load_rig("loop").toml, tmp_path / "moved.toml"
@@ -114,6 +116,7 @@ def test_an_offer_is_written_into_a_rig_file_of_its_own_and_said(aolink, tmp_pat
     assert {each.name for each in tmp_path.iterdir()} == {"session.mcap", "moved.toml", "identified.toml"}
 
 
+@pytest.mark.slow
 def test_too_short_a_recording_is_one_line(aolink, tmp_path):
     done = aolink("identify", REFERENCE / "jitter.mcap", "--follow", "-o", "identified.toml")
     assert done.returncode == 14

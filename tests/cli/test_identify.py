@@ -22,6 +22,7 @@ def shaken(tmp_path_factory):
     return path
 
 
+@pytest.mark.slow
 def test_a_model_goes_into_a_rig_file(aolink, shaken, tmp_path):
     out = tmp_path / "identified.toml"
     done = aolink("identify", shaken, "-o", out, "--model", "ornstein-uhlenbeck", "--json")

@@ -41,5 +41,6 @@ def test_looking_at_a_recording_that_holds_its_estimates_loads_rerun_and_no_esti
     assert (tmp_path / "part.rrd").stat().st_size > 100_000
 
 
+@pytest.mark.slow
 def test_what_a_recording_holds_is_told_without_scipy(tmp_path: Path) -> None:
     assert loaded_by_command(tmp_path, "info", SESSION) == {"numpy"}

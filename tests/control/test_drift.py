@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pytest
+
 from aolink.control import Fit, FitMonitor
 from aolink.control.drift import WINDOW
 from aolink.estimation import make_estimator
@@ -18,6 +20,7 @@ def fit_of(believed: Rig, true: Rig, seed: int, estimator: str = "moments") -> F
     return fit
 
 
+@pytest.mark.slow
 def test_a_right_model_fits() -> None:
     rig = small_rig(DRIFT, VIBRATION)
     for seed in range(5):

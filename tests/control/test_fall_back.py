@@ -74,6 +74,7 @@ def test_what_the_integrator_would_have_left_is_what_it_leaves() -> None:
     np.testing.assert_allclose(would, does, atol=0.004)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(2))
 def test_a_model_that_is_right_never_falls_back(seed: int) -> None:
     rig = small_rig(DRIFT, VIBRATION)
@@ -83,6 +84,7 @@ def test_a_model_that_is_right_never_falls_back(seed: int) -> None:
         assert np.array_equal(ours.exposure.inputs, theirs.exposure.inputs)
 
 
+@pytest.mark.slow
 def test_a_vibration_at_another_frequency_than_the_model_has_it_is_left_alone(tmp_path: Path) -> None:
     rig = played(tmp_path, vibration(10.5, 120), DRIFT, VIBRATION)
     series, alone = run(rig, 120), run(rig, 120, fall_back=False)
@@ -108,6 +110,7 @@ def test_a_model_that_is_known_to_be_wrong_need_not_be_worse_beyond_chance(seed:
     assert set(which[80:]) == {which[80]}
 
 
+@pytest.mark.slow
 def test_a_controller_whose_model_fits_again_acts_again(tmp_path: Path) -> None:
     """The vibration is elsewhere for a while, and comes back to where the model has it."""
     slopes = np.concatenate([vibration(10.5, 70), vibration(15.0, 190)])

@@ -73,6 +73,7 @@ def test_a_broken_package_is_one_line_for_who_asks_for_it(
     assert why in last
 
 
+@pytest.mark.slow
 def test_the_commands_say_what_they_need(aolink: Run, tmp_path: Path) -> None:
     (tmp_path / "rig.toml").write_text(small_rig(control="gain = 4.0").toml)
     ports = ("--camera", "/dev/none", "--mirror", "/dev/none", "--rig", "rig.toml", "-o", "a.mcap")

@@ -41,6 +41,7 @@ def settled(line: Line, queries: int = 60) -> tuple[ClockRegression, int]:
     return clock, START + round(queries * QUERY_PERIOD_S * 1e9)
 
 
+@pytest.mark.slow
 def test_offset_and_frequency_are_found_within_their_sigma() -> None:
     errors = []
     for seed in range(40):
@@ -196,6 +197,7 @@ def frames_of_a_session(seed: int, step_ns: int, *, stamps_show_it: bool) -> np.
     return np.array(nees)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("step_ns", [0, 50_000_000, 3_000_000_000])
 def test_the_host_time_of_frames_is_as_uncertain_as_is_said(step_ns: int) -> None:
     """NEES over 100 seeds.

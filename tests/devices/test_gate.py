@@ -177,6 +177,7 @@ ENDLESS: dict[str, tuple[bool, Callable[[int], Message]]] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("what", ENDLESS)
 def test_no_stream_fills_the_memory(hub: Hub, what: str) -> None:
     camera, make = ENDLESS[what]

@@ -274,6 +274,7 @@ def test_the_drivers_of_a_rig_file_are_checked_before_anything_is_opened(
     assert "the camera is recorded alone" in " ".join(good.stdout.split())
 
 
+@pytest.mark.slow
 def test_native_devices_may_stand_in_the_rig_file(aolink: Run, tmp_path: Path) -> None:
     with simulated_rig("section-vi") as ports:
         rig = rig_file(tmp_path, *(f'driver = "native"\nport = "{port}"' for port in ports))

@@ -77,6 +77,7 @@ def coverage(rig: Rig, name: str, sigma_steps: float | FloatArray) -> tuple[floa
     return scored(rig, name, (list(misaligned(rig, seed, sigma_steps=sigma_steps)) for seed in range(16)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "held_without", "nees_without"), [("moments", 0.75, 2.5), ("o3", 0.93, 1.25), ("profile", 0.75, 2.5)]
 )
@@ -188,6 +189,7 @@ def test_what_an_alignment_does_is_what_its_shift_does(rig: Rig) -> None:
     assert np.abs(change).max() > 0.003
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["moments", "profile"])
 def test_the_smoother_and_the_blur_carry_it_on(rig: Rig, name: str) -> None:
     inside = []

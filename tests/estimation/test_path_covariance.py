@@ -41,6 +41,7 @@ def test_outputs_are_chosen_by_number_and_keep_what_they_share() -> None:
     np.testing.assert_allclose(estimate.path_covariance([1, 0])[:n, n:], both[n:, :n], atol=1e-15)
 
 
+@pytest.mark.slow
 def test_what_a_large_plants_basis_leaves_out_is_on_the_diagonal() -> None:
     estimate = last_estimate("membrane-12x12", "o1")
     covariance = estimate.path_covariance([7])

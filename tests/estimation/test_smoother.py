@@ -65,6 +65,7 @@ def test_it_is_one_least_squares_solve_where_all_is_linear(period):
             np.testing.assert_allclose(before.end_state, after.start_state, atol=1e-10)
 
 
+@pytest.mark.slow
 def test_the_last_estimate_is_the_filters_and_the_others_know_more():
     exposures = simulate(RIG, 60, seed=6)
     for name, estimates in run(RIG, exposures, ["open-loop", "o1", "moments", "profile"]).items():

@@ -17,7 +17,7 @@ from tests.kinds import truth_of
 NAMES = ["o1", "moments", "profile"]
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 @pytest.mark.parametrize("K", [8, pytest.param(12, marks=pytest.mark.slow), pytest.param(24, marks=pytest.mark.slow)])
 def test_the_path_inside_an_exposure_is_found(K: int) -> None:
     """To half a pixel at K = 8, where a sphere goes by more than one (rms) from the exposure's start to its end.

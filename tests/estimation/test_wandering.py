@@ -82,6 +82,7 @@ def off():
     return truth, drifting(JITTER, truth, 1)
 
 
+@pytest.mark.slow
 def test_a_wrong_frequency_is_found_and_intervals_hold(off):
     truth, exposures = off
     fixed, following = (
@@ -168,6 +169,7 @@ def test_other_quantities_are_found_too_and_intervals_hold(parameter, truth, nam
     assert held > 0.88
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("noisier", "flux"), [(30.0, "known"), (9.0, "measured")])
 def test_copies_with_so_much_noise_that_they_see_no_spot_say_nothing(noisier, flux):
     rig = load_rig("section-vi-lively")
@@ -216,6 +218,7 @@ def test_the_rig_file_says_so():
             parse_rig(text.replace("[timing]", wrong + "\n[timing]"))
 
 
+@pytest.mark.slow
 def test_a_frequency_that_nothing_is_seen_of_becomes_uncertain(off):
     """By as much as it may wander in the meantime."""
     _, exposures = off

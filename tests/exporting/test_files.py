@@ -44,6 +44,7 @@ def test_numpy_reads_every_array(series: Series, tmp_path: Path) -> None:
         }  # fmt: skip
 
 
+@pytest.mark.slow
 def test_xarray_reads_the_dataset(series: NotebookRecording, tmp_path: Path) -> None:
     needed("h5netcdf")
     import xarray

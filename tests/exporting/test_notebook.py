@@ -71,6 +71,7 @@ def test_a_dataset_is_taken_apart_by_time_and_estimator(lively: NotebookRecordin
     assert dataset["rig_toml"].item() == lively.rig.toml
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["section-vi-lively", "single-lenslet"])
 def test_a_plot_on_axes_of_its_own_or_on_those_given(name: str) -> None:
     matplotlib = needed("matplotlib")

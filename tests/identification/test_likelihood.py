@@ -19,7 +19,7 @@ def seen():
     return readings(exposures.rig, list(exposures))
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 def test_with_squares_that_say_nothing_it_is_the_gaussian_of_the_means(seen):
     """The oracle has every fast step of every exposure in one covariance matrix."""
     from dataclasses import replace

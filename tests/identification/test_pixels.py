@@ -82,7 +82,7 @@ def test_without_evidence_the_order_stays():
     np.testing.assert_array_equal(refined(of, found[0].x, refused, []), found[0].x)
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 def test_a_scan_finds_a_vibration_far_from_every_maximum():
     """The maximum that it is given is at another frequency, and its vibration never changes."""
     exposures = frames(2.4, 64)
@@ -141,7 +141,7 @@ def test_a_maximum_whose_vibration_lasts_for_longer_than_the_recording_is_tried_
         np.testing.assert_array_equal(np.delete(each.x, 3), np.delete(at.x, 3))
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 def test_frequency_and_damping_move_to_where_the_pixels_see_them():
     exposures = frames(2.4, 48)
     of, _ = space(exposures)

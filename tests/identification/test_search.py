@@ -20,7 +20,7 @@ from bench_rows.identification import DisturbanceChange, changed  # noqa: E402 #
 from bench_rows.loop_worth import Cell  # noqa: E402
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 def test_a_sharp_vibration_beside_a_drift_is_found_although_only_an_alias_is_found_at_first():
     """The vibration is at 14.4 Hz; the best that the grid and its aliases lead to is at 34.4 Hz, 20 nats below."""
     rig = load_rig("loop")
@@ -33,7 +33,7 @@ def test_a_sharp_vibration_beside_a_drift_is_found_although_only_an_alias_is_fou
     assert found == sorted(found, key=lambda each: -each.log_likelihood)
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 @pytest.mark.parametrize(
     ("cycles", "seed"), [(2.4, 703), (2.7, 705)], ids=["between the points of the grid", "an alias of the second best"]
 )

@@ -51,14 +51,14 @@ def test_the_sets_hold_the_truth_and_the_aliases_that_remain(shaken):
     assert sets["sd"].holds(0.2)
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 def test_a_resonance_is_chosen_where_there_is_one(shaken):
     rig, seen = shaken
     names = ("random-walk", "ornstein-uhlenbeck", "resonance")
     assert chosen([tried(name, lambda kinds: space(kinds, seen, rig), seen) for name in names]).name == "resonance"
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 def test_the_sets_hold_a_noise_and_a_kernel_that_differ_from_the_rig_files(shaken):
     """The kernel is wider, and changes from exposure to exposure: noise of the blur's extent, not of the centroid."""
     _, (like,) = shaken

@@ -135,7 +135,7 @@ def test_the_ground_does_not_hide_that_light_fades(slope: float) -> None:
     assert (known.beside < 1 / 3).all()
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 @pytest.mark.parametrize("background", [True, False])
 def test_exposures_of_a_film_that_fades_are_scaled_to_the_same_light(background: bool, tmp_path: Path) -> None:
     """By 30 %: exposures have the light and the errors of those of the same film that does not fade."""

@@ -24,6 +24,7 @@ def rig(tmp_path: Path) -> str:
     return "rig.toml"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["TIFF", "pictures", "ROS 2 bag"])
 def test_a_film_of_every_kind_becomes_a_recording(kind, aolink, rig, tmp_path):
     source = KINDS[kind](tmp_path, FRAMES)
@@ -83,6 +84,7 @@ def test_one_of_two_topics_is_imported(aolink, rig, tmp_path):
     assert aolink("import", source, "-o", "a.mcap", "--rig", rig, "--topic", "/b").returncode == 0
 
 
+@pytest.mark.slow
 def test_a_target_is_replaced_only_on_request_and_never_the_source(aolink, rig, tmp_path):
     source = others.written_mcap(tmp_path, FRAMES)
     before = source.read_bytes()
@@ -98,6 +100,7 @@ def test_a_target_is_replaced_only_on_request_and_never_the_source(aolink, rig, 
     assert len(list(Recording(tmp_path / "copy.mcap"))) == 7
 
 
+@pytest.mark.slow
 def test_two_films_with_the_same_name_and_settings_are_two_sessions(aolink, rig, tmp_path):
     """The same film is the same session, and the same bytes."""
     sessions = []

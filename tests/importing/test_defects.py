@@ -93,6 +93,7 @@ def test_three_hot_pixels_beside_each_other_are_found(motion):
     assert {(int(x), int(y)) for y, x in np.argwhere(found.defects)} == set(THREE)
 
 
+@pytest.mark.slow
 def test_a_hot_pixel_of_a_film_that_nothing_is_followed_in(tmp_path):
     """It is masked, and estimates are as in the same film without it."""
     rig = load_rig("sh-4x4")
@@ -120,7 +121,7 @@ def test_a_film_too_short_to_find_hot_pixels_says_so(frames):
     assert ("8 frames are too few to find hot and dead pixels: 9 are needed" in notes) == (frames == 8)
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 def test_a_hot_pixel_is_masked_in_a_window_that_moves_over_it(tmp_path):
     """The window follows an object that goes by it; the places are as in the same film without hot pixels."""
     rng = np.random.default_rng(14)

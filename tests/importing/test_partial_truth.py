@@ -57,7 +57,7 @@ def exposures(recorded: tuple[Rig, Path]) -> list[Exposure]:
     return list(aolink.read(recorded[1]).exposures())
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 def test_the_truth_of_an_object_does_not_need_the_other_one(exposures: list[Exposure]) -> None:
     for k, exposure in enumerate(exposures):
         gone = (k + 1) * K > GONE
@@ -65,6 +65,7 @@ def test_the_truth_of_an_object_does_not_need_the_other_one(exposures: list[Expo
         assert np.isnan(truth_of(exposure).path[2:]).all() == gone
 
 
+@pytest.mark.slow
 def test_errors_are_those_of_the_objects_whose_path_is_known(
     recorded: tuple[Rig, Path], exposures: list[Exposure]
 ) -> None:
@@ -77,6 +78,7 @@ def test_errors_are_those_of_the_objects_whose_path_is_known(
     assert rows == pytest.approx(np.sqrt(means), rel=1e-12)
 
 
+@pytest.mark.slow
 def test_it_is_shown_drawn_and_exported(recorded: tuple[Rig, Path], exposures: list[Exposure], tmp_path: Path) -> None:
     """Where it is known: a line of the first object in each exposure, of the second one in the first two."""
     side = tmp_path / "estimates.mcap"

@@ -530,6 +530,7 @@ def test_commands_of_loops_that_do_not_command_together_are_left_out_and_said(tm
     assert "the loops loop (7 rows) and more (9 rows) do not command together" in film.notes[1]
 
 
+@pytest.mark.slow
 def test_telemetry_with_neither_pictures_nor_slopes_is_refused(tmp_path):
     text = refused(others.write_aot(tmp_path / "a.fits", None, slopes=np.full((7, 2, 1), np.nan)))
     assert "has no pictures, and its slopes are all NaN" in text
@@ -687,12 +688,14 @@ def test_commands_at_their_loops_rate_wait_for_its_delay(tmp_path):
     np.testing.assert_array_equal(film.input_times_ns, np.arange(14) * 10_000_000 + 40_000_000)
 
 
+@pytest.mark.slow
 def test_a_delay_that_cannot_be_leaves_the_commands_out(tmp_path):
     film = numbered(tmp_path, range(7), -1.0)
     assert film.inputs is None
     assert any("is -1: their commands are left out" in note for note in film.notes)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stated", [[0] * 7, range(0, 70, 10), [253, 254, 255, 0, 1, 2, 3]])
 def test_frame_numbers_that_do_not_count_frames_are_not_used(stated, tmp_path):
     film = numbered(tmp_path, list(stated), None)
@@ -700,6 +703,7 @@ def test_frame_numbers_that_do_not_count_frames_are_not_used(stated, tmp_path):
     assert "the frame numbers do not count up by one: not used" in film.notes
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shape", [(7, 4, 2), (7, 2)])
 def test_slopes_in_another_order_are_refused(shape, tmp_path):
     telemetry = others.write_aot(tmp_path / "a.fits", None, slopes=np.zeros((7, 2, 1), np.float32))
@@ -709,6 +713,7 @@ def test_slopes_in_another_order_are_refused(shape, tmp_path):
     assert f"has slopes of shape {shape}, expected (frames, 2 directions" in refused(tmp_path / "b.fits")
 
 
+@pytest.mark.slow
 def test_telemetry_without_loops_is_read_without_complaint(two_sensors, tmp_path):
     path, (low, _) = two_sensors
     system = aotpy.AOSystem.read_from_file(path)

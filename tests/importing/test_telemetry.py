@@ -215,6 +215,7 @@ def test_commands_faster_than_the_rigs_steps_are_refused(tmp_path: Path) -> None
         imported(path, small_rig(20, 20))
 
 
+@pytest.mark.slow
 def test_commands_wait_for_their_loops_delay(tmp_path: Path) -> None:
     commands = np.arange(14.0).reshape(7, 2)
     others.write_aot(tmp_path / "b.fits", FRAMES, commands=commands)

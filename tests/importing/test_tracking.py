@@ -55,7 +55,7 @@ def test_objects_are_found_and_followed_to_a_tenth_of_a_pixel(walkers: SpotFilm)
     assert known.sd == pytest.approx(1.8, rel=0.05)
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 def test_light_beside_an_object_is_said_with_its_frames(tmp_path: Path) -> None:
     """A second object sticks to the first one in the second half of the film; a fainter one is no matter."""
     rng = np.random.default_rng(6)
@@ -101,7 +101,7 @@ def test_objects_beside_each_other_are_measured_apart() -> None:
     assert np.sqrt(np.mean((known.places - film.places) ** 2)) < 0.1
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 def test_objects_that_meet_are_left_out_until_they_part(tmp_path: Path) -> None:
     rng = np.random.default_rng(4)
     film = spot_film(rng, passing(320, 0.0), MIDDLES)
@@ -182,7 +182,7 @@ def test_an_object_that_passes_a_faded_one_is_followed_on() -> None:
     assert np.sqrt(np.mean((known.places[:, 0] - film.places[:, 0]) ** 2)) < 0.1
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 def test_an_object_that_leaves_is_said_and_its_window_left_out(walkers: SpotFilm, tmp_path: Path) -> None:
     rng = np.random.default_rng(2)
     frames = walkers.frames.copy()
@@ -208,7 +208,7 @@ def test_a_drift_of_all_objects_is_said() -> None:
     assert "by 0.0" in note
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 def test_pixels_beyond_the_picture_are_no_darkness(tmp_path: Path) -> None:
     """An object at the edge: its window hangs over, and what is there is unknown, not dark."""
     rng = np.random.default_rng(2)
@@ -227,7 +227,7 @@ def test_pixels_beyond_the_picture_are_no_darkness(tmp_path: Path) -> None:
     assert np.mean((np.abs(errors) < 1.96 * spread)[known]) > 0.9
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 def test_a_bright_object_keeps_its_light() -> None:
     """What an exposure lacks of it, taken as light of others, is less than twice the noise of its light."""
     rng = np.random.default_rng(6)
@@ -270,7 +270,7 @@ def test_an_object_that_goes_out_of_the_picture_is_not_seen_at_its_edge() -> Non
     assert np.nanmax(errors[:, 0]) < 0.25
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 def test_saturated_pixels_do_not_widen_the_kernel(walkers: SpotFilm) -> None:
     flat = np.minimum(walkers.frames, np.uint16(1700))
     full = np.where(flat == 1700, np.uint16(65535), flat)
@@ -297,6 +297,7 @@ def test_a_motion_that_is_none_of_them_is_said(seed: int) -> None:
     assert fit_motion(walk).unexplained == 0, "a frame that is exposed throughout correlates neighbours only"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("period", "lasts", "walks"), [(3.7, 10, 0.0), (5.3, 50, 0.4), (12, 20, 0.4), (30, 10, 0.0)])
 def test_a_vibration_is_found_with_its_uncertainty(period: float, lasts: float, walks: float) -> None:
     """Alone, and of an object that walks at random as well; 30 places of 480 are not seen."""
@@ -362,6 +363,7 @@ def test_a_film_without_light_has_no_objects() -> None:
         find_objects(array_film(np.zeros((5, 64, 64), np.uint8), "dark"), FilmSettings(track=1))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(4))
 def test_a_walk_and_a_bound_motion_are_told_apart_and_fitted(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -441,7 +443,7 @@ def test_the_error_of_the_truth_is_as_large_as_said(motion: Callable[[np.random.
     assert known.place_sd[0] > known.place_sd[1]
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 def test_the_path_of_walkers_is_found_and_its_intervals_hold(walkers: SpotFilm, tmp_path: Path) -> None:
     rig, recording = imported_film(walkers, tmp_path / "walkers.mcap")
     exposures = list(recording.exposures())
@@ -466,7 +468,7 @@ def test_the_path_of_walkers_is_found_and_its_intervals_hold(walkers: SpotFilm, 
     assert 0.9 < np.mean(np.abs(errors) < 1.96 * spread) < 0.98
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 def test_a_resonance_inside_the_exposure_is_found(tmp_path: Path) -> None:
     """The first rig file has the resonance: half of what the path's own mean leaves, or less."""
     rng = np.random.default_rng(11)
@@ -485,7 +487,7 @@ def test_a_resonance_inside_the_exposure_is_found(tmp_path: Path) -> None:
     assert 0.88 < np.mean(np.abs(errors) < 1.96 * spread) < 0.99
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 def test_a_rig_whose_inputs_do_not_shift_its_spots_keeps_its_windows(walkers: SpotFilm, tmp_path: Path) -> None:
     """And a scale is said not to be used."""
     text = first_rig(array_film(walkers.frames, "film"), SETTINGS, "film").text.replace("\nB = [[1.0]", "\nB = [[0.0]")

@@ -131,6 +131,7 @@ def test_nothing_is_written_over_but_results(recorded: Session, tmp_path: Path) 
     assert {each.name for each in out.iterdir()} == {"s.mcap", "s.json"}
 
 
+@pytest.mark.slow
 def test_damage_of_a_recording_is_in_its_row(aolink: Run, recorded: Session, tmp_path: Path) -> None:
     (tmp_path / "cut.mcap").write_bytes(recorded.path.read_bytes()[:-3000])
     shutil.copy(recorded.path, tmp_path / "whole.mcap")

@@ -74,6 +74,7 @@ def pulls(rig: Rig, seed: int, lights: str) -> list[float]:
     return [(measured.value - true) / measured.sd for measured, true in pairs]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("photoelectrons", "noise_density", "lights"),
     [
@@ -97,6 +98,7 @@ def test_the_truth_is_found_and_the_standard_deviations_are_right(
     assert squares.max() < 112
 
 
+@pytest.mark.slow
 def test_the_chi_square_of_a_gaussian_spot_is_that_of_its_freedom() -> None:
     fits = [calibrate(camera(1000), shoot(camera(1000), seed, "dark,flat:8,still")[0]).spot for seed in range(SEEDS)]
     total, freedom = sum(f.chi_square for f in fits if f), sum(f.freedom for f in fits if f)
@@ -259,6 +261,7 @@ def test_frames_that_are_not_what_they_are_said_to_be(lights: str, kinds: tuple[
         calibrate(camera(1000), relabelled(lights, *kinds))
 
 
+@pytest.mark.slow
 def test_a_spot_that_moves_is_refused() -> None:
     for name, seed in product(("section-vi", "section-vi-lively"), range(3)):
         rig = load_rig(name)
@@ -508,6 +511,7 @@ def test_nobody_is_asked_for_anything_before_the_ports_are_tried(aolink: Run, tm
     assert not list((tmp_path / "tmp").iterdir())
 
 
+@pytest.mark.slow
 def test_frames_are_recorded_apart_and_marked(aolink: Run, tmp_path: Path) -> None:
     rig = load_rig("section-vi-lively")
     with simulated_rig("section-vi-lively", "--light", "dark") as ports:
@@ -527,6 +531,7 @@ def test_frames_are_recorded_apart_and_marked(aolink: Run, tmp_path: Path) -> No
     )
 
 
+@pytest.mark.slow
 def test_a_mirror_is_poked_no_faster_than_its_rig_file_allows(aolink: Run, tmp_path: Path) -> None:
     toml = load_rig("tip-tilt").toml
     for old, new in (

@@ -144,7 +144,7 @@ def test_the_command_on_a_cluster(cluster: Cluster, aolink: Run, tmp_path: Path)
     assert "3 of 3 done, 0 of them before, 0 failed; table: all.parquet" in first.stdout
     assert "3 of 3 done, 3 of them before, 0 failed; table: all.parquet" in second.stdout
     assert (first.stderr, second.stderr) == ("", "")
-    assert {each.name for each in (tmp_path / "out").glob("*.mcap")} == {f"s{k}.o3.mcap" for k in range(3)}
+    assert {each.name for each in (tmp_path / "out").glob("*.mcap")} == {f"s{k}.moments.mcap" for k in range(3)}
 
 
 @pytest.mark.slow

@@ -86,6 +86,7 @@ def blas_threads() -> set[int]:
     return {each["num_threads"] for each in threadpool_info() if each["user_api"] == "blas"}
 
 
+@pytest.mark.slow
 def test_one_thread_as_long_as_anybody_is_inside() -> None:
     """In a process whose BLAS has two threads otherwise: a worker of the tests has one."""
     program = "from tests.numerics.test_single_thread import see_who_is_inside; see_who_is_inside()"

@@ -188,6 +188,7 @@ def test_a_process_whose_parent_ended_before_it_began_to_watch_ends() -> None:
         assert (done.stdout, done.returncode) == (said, int(not said))
 
 
+@pytest.mark.slow
 def test_the_viewer_of_a_killed_command_ends(recorded: Session, tmp_path: Path) -> None:
     with started(tmp_path, "view", str(recorded.path), "--web") as process:
         wait_for(lambda: psutil.Process(process.pid).children(recursive=True), process)

@@ -177,6 +177,7 @@ def test_a_hole_in_the_middle_is_no_matter():
     np.testing.assert_array_equal(lattice.lit[hole.reshape(13, 13)], False)
 
 
+@pytest.mark.slow
 def test_a_frame_is_matched_to_its_reference_by_spots_nearest():
     reference = find_lattice(synthetic(shape=(9, 11), seed=1)[0])
     frame, _, nodes = synthetic(shape=(9, 11), seed=1)

@@ -28,6 +28,7 @@ def finite_differences(pad: np.ndarray, n: int = 301) -> tuple[np.ndarray, np.nd
     return points[inside], w
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("pad", [0, 1, 2])
 def test_influence_is_the_membrane_equation(pad):
     points, w = finite_differences(PADS[pad])

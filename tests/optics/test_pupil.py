@@ -145,6 +145,7 @@ def run_with(rig, exposures, gain):
     return [estimator.step(each) for each in exposures][-1]
 
 
+@pytest.mark.slow
 def test_every_estimator_works_and_moments_knows_how_well():
     exposures = simulate(FOUR, 25)
     names = ("open-loop", "o1", "o2", "o3", "moments")

@@ -20,6 +20,7 @@ def measured(mmirs):
     return measure_files(mmirs / "mmirs_wfs_0150.fits.gz", mmirs / "mmirs_camera2_ref.fits.gz")
 
 
+@pytest.mark.slow
 def test_the_reference_has_its_lenslets(measured):
     reference = measured.reference
     assert reference.shape == (17, 17)
@@ -71,6 +72,7 @@ def test_the_wavefronts_differences_are_the_slopes(measured):
     assert np.corrcoef(difference[both], mean[both])[0, 1] > 0.97
 
 
+@pytest.mark.slow
 def test_real_units_scale_by_the_optics(mmirs, measured):
     paths = mmirs / "mmirs_wfs_0150.fits.gz", mmirs / "mmirs_camera2_ref.fits.gz"
     real = measure_files(*paths, pitch_m=600e-6, focal_m=40e-3)
@@ -80,6 +82,7 @@ def test_real_units_scale_by_the_optics(mmirs, measured):
     assert real.in_metres
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["blank", "bogus"])
 def test_frames_that_show_no_spots_are_refused(mmirs, name):
     with pytest.raises(FrameError, match="the frame: no grid"):
@@ -91,6 +94,7 @@ def test_frames_of_two_cameras_are_refused():
         measure_slopes(np.zeros((64, 64)), np.zeros((64, 65)))
 
 
+@pytest.mark.slow
 def test_a_frame_against_itself_is_flat(mmirs):
     frame = read_frame(mmirs / "mmirs_camera2_ref.fits.gz")
     same = measure_slopes(frame, frame)

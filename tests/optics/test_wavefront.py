@@ -53,6 +53,7 @@ def test_zonal_is_exact_for_tilt_and_focus():
     np.testing.assert_allclose(found, true - true.mean(), atol=1e-12)
 
 
+@pytest.mark.slow
 def test_zonal_finds_turbulence_but_for_what_lenslets_cannot_resolve():
     pitch, layer = 0.1, Layer(r0_m=0.2, wind_m_s=(0, 0))
     square = Lenslets(grid=(30, 30), pitch_m=pitch, focal_length_m=1.0)

@@ -78,6 +78,7 @@ def test_without_a_truth_and_estimates_the_blur_is_drawn_alone(tmp_path: Path) -
     assert not any(coloured(bands, estimator_colour(name)).any() for name in ("open-loop", "o1", "moments"))
 
 
+@pytest.mark.slow
 def test_what_cannot_be_drawn_or_written_is_one_clear_error(tmp_path: Path) -> None:
     with pytest.raises(ExportError, match="holds no exposure"):
         draw_session(Recording(write_small(tmp_path / "empty.mcap", 0)), tmp_path / "a.png")

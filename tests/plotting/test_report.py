@@ -64,6 +64,7 @@ def page_of(folder: Path, *names: Path | str) -> Page:
     return Page(write_report([aolink.read(name) for name in names], folder / "report.html", overwrite=True))
 
 
+@pytest.mark.slow
 def test_a_page_stands_alone_and_has_every_section(tmp_path: Path) -> None:
     page = page_of(tmp_path, RECORDINGS / "section-vi-lively.mcap")
     assert not {"script", "link", "iframe", "a"} & set(page.tags)
@@ -91,6 +92,7 @@ def scores(path: Path) -> dict[str, aolink.estimation.Score]:
     return scored(recording, recording.estimators)
 
 
+@pytest.mark.slow
 def test_two_recordings_stand_side_by_side_and_many_in_a_table(tmp_path: Path) -> None:
     four = [write_small(tmp_path / f"small-{number}.mcap", 2, truth=True) for number in range(4)]
     two = page_of(tmp_path, *four[:2])
@@ -110,6 +112,7 @@ def test_a_live_session_has_latencies(tmp_path: Path) -> None:
     assert any("how long an estimate took" in each for each in page.captions)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("make", "said"),
     [
@@ -138,6 +141,7 @@ def drawn_text(page: Page) -> str:
     return "".join(base64.b64decode(each.partition(",")[2]).decode() for each in page.sources)
 
 
+@pytest.mark.slow
 def test_a_recording_that_was_cut_off_says_so(tmp_path: Path) -> None:
     whole = (RECORDINGS / "section-vi-lively.mcap").read_bytes()
     (tmp_path / "broken.mcap").write_bytes(whole[: len(whole) * 2 // 3])
@@ -176,6 +180,7 @@ def test_the_commands_write_their_files_and_say_what_is_wrong(aolink: Aolink, tm
         assert not list(tmp_path.glob("x.*"))
 
 
+@pytest.mark.slow
 def test_every_figure_is_a_file_of_its_size(tmp_path: Path) -> None:
     from PIL import Image
 

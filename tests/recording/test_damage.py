@@ -78,6 +78,7 @@ def by_chunk(data: bytes, chunks: list[tuple[int, int]]) -> list[set[int]]:
     return found
 
 
+@pytest.mark.slow
 def test_cut_off_at_any_byte_all_whole_chunks_come_back(
     many_chunks: tuple[bytes, list[tuple[int, int]]], tmp_path: Path
 ) -> None:

@@ -129,6 +129,7 @@ def test_the_editing_commands_say_what_they_did_and_lost(aolink: Run, recorded: 
     assert aolink("merge", "c1.mcap", "c2.mcap", "-o", "m.mcap").returncode == 0
 
 
+@pytest.mark.slow
 def test_no_command_writes_over_what_it_reads(aolink: Run, recorded: Session, tmp_path: Path) -> None:
     """By whatever name: a second source, a hard link, with --overwrite."""
     data = recorded.path.read_bytes()
@@ -190,6 +191,7 @@ def test_nothing_is_recovered_from_nothing(recorded: Session, tmp_path: Path) ->
         pytest.fail("the first chunk is in the first 30 kB: cut earlier")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", [["cut", "-o", "c.mcap"], ["replay", "-e", "o1"]])
 def test_a_start_after_the_end_of_a_recording_is_said(aolink: Run, recorded: Session, command: list[str]) -> None:
     refused = aolink(command[0], recorded.path, *command[1:], "--start", "100")

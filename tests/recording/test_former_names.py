@@ -65,6 +65,7 @@ def test_a_former_name_asks_for_the_topic_that_has_another_now(tmp_path: Path) -
     assert both.keys() == {topics.CONNECTION, topics.EXPOSURE, topics.IMAGE}
 
 
+@pytest.mark.slow
 def test_an_older_recording_is_shown(tmp_path: Path) -> None:
     save_rrd(Recording(OLD), tmp_path / "a.rrd")
     shown = read_rrd(tmp_path / "a.rrd")

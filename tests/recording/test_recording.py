@@ -138,6 +138,7 @@ def test_the_file_is_flushed_by_the_messages_own_time(recorded: Session, tmp_pat
 masks = st.lists(st.booleans(), min_size=40, max_size=40)
 
 
+@pytest.mark.slow
 @given(masks, st.lists(st.integers(0, 65535), min_size=40, max_size=40))
 def test_frames_survive_the_recording(mask: list[bool], counts: list[int]) -> None:
     pixels = np.where(mask, np.array(counts), 0).astype(np.uint16).reshape(4, 10)

@@ -17,6 +17,7 @@ def test_there_are_reference_recordings() -> None:
     assert FILES
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
 def test_estimates_are_what_they_were(path: Path, tmp_path: Path) -> None:
     """If this is meant to change: `aolink compare FILE --accept`, and a line in the changelog."""

@@ -104,12 +104,14 @@ def same_as_from_the_file(url: str, source: Path, folder: Path) -> None:
     assert all(each.same for each in compare(Recording(source, side=[folder / "1.mcap"]), there).values())
 
 
+@pytest.mark.slow
 def test_object_storage_gives_what_the_file_gives(s3: S3Server, tmp_path: Path) -> None:
     source = write_small(tmp_path / "s.mcap", 30, truth=True)
     s3fs.S3FileSystem().put(str(source), "lab/night/s.mcap")
     same_as_from_the_file("s3://lab/night/s.mcap", source, tmp_path)
 
 
+@pytest.mark.slow
 def test_so_do_a_web_server_and_memory(web: tuple[str, type[_Ranges]], tmp_path: Path) -> None:
     source = write_small(tmp_path / "s.mcap", 30, truth=True)
     same_as_from_the_file(f"{web[0]}/s.mcap?signature=1", source, tmp_path)
@@ -157,6 +159,7 @@ def test_no_more_is_read_than_is_needed(s3: S3Server, tmp_path: Path) -> None:
     assert max(s3.sent) <= 1.3 * MOST_AHEAD
 
 
+@pytest.mark.slow
 def test_nobody_may_read_it_or_it_is_not_there(
     s3: S3Server, web: tuple[str, type[_Ranges]], aolink: Run, tmp_path: Path
 ) -> None:
@@ -188,6 +191,7 @@ def test_nobody_may_read_it_or_it_is_not_there(
     assert [each.name for each in (tmp_path / "out").iterdir()] == ["results.csv"]
 
 
+@pytest.mark.slow
 def test_a_server_that_gives_no_ranges_is_refused(web: tuple[str, type[_Ranges]], tmp_path: Path) -> None:
     write_small(tmp_path / "s.mcap", 400)
     web[1].gives_ranges = False
@@ -209,6 +213,7 @@ def test_the_commands_take_urls(s3: S3Server, aolink: Run, tmp_path: Path) -> No
     assert "--side makes side files" in " ".join(refused.stderr.replace("│", " ").split())
 
 
+@pytest.mark.slow
 @given(st.lists(st.tuples(st.integers(0, 400_000), st.integers(0, 90_000)), max_size=12), st.booleans())
 @example([(210_001, 90_000)], True)  # planned beyond the end
 def test_what_is_read_is_what_is_there(reads: list[tuple[int, int]], planned: bool) -> None:

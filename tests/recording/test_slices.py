@@ -86,6 +86,7 @@ def faulty(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_what_was_lost_on_the_line_is_lost_in_a_slice_too(faulty: Path) -> None:
     recording = aolink.read(faulty)
     whole = list(recording)

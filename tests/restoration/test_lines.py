@@ -1,21 +1,18 @@
-"""The Kalman filter along lines: against filterpy, dense Gaussian algebra, the banded solve."""
+"""The Kalman filter along lines: against filterpy and dense Gaussian algebra."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 from filterpy.kalman import KalmanFilter
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy import linalg
 
 from aolink.errors import RestorationError
 from aolink.numerics.arrays import FloatArray
 from aolink.restoration import Scanner, first_order, from_correlation, measured_correlation
-from aolink.restoration.banded import MANY_LINES, smooth_lines
-from aolink.restoration.kalman import kalman, line_model, scene_from_states, smooth
 from aolink.restoration.psf import line_matrix
+from aolink.restoration.shahin import expected_gain_db, kalman, line_model, smooth
 from tests.restoration.scenes import DECAYING, LOPSIDED, UNIFORM
 
 NOISE = 0.01
@@ -43,10 +40,6 @@ def given_pixels(
     return np.array(out)
 
 
-def pixels(m: int, columns: int = COLUMNS) -> range:
-    return range(-m, columns)
-
-
 def make_lines(values: FloatArray, scanner: Scanner = FIRST, n: int = 3, seed: int = 1) -> FloatArray:
     rng = np.random.default_rng(seed)
     m = values.shape[-1] - 1
@@ -67,17 +60,22 @@ def test_the_state_space_is_the_transfer_function() -> None:
 
 @pytest.mark.parametrize("scanner", [FIRST, THIRD, first_order(0.0, 2.0)], ids=["first", "third", "just a delay"])
 def test_step_by_step_as_filterpy(scanner: Scanner) -> None:
-    lines = make_lines(LOPSIDED)
+    lines, m = make_lines(LOPSIDED), len(LOPSIDED) - 1
     model = line_model(LOPSIDED, COLUMNS, scanner)
-    found = kalman(model, lines, NOISE)
+    predicted, filtered = (
+        kalman(model, lines, NOISE, None, range(COLUMNS), which) for which in ("predictor", "filter")
+    )
+    lagged = kalman(model, lines, NOISE, None, range(COLUMNS), "lag", m)
     for line in range(len(lines)):
         peer = KalmanFilter(dim_x=len(model.A), dim_z=1)
         peer.x, peer.P = np.zeros((len(model.A), 1)), model.start_covariance.copy()
         peer.F, peer.Q, peer.H, peer.R = model.A, model.Q, model.rows[:1], np.array([[NOISE]])
         for k in range(COLUMNS):
-            assert found.predicted[k, line] == pytest.approx(peer.x[:, 0], abs=1e-10)
+            assert predicted[line, k] == pytest.approx(model.output @ peer.x[:, 0], abs=1e-10)
             peer.update(lines[line, k])
-            assert found.filtered[k, line] == pytest.approx(peer.x[:, 0], abs=1e-10)
+            assert filtered[line, k] == pytest.approx(model.output @ peer.x[:, 0], abs=1e-10)
+            if k >= m:
+                assert lagged[line, k - m] == pytest.approx(peer.x[m - 1, 0], abs=1e-10)
             peer.predict()
 
 
@@ -85,10 +83,10 @@ def test_step_by_step_as_filterpy(scanner: Scanner) -> None:
 def test_predictor_filter_and_lag_are_conditional_expectations(scanner: Scanner) -> None:
     lines, m = make_lines(LOPSIDED, scanner), len(LOPSIDED) - 1
     model = line_model(LOPSIDED, COLUMNS, scanner)
-    found = kalman(model, lines, NOISE)
-    predicted = scene_from_states(model, found.predicted, range(COLUMNS))
-    filtered = scene_from_states(model, found.filtered, range(COLUMNS))
-    lagged = scene_from_states(model, found.filtered, range(COLUMNS), lag=m)
+    predicted, filtered = (
+        kalman(model, lines, NOISE, None, range(COLUMNS), which) for which in ("predictor", "filter")
+    )
+    lagged = kalman(model, lines, NOISE, None, range(COLUMNS), "lag", m)
     for k in range(1, COLUMNS):
         before, now = (given_pixels(lines, LOPSIDED, scanner, upto) for upto in (k, k + 1))
         late = given_pixels(lines, LOPSIDED, scanner, min(k + m + 1, COLUMNS))
@@ -100,72 +98,58 @@ def test_predictor_filter_and_lag_are_conditional_expectations(scanner: Scanner)
 @pytest.mark.parametrize("values", [UNIFORM, DECAYING, DECAYING[::-1], LOPSIDED, np.ones(1)], ids=len)
 @pytest.mark.parametrize("masked", [False, True])
 @pytest.mark.parametrize("varying", [False, True])
-@pytest.mark.parametrize("count", [3, MANY_LINES + 1])
-def test_smoother_banded_solve_and_dense_least_squares_agree(
-    values: FloatArray, masked: bool, varying: bool, count: int
-) -> None:
+def test_the_smoother_is_what_the_measured_pixels_let_expect(values: FloatArray, masked: bool, varying: bool) -> None:
+    """Of dense joint Gaussians, and of the filter where it has come to the end of a line."""
     rng, m = np.random.default_rng(5), len(values) - 1
     if varying:
         values = values * rng.uniform(0.5, 1.5, (COLUMNS, m + 1))
-    lines = make_lines(values, n=count)
-    # Some of the lines have the same mask.
-    seen = np.repeat(rng.random((2, COLUMNS)) > 0.2, [1, count - 1], axis=0) if masked else None
-    model = line_model(values, COLUMNS, FIRST)
-    states = smooth(model, kalman(model, lines, NOISE, seen, keep=True))
-    kalmans = scene_from_states(model, states, pixels(m))
-    banded = smooth_lines(lines, values, 0.9, 1.0, NOISE, seen)
-    dense = given_pixels(lines, values, FIRST, COLUMNS, seen)
-    assert abs(kalmans - dense).max() < 1e-10
-    assert abs(banded - dense).max() < 1e-10
+    lines = make_lines(values)
+    seen = rng.random(lines.shape) > 0.2 if masked else None
+    found = smooth(lines, values, FIRST, NOISE, seen)
+    assert abs(found - given_pixels(lines, values, FIRST, COLUMNS, seen)).max() < 1e-10
+    last = kalman(line_model(values, COLUMNS, FIRST), lines, NOISE, seen, range(COLUMNS - 1 - m, COLUMNS), "lag", m)
+    assert abs(found[:, -1 - m :] - last).max() < 1e-10
 
 
-def test_a_pixel_that_was_not_seen_is_not_looked_at() -> None:
+@pytest.mark.parametrize("alike", [False, True])
+def test_a_pixel_that_was_not_seen_is_not_looked_at(alike: bool) -> None:
     lines = make_lines(UNIFORM)
     seen = np.ones(lines.shape, bool)
     seen[:, 10:14] = False
-    seen[0, 30] = False
-    spoilt = np.where(seen, lines, 1e6)
-    model = line_model(UNIFORM, COLUMNS, FIRST)
-    one, other = (kalman(model, each, NOISE, seen).filtered for each in (lines, spoilt))
+    seen[0, 30] = alike
+    spoilt, model = np.where(seen, lines, 1e6), line_model(UNIFORM, COLUMNS, FIRST)
+    one, other = (kalman(model, each, NOISE, seen, range(COLUMNS), "filter") for each in (lines, spoilt))
     assert (one == other).all()
-    assert (
-        smooth_lines(lines, UNIFORM, 0.9, 1.0, NOISE, seen) == smooth_lines(spoilt, UNIFORM, 0.9, 1.0, NOISE, seen)
-    ).all()
+    assert (smooth(lines, UNIFORM, FIRST, NOISE, seen) == smooth(spoilt, UNIFORM, FIRST, NOISE, seen)).all()
 
 
-@pytest.mark.parametrize("count", [3, MANY_LINES + 1])
 @pytest.mark.parametrize("scanner", [FIRST, THIRD], ids=["first", "third"])
-def test_known_pixels_before_the_line(scanner: Scanner, count: int) -> None:
-    lines, m = make_lines(LOPSIDED, scanner, count), len(LOPSIDED) - 1
+def test_known_pixels_before_the_line(scanner: Scanner) -> None:
+    lines, m = make_lines(LOPSIDED, scanner), len(LOPSIDED) - 1
     known = np.random.default_rng(2).standard_normal((len(lines), m))
     # Dense: the known pixels as measured without noise.
     C = np.vstack([np.eye(m, COLUMNS + m), line_matrix(LOPSIDED, COLUMNS)])
     R = scene_covariance(scanner, COLUMNS + m)
     S = C @ R @ C.T + np.diag(np.r_[np.zeros(m), np.full(COLUMNS, NOISE)])
     dense = (R @ C.T @ np.linalg.solve(S, np.concatenate([known, lines], axis=1).T)).T
+    assert abs(smooth(lines, LOPSIDED, scanner, NOISE, known=known) - dense).max() < 1e-9
     model = line_model(LOPSIDED, COLUMNS, scanner, known[:, ::-1])
-    states = smooth(model, kalman(model, lines, NOISE, keep=True))
-    assert abs(scene_from_states(model, states, pixels(m)) - dense).max() < 1e-9
-    if scanner is FIRST:
-        banded = smooth_lines(lines, LOPSIDED, 0.9, 1.0, NOISE, known=known)
-        assert abs(banded - dense).max() < 1e-10
+    last = kalman(model, lines, NOISE, None, range(COLUMNS - 1, COLUMNS), "filter")
+    assert abs(last - dense[:, -1:]).max() < 1e-9
 
 
-@settings(max_examples=25)
-@given(
-    st.lists(st.floats(0, 1), min_size=1, max_size=8).filter(lambda c: sum(c) > 0.1),
-    st.floats(0, 0.99),
-    st.floats(1e-4, 1.0),
-)
-def test_the_smoother_is_the_banded_solution_for_any_psf_and_scanner(
-    taps: list[float], correlation: float, noise: float
-) -> None:
-    values, scanner = np.array(taps) / sum(taps), first_order(correlation, 1.0)
-    lines = np.random.default_rng(1).standard_normal((2, 20))
-    model = line_model(values, 20, scanner)
-    states = smooth(model, kalman(model, lines, noise, keep=True))
-    banded = smooth_lines(lines, values, correlation, 1.0, noise)
-    assert abs(scene_from_states(model, states, pixels(len(values) - 1, 20)) - banded).max() < 1e-8
+@pytest.mark.parametrize("taps", [UNIFORM, DECAYING[:3] / DECAYING[:3].sum()], ids=["worse", "better"])
+@pytest.mark.parametrize("which", ["predictor", "filter"])
+def test_what_a_filter_expects_to_gain_is_what_it_gains_on_its_own_scenes(which: str, taps: FloatArray) -> None:
+    rng, m, columns = np.random.default_rng(4), len(taps) - 1, 120
+    root = np.linalg.cholesky(scene_covariance(FIRST, columns + m) + 1e-12 * np.eye(columns + m))
+    scenes = rng.standard_normal((400, columns + m)) @ root.T
+    lines = scenes @ line_matrix(taps, columns).T + np.sqrt(NOISE) * rng.standard_normal((400, columns))
+    true, inner = scenes[:, m:], slice(40, -20)
+    found = kalman(line_model(taps, columns, FIRST), lines, NOISE, None, range(columns), which)
+    blurred, left = (np.mean((each - true)[:, inner] ** 2) for each in (lines, found))
+    gained = expected_gain_db(which, taps, 0, FIRST, NOISE)
+    assert gained == pytest.approx(10 * np.log10(blurred / left), abs=0.15)
 
 
 def test_a_scanner_has_the_correlation_that_it_was_made_from() -> None:

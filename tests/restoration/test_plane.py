@@ -120,6 +120,7 @@ def variation(x: FloatArray) -> float:
     return float(np.mean([np.hypot(*each).sum() for each in gradients]))
 
 
+@pytest.mark.slow
 def test_total_variation_meets_its_dual() -> None:
     """Without blur the dual problem is plain: a gradient field p, |p| <= w, whose divergence makes the picture."""
     rng = np.random.default_rng(5)
@@ -165,6 +166,7 @@ def test_few_iterations_are_enough(values: FloatArray) -> None:
     assert psnr(found[0], inside) > psnr(image, inside) + 4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("masked", [False, True])
 def test_on_the_plane_total_variation_is_what_exact_steps_find(masked: bool) -> None:
     rng = np.random.default_rng(7)

@@ -99,6 +99,7 @@ def test_a_covariance_is_as_good_as_its_root(plane: bool) -> None:
     assert two.sd == pytest.approx(one.sd, abs=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("plane", [False, True])
 def test_expected_psf_and_its_sd_are_those_of_drawn_paths(plane: bool) -> None:
     rng = np.random.default_rng(1)

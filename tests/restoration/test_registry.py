@@ -77,7 +77,7 @@ def test_a_method_that_cannot_be_loaded_is_one_line(
 @pytest.mark.parametrize(
     ("method", "parameters", "says"),
     [
-        ("tv", {"boundary": 0.0}, "tv takes no boundary, which belongs to inverse, predictor, filter, lag, smoother"),
+        ("tv", {"boundary": 0.0}, "tv takes no boundary, which belongs to smoother, lag, inverse, filter, predictor"),
         ("smoother", {"denoise": abs}, "smoother takes no denoise, which belongs to pnp"),
         ("tv", {"strength": 2}, "tv takes no strength, which is a parameter of no method of aolink"),
     ],

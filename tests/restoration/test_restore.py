@@ -275,7 +275,7 @@ def test_an_even_picture_stays_as_it_is(method: str) -> None:
         (np.zeros((5, 5), bool), np.ones(2), {}, "type bool"),
         (np.zeros((5, 5), complex), np.ones(2), {}, "type complex128"),
         (np.full((5, 5), np.nan), np.ones(2), {}, "25 of the picture's 25 pixels are not finite.*mask=np.isfinite"),
-        (np.zeros((5, 5)), np.ones(2), {"method": "magic"}, "use one of inverse, predictor"),
+        (np.zeros((5, 5)), np.ones(2), {"method": "magic"}, "use one of tv, pnp"),
         (np.zeros((5, 5)), np.ones(2), {"method": "lag", "direction": "up"}, "expected one of forward, backward"),
         (np.zeros((5, 5)), np.eye(3), {"method": "inverse"}, "along the picture's rows or columns"),
         (np.zeros((5, 5)), np.ones(2), {"noise_sd": 0.0}, "above zero, or method='inverse'"),

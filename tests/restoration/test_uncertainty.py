@@ -11,8 +11,9 @@ from scipy import linalg
 from aolink.optics.sensor import Kernel
 from aolink.restoration import Psf, first_order, motion_psf, restore
 from aolink.restoration.deblur import psnr
+from aolink.restoration.plane import plane_variance
 from aolink.restoration.psf import line_matrix
-from aolink.restoration.uncertainty import line_variance, plane_variance
+from aolink.restoration.shahin import line_variance
 from tests.restoration.scenes import blocks, blurred
 
 KERNEL = Kernel(shape="gaussian", sigma=0.3)

@@ -92,6 +92,7 @@ def test_a_port_that_is_not_there_is_refused(aolink: Run) -> None:
     assert_refused(result, 3, "there is no port /dev/nowhere: `aolink devices` lists those of this machine")
 
 
+@pytest.mark.slow
 def test_a_port_in_use_is_refused(aolink: Run) -> None:
     with simulated_rig("section-vi") as (camera, mirror):
         held = SerialPort(camera)
@@ -345,6 +346,7 @@ def test_a_command_beyond_the_limits_is_refused_by_the_host_and_by_the_device() 
         ((_, refusal),) = hub.wait(1.0)
         (answered,) = mirror.handle(refusal)
         assert isinstance(answered, CommandAnswered)
+        assert answered.ack
         assert (answered.ack.code, answered.ack.text) == (pb.OUT_OF_RANGE, "an input is beyond the limits")
         assert mirror.in_flight == 0
 

@@ -58,6 +58,7 @@ def acts(folder: Path) -> list[pb.Control]:
     return [must_be(pb.Control, each.message) for each in Recording(folder / "a.mcap").messages(topics.CONTROL)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("controller", "estimator"), [("integrator", ""), ("lqg", "o1")])
 def test_on_virtual_time_the_session_is_the_loop_in_memory_bit_for_bit(
     tmp_path: Path, controller: str, estimator: str
@@ -95,6 +96,7 @@ def test_spots_close_the_loop_over_the_wire_as_in_memory(tmp_path: Path, name: s
     assert np.ptp(memory[-1].exposure.inputs, axis=0).all()  # every input moves
 
 
+@pytest.mark.slow
 def test_the_recording_says_who_closed_the_loop_and_how(tmp_path: Path) -> None:
     path = rig_file(tmp_path, small_rig(DRIFT, control="gain = 0.4"))
     report = close(path, tmp_path, "lqg", "moments", "o1")
@@ -118,6 +120,7 @@ def test_the_recording_says_who_closed_the_loop_and_how(tmp_path: Path) -> None:
         )
 
 
+@pytest.mark.slow
 def test_estimates_of_a_closed_loop_are_the_same_offline(tmp_path: Path) -> None:
     path = rig_file(tmp_path, small_rig(VIBRATION))
     close(path, tmp_path, "lqg", "o1")
@@ -182,6 +185,7 @@ def test_an_estimator_that_is_too_slow_to_control_opens_the_loop_and_costs_nothi
     assert report.control.late_exposures == report.control.exposures
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("when_lost", "state"), [("hold", State.HELD), ("park", State.PARKED)])
 def test_a_light_that_goes_out_opens_the_loop(tmp_path: Path, when_lost: str, state: State) -> None:
     """The camera sees nothing: the mirror stays where the rig file says, and the session goes on."""
@@ -222,6 +226,7 @@ def lost_and_found(folder: Path, when_lost: str, away: float, gone: range, estim
     return report, states
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("when_lost", ["hold", "park"])
 def test_light_that_is_lost_in_a_closed_loop_and_comes_back(tmp_path: Path, when_lost: str) -> None:
     """The spot jumps off the sensor in exposure 20 of a loop that is closed, and is back in exposure 30."""
@@ -235,6 +240,7 @@ def test_light_that_is_lost_in_a_closed_loop_and_comes_back(tmp_path: Path, when
     assert slopes[34:].max() < 0.02 < 0.05 < slopes[30:32].min()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("when_lost", "estimator"), [("hold", "o1"), ("park", "o1"), ("hold", "moments")])
 def test_an_estimator_that_diverges_in_a_closed_loop_opens_it_until_it_has_started_again(
     tmp_path: Path, when_lost: str, estimator: str
@@ -249,6 +255,7 @@ def test_an_estimator_that_diverges_in_a_closed_loop_opens_it_until_it_has_start
     assert max(slopes[30:]) < 0.1 < 0.5 < min(slopes[20:26])
 
 
+@pytest.mark.slow
 def test_a_model_that_no_longer_fits_is_said(tmp_path: Path) -> None:
     """The rig is shaken five times as much as the session's rig file says."""
     path = rig_file(tmp_path, small_rig(DRIFT.replace("0.15", "0.6")))
@@ -262,6 +269,7 @@ def test_a_model_that_no_longer_fits_is_said(tmp_path: Path) -> None:
     assert report.control.misfit_exposures > 0
 
 
+@pytest.mark.slow
 def test_a_controller_that_does_not_pay_is_left_and_the_recording_says_so(tmp_path: Path) -> None:
     """The vibration is not where the model has it; and the same is decided offline."""
     rig = played(tmp_path, vibration(10.5, 50), DRIFT, VIBRATION)
@@ -298,6 +306,7 @@ def test_a_loop_that_cannot_be_closed_is_refused_before_anything_is_opened(
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("controller", "estimators"), [("lqg", ["moments"]), ("integrator", [])])
 def test_a_controller_that_needs_an_estimator_has_the_default_one(
     tmp_path: Path, controller: str, estimators: list[str]
@@ -310,6 +319,7 @@ def test_a_controller_that_needs_an_estimator_has_the_default_one(
     assert Recording(tmp_path / "a.mcap").estimators == estimators
 
 
+@pytest.mark.slow
 def test_an_unstable_loop_that_is_forced_stays_within_the_limits(tmp_path: Path) -> None:
     path = rig_file(tmp_path, small_rig(DRIFT, control="gain = 20.0"))
     with simulated_rig(path) as ports:
@@ -334,6 +344,7 @@ def test_several_spots_and_a_mirror_of_many_actuators_run_in_a_closed_loop(tmp_p
     assert ours < theirs
 
 
+@pytest.mark.slow
 def test_a_controller_asked_offline_says_what_it_commanded_in_the_session(tmp_path: Path) -> None:
     """And for a simulated rig, what came of it: the same numbers as in the session, from the same seed."""
     path = rig_file(tmp_path, small_rig(VIBRATION))
@@ -346,6 +357,7 @@ def test_a_controller_asked_offline_says_what_it_commanded_in_the_session(tmp_pa
     assert result.closed_rms == result.recorded_rms < 0.5 * result.open_rms
 
 
+@pytest.mark.slow
 def test_another_controller_offline_answers_to_what_was_recorded(tmp_path: Path) -> None:
     path = rig_file(tmp_path, small_rig(DRIFT))
     with simulated_rig(path, "--seed", "8") as ports:
@@ -362,6 +374,7 @@ def on_simulated_time(tmp_path: Path, rig: Rig, exposures: int = 40) -> Run:
     return run_session(hub, rig, tmp_path / "a.mcap", exposures, controller="lqg", estimators=["o1"])
 
 
+@pytest.mark.slow
 def test_with_a_queue_the_loop_is_as_good_as_its_delay(tmp_path: Path) -> None:
     """Three blocks of lead, which are longer than a frame, delay nothing: each exposure acts after 10 ms, as asked."""
     rig = small_rig(VIBRATION)

@@ -44,6 +44,7 @@ def test_all_that_was_found_is_said(aolink: Run, ports: tuple[str, ...], tmp_pat
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_on_virtual_time_too(aolink: Run, tmp_path: Path) -> None:
     with simulated_rig("section-vi") as (camera, mirror):
         found = aolink(

@@ -227,6 +227,7 @@ def test_a_flood_ends_the_session_before_it_fills_the_memory(tmp_path: Path, rea
     assert_caught(tmp_path, lies, found + late, real_time=real_time)
 
 
+@pytest.mark.slow
 def test_a_stop_is_heard_in_a_flood(tmp_path: Path) -> None:
     """The flood has no end, and nothing but the stop ends the session."""
     begun = threading.Event()

@@ -21,6 +21,7 @@ AT_ONCE = 8
 """Sessions, which wait most of the time."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("part", range(3))
 def test_a_device_that_lies_ends_the_session_with_the_field(tmp_path: Path, part: int) -> None:
     def told(number: int) -> None:

@@ -78,6 +78,7 @@ def test_the_commands_are_those_of_the_session(recorded: Session) -> None:
     assert np.array_equal(asked[-1], recording.rig.mirror.park), "after the last command the mirror rests"
 
 
+@pytest.mark.slow
 def test_played_to_the_same_simulated_rig_a_recording_comes_out_the_same(
     aolink: Run, recorded: Session, tmp_path: Path
 ) -> None:

@@ -231,19 +231,6 @@ def test_a_rig_file_with_other_numbers_is_a_warning(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_the_demo_does_the_main_job(aolink: Callable[..., subprocess.CompletedProcess[str]], tmp_path: Path) -> None:
-    result = aolink("demo", "--rig", "section-vi-lively", "--exposures", "20", "--out", tmp_path)
-    assert result.returncode == 0, result.stderr
-    (folder,) = tmp_path.glob("demo-*")
-    assert {"session.mcap", "session.rrd"} <= {file.name for file in folder.iterdir()}
-    assert "agree bit for bit" in result.stdout
-    for word in ("open-loop", "o1", "o2", "o3", "RMSE path", "NEES end", "20 received", "n/a on virtual time"):
-        assert word in result.stdout
-    if not (folder / "session.png").exists():
-        assert "picture   none: " in result.stdout
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("arguments", [["--exposures", "3"], ["--duration", "0.5"]])
 def test_the_commands_of_a_session_by_hand_work_one_after_the_other(
     aolink: Callable[..., subprocess.CompletedProcess[str]], arguments: list[str]

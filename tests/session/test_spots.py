@@ -34,6 +34,7 @@ def spots(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFacto
     return Session(path, report)
 
 
+@pytest.mark.slow
 def test_every_frame_survives_the_wire_as_the_model_made_it(spots: Session) -> None:
     report, recording = spots.report, Recording(spots.path)
     assert (report.ended, report.exposures, report.frames_received) == ("complete", EXPOSURES, EXPOSURES)
@@ -66,6 +67,7 @@ def test_looking_at_the_frames_is_better_than_not_looking(spots: Session) -> Non
     assert rmse["moments"] < 0.5 * rmse["o3"]
 
 
+@pytest.mark.slow
 def test_one_mirror_with_a_tilted_spot_that_is_exposed_between_fast_steps(tmp_path: Path) -> None:
     """One copy of the plant for both slopes, a kernel that couples them, and exposures 0.375 of a step late."""
     text = load_rig("single-lenslet").toml
@@ -132,6 +134,7 @@ def many_inputs(exposure_steps: int) -> str:
     return text
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("faults", ["", FAULTY.replace("command_loss_rate = 0.05", "command_loss_rate = 0.02")])
 def test_a_row_of_inputs_may_be_longer_than_a_packet(tmp_path: Path, faults: str) -> None:
     rig_file, path = tmp_path / "many.toml", tmp_path / "a.mcap"
@@ -160,6 +163,7 @@ def test_the_demo_works(aolink: Callable[..., subprocess.CompletedProcess[str]],
     assert "agree bit for bit" in result.stdout
 
 
+@pytest.mark.slow
 def test_calibrating_it_is_refused(
     aolink: Callable[..., subprocess.CompletedProcess[str]], tmp_path: Path,
 ) -> None:  # fmt: skip

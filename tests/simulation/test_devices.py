@@ -206,6 +206,7 @@ def test_what_is_no_longer_remembered_is_not_reported_and_the_rest_comes_with_it
     assert known[:3] == (0, pb.Applied.PARKED, 100)
 
 
+@pytest.mark.slow
 @given(st.integers(0, 600), st.integers(1, 600))
 def test_an_answer_is_one_packet_and_goes_on_where_it_is_asked(first: int, n_steps: int) -> None:
     device = devices()

@@ -91,6 +91,7 @@ def test_states_scatter_as_the_lifted_covariance_says():
     np.testing.assert_allclose(np.cov(starts.T).diagonal() / RIG.plant.initial_covariance.diagonal(), 1, atol=0.25)
 
 
+@pytest.mark.slow
 def test_first_states_scatter_as_the_initial_covariance_says():
     states = []
     for seed in range(2000):

@@ -96,6 +96,7 @@ def test_rows_that_take_minutes_are_rows(monkeypatch: pytest.MonkeyPatch) -> Non
     assert {name for names in groups.ROWS.values() for name in names} >= groups.LONG
 
 
+@pytest.mark.slow
 def test_a_curve_knows_its_power_and_is_drawn(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(str(TOOLS))
     plots = importlib.import_module("bench_rows.plots")

@@ -192,6 +192,7 @@ def test_goals_are_held_or_not() -> None:
     assert [goal.held for goal in judged] == [False, True, False, False]  # limit, coverage, NEES, o1
 
 
+@pytest.mark.slow
 def test_the_picture_is_drawn_of_the_rows_that_are_kept(tmp_path: Path) -> None:
     from paper_report.figures import figure_family
     from paper_report.judge import RECORDED, read_rows

@@ -55,6 +55,7 @@ def test_a_vibration_has_the_sd_and_the_frequency_that_it_is_asked_for() -> None
     assert np.argmax(spectrum) / 4 == pytest.approx(48.0, abs=0.5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["own", "hcipy"])
 def test_turbulence_is_foretold_by_what_is_known_of_it(kind: str) -> None:
     """The state holds the slopes, and its model foretells those that it was not fitted to better than the last one."""

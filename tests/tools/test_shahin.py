@@ -24,6 +24,7 @@ def shahin(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     return importlib.import_module("paper_report.shahin")
 
 
+@pytest.mark.slow
 def test_the_page_and_its_figures(shahin: ModuleType, tmp_path: Path) -> None:
     page = shahin.make(tmp_path, quick=True).read_text(encoding="utf-8")
     for words in ("variance 6.092", "correlate by 0.873", "32 and 16.1 pixels", "-0.0038", "5.25 as printed"):

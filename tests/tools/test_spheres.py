@@ -76,6 +76,7 @@ def test_pylake_takes_the_blur_of_frames_that_are_apart_for_shorter_than_their_d
     assert sd < 0.1
 
 
+@pytest.mark.slow
 def test_frames_that_are_apart_keep_their_distance(identification: Any) -> None:
     """The intensity of a random walk is that of the recording; without the empty slots it would be four times that."""
     log, seen, _ = identification._seen(30_002)

@@ -68,6 +68,7 @@ def test_bad_inputs_find_nothing() -> None:
     assert all("from 1000 to 1020" in line and line.endswith("nothing found") for line in lines)
 
 
+@pytest.mark.slow
 def test_a_kind_of_inputs_that_there_is_not_is_an_error() -> None:
     done = run(TOOLS / "fuzz", "pakets")
     assert done.returncode == 2
@@ -95,12 +96,6 @@ def test_a_row_that_fails_says_so_and_the_others_go_on() -> None:
     assert "Traceback" in done.stderr
 
 
-@pytest.mark.slow
-def test_rows_that_work_end_well() -> None:
-    done = run(TOOLS / "bench", "--short", "turbulence", "recording_rate")
-    assert done.returncode == 0, done.stderr
-
-
 def test_a_word_that_no_row_has_is_an_error() -> None:
     done = run(TOOLS / "bench", "--short", "turbulense")
     assert done.returncode == 2
@@ -108,7 +103,7 @@ def test_a_word_that_no_row_has_is_an_error() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["demo", "method", "scene", "pupil", "loop"])
+@pytest.mark.parametrize("name", ["demo", "method", "scene", "pupil", pytest.param("loop", marks=pytest.mark.rare)])
 def test_pictures_are_made_and_are_those_of_the_pages(name: str, tmp_path: Path) -> None:
     """Short ones; README and the gallery show the repository's own, which are small."""
     done = run(TOOLS / "pictures", name, "--short", "--out", tmp_path)

@@ -33,6 +33,7 @@ def identity(path: Path) -> tuple[str, str]:
     return entry.application_id, entry.recording_id
 
 
+@pytest.mark.slow
 def test_the_same_file_is_one_recording_under_any_name_and_another_file_another(
     recording: Recording, saved: Path, tmp_path: Path
 ) -> None:

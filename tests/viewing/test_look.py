@@ -25,6 +25,7 @@ LIVELY = RECORDINGS / "section-vi-lively.mcap"
 Aolink = Callable[..., subprocess.CompletedProcess[str]]
 
 
+@pytest.mark.slow
 def test_one_exposure_has_every_step_of_its_paths_and_nothing_of_others(aolink: Aolink, tmp_path: Path) -> None:
     done = aolink("view", LIVELY, "--exposure", "7", "--save", "one.rrd")
     assert done.returncode == 0, done.stderr
@@ -71,6 +72,7 @@ def test_a_layout_about_an_exposure_has_a_few_views_of_it_and_all_exposures_are_
     assert near[0]["x_range"][0] <= columns.min() < columns.max() <= near[0]["x_range"][1] < sensor.pixels
 
 
+@pytest.mark.slow
 def test_a_part_has_the_exposures_that_begin_in_it(aolink: Aolink, tmp_path: Path) -> None:
     done = aolink("view", LIVELY, "--start", "0.3", "--end", "1.25", "--save", "part.rrd")
     assert done.returncode == 0, done.stderr
@@ -95,6 +97,7 @@ def test_a_lenslet_has_its_own_lines_as_x_and_y(tmp_path: Path, aolink: Aolink) 
         assert why in " ".join(aolink("view", recording.path, *options, "--save", "x.rrd").stderr.split())
 
 
+@pytest.mark.slow
 def test_two_estimates_and_two_recordings_are_drawn_in_the_same_plots(tmp_path: Path) -> None:
     """The second in fainter lines, from its own first exposure on."""
     recording = Recording(LIVELY)
@@ -147,6 +150,7 @@ def test_side_files_are_drawn_and_reported(aolink: Aolink, tmp_path: Path) -> No
     assert "is a side file" in alone.stderr
 
 
+@pytest.mark.slow
 def test_a_closed_loop_is_shown(tmp_path: Path) -> None:
     rig = load_rig("loop")
     with simulated_rig("loop") as ports:

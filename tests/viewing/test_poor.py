@@ -92,6 +92,7 @@ def page_of(entities: Entities) -> str:
     return str(text)
 
 
+@pytest.mark.slow
 def test_the_viewer_shows_what_there_is_and_its_page_says_what_there_is_not(
     case: tuple[str, Recording], tmp_path: Path
 ) -> None:

@@ -307,6 +307,7 @@ def test_a_quantity_has_one_colour_everywhere(entities: Entities) -> None:
             assert colours(path) == packed, path
 
 
+@pytest.mark.slow
 def test_every_view_shows_entities_that_exist(saved: Path) -> None:
     assert absent_from_views(saved) == []
 
@@ -375,6 +376,7 @@ def test_a_full_disk_is_one_clear_error_and_leaves_nothing(tmp_path: Path) -> No
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_fed_exposure_by_exposure_it_shows_what_the_file_shows(recorded: Session, tmp_path: Path) -> None:
     """Frames, paths, errors and states are those of `save_rrd`; only the brightness follows the first frame."""
     import rerun as rr

@@ -153,6 +153,7 @@ def test_a_viewer_ends_with_its_block_whatever_happens_in_it(rrd: Path) -> None:
     assert not viewers[0].is_running()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("backend", ["dx12", "gl"])
 def test_without_a_driver_the_error_names_the_package(
     rrd: Path, tmp_path: Path, without_vulkan: pytest.MonkeyPatch, backend: str
@@ -211,6 +212,7 @@ def test_the_web_viewer_is_served_on_loopback_until_interrupted(rrd: Path) -> No
     assert seen[1] == {"127.0.0.1"}
 
 
+@pytest.mark.slow
 def test_a_viewer_that_gets_the_data_over_the_network_shows_the_layout(rrd: Path, tmp_path: Path) -> None:
     with rr.RecordingStream("another") as stream:
         stream.save(tmp_path / "another.rrd")
@@ -304,6 +306,7 @@ def test_a_page_moves_where_its_usual_port_is_taken(rrd: Path) -> None:
     assert urllib.parse.urlsplit(seen[1]).port != WEB_PORT
 
 
+@pytest.mark.slow
 def test_a_rerun_file_is_shown_as_it_is(rrd: Path, start_aolink: Callable[..., subprocess.Popen[str]]) -> None:
     """The command serves it without making a recording of it first; Ctrl-C ends it."""
     serving = start_aolink("view", rrd, "--web")

@@ -106,6 +106,7 @@ class _Empty(SimpleHTTPRequestHandler):
         pass
 
 
+@pytest.mark.slow
 def test_only_this_machine_is_listened_to_and_no_page_from_elsewhere(full: Server) -> None:
     """A page of another origin gets neither the viewer's page nor the recording; the viewer's own page does."""
     assert listening(psutil.Process(full.process.pid), *psutil.Process(full.process.pid).children(recursive=True)) == {

@@ -62,6 +62,7 @@ def test_the_stream_may_be_cut_anywhere(sent: list[Packet], cuts: list[int]) -> 
     assert received == sent
 
 
+@pytest.mark.slow
 @given(packets, st.data())
 def test_every_burst_of_up_to_32_bits_is_found(packet: Packet, data: st.DataObject) -> None:
     """The damage that CRC-32 promises to find, applied to the bytes that it covers."""

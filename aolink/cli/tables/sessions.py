@@ -77,6 +77,8 @@ def session(report: Report) -> Table:
     for name, parts in counts.items():
         if parts:
             table.add_row(name, ", ".join(parts))
+    for line in report.answers.lines():
+        table.add_row("answers", line)
     if report.ports_vanished:
         gone = f"vanished {report.ports_vanished} times, and {report.away_s:.2f} s until all had returned"
         table.add_row("ports", gone)
@@ -151,6 +153,7 @@ def deblurred(summary: RestoredCounts) -> dict[str, Any]:
         "psnr_blurred_db": float(np.mean(blurred)) if blurred else None,
         "psnr_restored_db": float(np.mean(restored)) if restored else None,
         "psnr_restored_least_db": min(restored) if restored else None,
+        "expected_gain_db": float(np.mean(summary.expected_gains)) if summary.expected_gains else None,
     }
 
 
@@ -164,8 +167,19 @@ def deblurred_lines(summary: RestoredCounts, estimator: str, method: str) -> lis
             f"PSNR of the scene: {facts['psnr_blurred_db']:.1f} dB as recorded (shift removed),"
             f" {facts['psnr_restored_db']:.1f} dB restored (at least {facts['psnr_restored_least_db']:.1f})"
         )
+    lines += adds_error(method, facts["expected_gain_db"])
     lines += unused_lines({estimator: summary.motion.result()})
     return lines + [f"{count} not restored: {reason}" for reason, count in summary.reasons.items()]
+
+
+def adds_error(method: str, expected_gain_db: float | None) -> list[str]:
+    """A line where a method expects to make a picture worse."""
+    if expected_gain_db is None or not expected_gain_db < 0:
+        return []
+    return [
+        f"{method} leaves more error than the blurred picture has, by its own model ({expected_gain_db:.1f} dB): take"
+        " tv, gauss_markov or smoother"
+    ]
 
 
 def demo_summary(result: DemoResult, command: str) -> list[str]:

@@ -61,6 +61,7 @@ def test_a_picture_of_another_size_ends_the_session(tmp_path: Path) -> None:
     counted(list(Recording(tmp_path / "a.mcap").exposures()), pictures(3))
 
 
+@pytest.mark.slow
 def test_a_camera_alone_can_be_calibrated(aolink: Run, tmp_path: Path) -> None:
     """In the dark, as far as that goes: here the other lights are left out."""
     noise = np.random.default_rng(1).normal(20_000, 50, (30, *SHAPE))

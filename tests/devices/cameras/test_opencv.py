@@ -47,6 +47,7 @@ def table(source: object) -> str:
     return f'driver = "opencv"\nsource = {source!r}\ncorner = {[*CORNER]}\ndelay_s = 0.0\ndelay_sd_s = 0.002'
 
 
+@pytest.mark.slow
 def test_a_session_records_a_film_as_it_plays(film: Path, tmp_path: Path) -> None:
     rig = rig_of(table(film.name), tmp_path, **BITS_8)
     report, recording, found = recorded(rig, tmp_path / "a.mcap", 8, ["o3"])

@@ -31,6 +31,7 @@ def _camera(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[None]:
     installed.cache_clear()
 
 
+@pytest.mark.slow
 def test_a_camera_that_fails(tmp_path: Path) -> None:
     np.save(tmp_path / "film.npy", np.full((6, 20, 20), 400, dtype=np.uint16))
 

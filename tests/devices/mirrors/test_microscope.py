@@ -103,8 +103,7 @@ def session_rig(settings: str = "") -> Rig:
 
 
 @pytest.mark.slow
-def test_a_whole_session(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    bench.install(monkeypatch, tmp_path, microscope="aolink.devices.mirrors.microscope:MicroscopeMirror")
+def test_a_whole_session(tmp_path: Path) -> None:
     spot_camera.mirror.held = held
     report = record(session_rig(), None, None, tmp_path / "a.mcap", estimators=["o1"], exposures=10)
     assert (report.ended, report.exposures) == ("complete", 10)

@@ -18,6 +18,7 @@ from tests.devices.simulators.serial_device import Faults
 Session = Callable[..., Path]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "faults",
     [Faults(late_s=0.002, split=True), Faults(late_s=2.5 * bench.FAST_STEP_S, after_moves=10)],

@@ -39,6 +39,7 @@ def test_gradients_are_the_twins_and_log_likelihoods_those_without(kind):
     assert worst < 5e-5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["lively", "dark pixels", "round", "aslant", "shot noise"])
 def test_points_have_the_same_gradient_wherever_they_are_among_others(kind):
     view, _, state = looked(kind)
@@ -52,6 +53,7 @@ def test_points_have_the_same_gradient_wherever_they_are_among_others(kind):
     assert not part[:, 133:].any()
 
 
+@pytest.mark.slow
 def test_the_gradient_of_several_spots_is_the_sum_of_theirs():
     view, _, state = looked_at_plane("round", 9)
     one, t = view.seen, np.ascontiguousarray(drawn(view, state).transpose(0, 2, 1))

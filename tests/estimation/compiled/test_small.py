@@ -1,10 +1,12 @@
 """Compiled code for small matrices against NumPy."""
 
 import numpy as np
+import pytest
 
 from aolink.estimation.compiled import small
 
 
+@pytest.mark.slow
 def test_small_matrices_are_those_of_numpy():
     rng = np.random.default_rng(5)
     for n in (1, 2, 5, 12):

@@ -136,6 +136,7 @@ def test_sums_of_products_take_the_place_of_what_was_there(kind, count):
     assert only(found, out, changed)
 
 
+@pytest.mark.slow
 @KINDS
 def test_the_bits_are_those_of_a_loop(kind):
     for seed in range(100):

@@ -151,6 +151,7 @@ def coupled() -> Rig:
     return replace(one, plant=plant, sensor=ONE)
 
 
+@pytest.mark.slow
 def test_a_coupled_plant_is_told_that_its_slopes_share_the_pixels_noise():
     rig = coupled()
     found = [measured_of(ONE, rig.plant, frame)[0] for frame in noisy_frames(ONE, (0.3, -0.2), FRAMES)]
@@ -195,6 +196,7 @@ def estimates(exposures):
     return run(RIG, exposures, NAMES)
 
 
+@pytest.mark.slow
 def test_every_estimator_that_looks_beats_prediction(exposures, estimates):
     rmse = {name: score(exposures, each, skip=5).path_rmse for name, each in estimates.items()}
     assert rmse["o1"] < 0.5 * rmse["open-loop"]

@@ -29,6 +29,7 @@ def test_filterpy_gives_our_estimates(rig, name, gain):
                 np.testing.assert_allclose(value, getattr(b, field.name), atol=1e-9, rtol=0, err_msg=field.name)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["o1", "o2", "o3"])
 @pytest.mark.parametrize("rig_name", ["tip-tilt", "sh-8x8"])
 def test_filterpy_gives_our_estimates_of_plants_that_move_whole_spots(rig_name, name):
@@ -45,13 +46,13 @@ def test_filterpy_gives_our_estimates_of_plants_that_move_whole_spots(rig_name, 
 @pytest.mark.parametrize("method", ["update", "predict"])
 def test_it_is_filterpy_that_works(rig, name, method, monkeypatch):
     def fail(*args, **kwargs):
-        raise ZeroDivisionError
+        raise NotImplementedError
 
     for kind in (filterpy.kalman.KalmanFilter, filterpy.kalman.ExtendedKalmanFilter):
         monkeypatch.setattr(kind, method, fail)
     (exposure,) = simulate(rig, 1)
     estimator = make_estimator(rig, name, engine="filterpy", gain="time-varying")
-    with pytest.raises(ZeroDivisionError):
+    with pytest.raises(NotImplementedError):
         estimator.step(exposure)
     make_estimator(rig, name).step(exposure)
 

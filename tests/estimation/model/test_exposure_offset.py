@@ -114,6 +114,7 @@ def test_windowed_moments_expect_what_finer_steps_show():
     np.testing.assert_allclose(expected, W[0] @ density * rig.sensor.pixel_width, atol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["o1", "o3", "moments"])
 def test_estimators_that_know_where_in_a_step_exposures_start_are_better(name):
     rig = shaken(0.9)

@@ -76,6 +76,7 @@ def test_a_quiet_camera_needs_more_of_them():
     assert counts[0] < counts[1] < counts[2]
 
 
+@pytest.mark.slow
 def test_a_spot_that_goes_back_and_forth_needs_many():
     error, count = wrong(SHAKEN)
     assert error < 0.15

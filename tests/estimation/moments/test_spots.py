@@ -260,6 +260,7 @@ def test_o1_of_a_membrane_is_the_dense_least_squares_solution():
     np.testing.assert_allclose(difference, 0, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_the_cross_moment_tells_one_diagonal_from_the_other():
     """It takes a tenth off the error here: 0.085, without it 0.095, o1 0.152."""
     rig = diagonal_shake(1e-3)
@@ -268,6 +269,7 @@ def test_the_cross_moment_tells_one_diagonal_from_the_other():
     assert found["moments"].path_rmse < 0.59 * found["o1"].path_rmse
 
 
+@pytest.mark.slow
 def test_a_round_kernel_taken_for_the_tilted_one_biases_what_is_seen():
     rig = tip_tilt(kernel=TILTED, noise_density=2e-4)
     wrong = dataclasses.replace(rig, sensor=sensor_of(rig, kernel=Kernel(shape="gaussian", sigma=TILTED.sigma)))
@@ -294,6 +296,7 @@ def test_measured_flux_does_not_mind_a_lamp_that_is_half_as_bright():
 # Trust
 
 
+@pytest.mark.slow
 def test_a_part_of_a_window_that_is_missing_is_left_out():
     rig = membrane()
     exposures = simulate(rig, 12)

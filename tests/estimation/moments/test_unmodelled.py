@@ -96,6 +96,7 @@ def test_on_a_membrane_under_turbulence_frames_are_believed(
         assert abs(nis.mean - (nis.low + nis.high) / 2) < nis.high - nis.low
 
 
+@pytest.mark.slow
 def test_the_stated_deviation_of_the_path_holds_the_error(
     exposures: list[Exposure], estimates: dict[str, list[Estimate]]
 ) -> None:
@@ -106,6 +107,7 @@ def test_the_stated_deviation_of_the_path_holds_the_error(
     assert np.mean(inside) > 0.93
 
 
+@pytest.mark.slow
 def test_the_papers_filters_do_not_know_of_them(exposures: list[Exposure]) -> None:
     plain = dataclasses.replace(SH, plant=_without(SH.plant))
     for name in ("o1", "o2", "o3"):

@@ -309,6 +309,7 @@ def test_a_frame_without_a_spot_is_refused():
     assert "no spot" in dark.reason
 
 
+@pytest.mark.slow
 def test_shot_noise_by_the_rig_file_is_allowed_for():
     """With 300 photo-electrons there is more noise than the camera's own; without allowing for it, NEES shows it."""
     sensor = dataclasses.replace(SENSOR, noise_density=1e-4, photoelectrons=300.0)

@@ -131,6 +131,7 @@ def swinging():
     return rig, [(exposures, run(rig, exposures, ["profile"])["profile"]) for exposures in runs]
 
 
+@pytest.mark.slow
 def test_later_frames_tell_which_way_a_path_ran(swinging):
     rig, runs = swinging
     errors, inside = np.zeros(2), []

@@ -106,6 +106,7 @@ def whole_prior(frame: Frame, size: int) -> Gaussian:
 # The pixels
 
 
+@pytest.mark.slow
 def test_pixels_and_what_they_tell_are_those_of_a_dense_view(rig, frame):
     paths = JointPaths(frame.model, rig.sensor)
     ours, theirs = joint_view(rig, frame, paths), dense_view(rig, frame, paths)
@@ -236,6 +237,7 @@ def test_moments_are_the_dense_ones_but_for_errors_that_spots_share(rig, frame, 
     np.testing.assert_allclose(found.innovation_covariance[0], np.diag(S), rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_the_gain_of_o1_solves_the_riccati_equation(small_membrane):
     plant = small_membrane.plant
     model, (R,) = exposure_model(plant, 200), centroid_covariance(small_membrane)
@@ -267,6 +269,7 @@ def test_288_states_are_told_by_200_slopes_with_the_certainty_that_is_claimed(me
     assert found["profile"].nis.mean == pytest.approx(200, rel=0.15)
 
 
+@pytest.mark.slow
 def test_nothing_is_as_large_as_a_dense_basis(membrane):
     """Outputs times steps times coefficients would be 220 MB."""
     exposures = simulate(membrane, 2)

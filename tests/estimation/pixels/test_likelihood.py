@@ -266,6 +266,7 @@ def test_no_coefficient_is_added_for_the_mean_of_a_path_where_there_are_sixteen(
     assert left_out > 0.11**2
 
 
+@pytest.mark.slow
 def test_both_ends_of_an_exposure_are_as_sure_as_they_are_right_where_a_slow_process_is_the_weaker():
     rig = slow_and_fast()
     start, end = list[float](), list[float]()
@@ -294,6 +295,7 @@ def test_the_end_of_an_exposure_is_as_sure_as_it_is_right_where_one_direction_ha
     assert 0.9 < np.mean(nees) < 1.1
 
 
+@pytest.mark.slow
 def test_the_end_of_an_exposure_is_as_sure_as_it_is_right_on_a_line():
     rig, nees = slow_on_a_line(), list[float]()
     for seed in range(40):
@@ -326,6 +328,7 @@ def test_noise_that_is_left_out_hardly_changes_the_pixels():
     assert np.trace(seen) < 0.5
 
 
+@pytest.mark.slow
 def test_a_bright_spot_that_vibrates_fast_is_known_as_well_as_the_estimate_says():
     rig = fast_and_bright()
     nees = []

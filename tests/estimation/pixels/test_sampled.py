@@ -153,6 +153,7 @@ def test_it_is_an_estimator_like_any_other():
         assert np.mean(np.abs(e.path - truth_of(x).path) < 3 * e.path_sd) > 0.9
 
 
+@pytest.mark.slow
 def test_no_bit_depends_on_how_many_threads_there_are():
     """Of 10,000 numbers BLAS shares a scalar product among threads, of 30 coefficients a product of matrices."""
     rng = np.random.default_rng(3)
