@@ -48,7 +48,7 @@ _MODULES = (
     "aolink.cli.tables.scores",
     "aolink.cli.tables.sessions",
     "aolink.estimation.pixels.filter",
-    "aolink.estimation.pixels.updates",
+    "aolink.estimation.pixels.profile",
     "aolink.estimation.pixels.sampled",
     "typer._adapters",  # with which it reads options
 )
