@@ -1,6 +1,8 @@
 """The command ``aolink``: signals are handled before anything else is loaded, which takes a second."""
 
+import mmap
 import os
+import resource
 import sys
 
 # `python -m aolink` has put the current folder first, where somebody else's numpy.py may lie.
@@ -8,6 +10,12 @@ if __name__ == "__main__" and not sys.flags.safe_path and sys.path[0] != os.path
     del sys.path[0]
 
 from aolink.signals import ending_the_command
+
+_LIBRARIES_BYTES = 256 << 20
+"""Address space that NumPy and SciPy take; where it ends while they are loaded, they may never come back."""
+_MEMORY_LIMITS = (resource.RLIMIT_AS, resource.RLIMIT_DATA)
+_LACKS_MEMORY = ("failed to map segment", "cannot allocate memory")
+"""What the loader of libraries says where a limit of the process leaves too little memory."""
 
 
 def main() -> None:
@@ -17,9 +25,20 @@ def main() -> None:
     os.environ["PYTHONSAFEPATH"] = "1"
     os.environ.setdefault("NUMBA_CACHE_DIR", "")
     with ending_the_command():
-        from aolink.cli import main as run
+        try:
+            if any(resource.getrlimit(each)[0] != resource.RLIM_INFINITY for each in _MEMORY_LIMITS):
+                # Each thread of BLAS takes memory of its own, which a machine with many cores may not have then.
+                os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+                mmap.mmap(-1, _LIBRARIES_BYTES, mmap.MAP_PRIVATE).close()
+            from aolink.cli import main as run
 
-        run()
+            run()
+        except (MemoryError, OSError, ImportError) as error:
+            if not (isinstance(error, MemoryError) or any(each in str(error).lower() for each in _LACKS_MEMORY)):
+                raise
+            text = "this needs more memory than there is: raise the limit of this process (ulimit -v, ulimit -d)"
+            print(f"aolink: {text}, or take a part of the recording, or fewer axes", file=sys.stderr)
+            sys.exit(1)
 
 
 if __name__ == "__main__":

@@ -2,7 +2,8 @@
 
 Every file that aolink writes comes from here. `writing` makes it under a name of its own beside the target and
 puts it in the target's place when it is complete. `create` is for a recording that has to be readable while the
-session still goes on: it is written under its final name.
+session still goes on: it is written under its final name, and takes the place of an old file when there is something
+in it.
 
 A target is a plain file or a name that is still free. Folders, symbolic links, pipes, sockets and devices are
 refused before they are opened, so nothing is written through a link and nothing waits for a pipe.
@@ -22,6 +23,7 @@ import os
 import random
 import re
 import secrets
+import shutil
 import stat
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -124,10 +126,81 @@ def writing(
         raise error(f"cannot write {target}: {why_not(problem)}") from None
 
 
-def create(target: Path, *, overwrite: bool = False, error: type[AolinkError] = AolinkError) -> int:
-    """Create a file that is written under its final name; gives its descriptor, locked until it is closed.
+class NewFile:
+    """A file that is being written while others may read it; it is locked until it is closed.
 
-    With ``overwrite`` an old file is emptied and keeps its permissions.
+    Where its name is that of an old file, it is beside that one until `take_place`.
+    """
+
+    def __init__(self, path: Path, target: Path, descriptor: int, error: type[AolinkError]) -> None:
+        self.path = path
+        """Its name at present."""
+        self.target = target
+        """Its name in the end."""
+        self.descriptor = descriptor
+        self._error, self._closed = error, False
+        self._old = None if path == target else _identity(target)
+
+    @property
+    def is_aside(self) -> bool:
+        """Whether it is still beside the file that it is to replace."""
+        return self.path != self.target
+
+    def is_there(self) -> bool:
+        """Whether its name is still its own: another program may have removed, renamed or replaced it."""
+        return _is_open_as(self.path, self.descriptor)
+
+    def take_place(self) -> None:
+        """Put it in the place of the old file, unless another program has exchanged one of them. Raises OSError, and
+        an error of the class that `create` was given."""
+        check_target(self.target, overwrite=True, error=self._error)
+        changed = self.target.exists() and self._old != _identity(self.target)
+        if changed or not self.is_there():
+            what = self.target if changed else self.path
+            raise self._error(f"cannot write {self.target}: another program has put a file in the place of {what}")
+        os.replace(self.path, self.target)
+        self.path = self.target
+        _sync_folder(self.target.parent)
+
+    def moved_to(self) -> Path | None:
+        """Where it is now that its name is no longer its own; None if it was removed, or that is not known."""
+        try:
+            place = Path(os.readlink(f"/proc/self/fd/{self.descriptor}"))
+        except OSError:  # a system without /proc
+            return None
+        # NFS keeps a removed file as .nfs... until it is closed.
+        return None if place.name.endswith(" (deleted)") or place.name.startswith(".nfs") else place
+
+    def saved(self) -> Path:
+        """Copy a file that was removed to a new one beside its name; gives that one. Raises OSError."""
+        copy = self.path.with_name(f"{self.path.stem}-saved-{secrets.token_hex(4)}{self.path.suffix}")
+        with open(os.dup(self.descriptor), "rb") as source, copy.open("xb") as new:
+            source.seek(0)
+            shutil.copyfileobj(source, new, 1 << 20)
+            new.flush()
+            os.fsync(new.fileno())
+        return copy
+
+    def close(self) -> None:
+        """Close it; one that is still beside the old file is removed. Raises nothing."""
+        if self._closed:
+            return
+        self._closed = True
+        with suppress(OSError):
+            if self.is_aside and self.is_there():
+                self.path.unlink()
+        with suppress(OSError):
+            os.close(self.descriptor)
+
+
+def _identity(path: Path) -> tuple[int, int, int]:
+    """What tells a file from another one in its place, which may have got its number."""
+    found = path.stat()
+    return found.st_dev, found.st_ino, found.st_mtime_ns
+
+
+def create(target: Path, *, overwrite: bool = False, error: type[AolinkError] = AolinkError) -> NewFile:
+    """Create a file that is written under its final name, or beside an old file with the permissions of that.
 
     Raises
     ------
@@ -136,16 +209,16 @@ def create(target: Path, *, overwrite: bool = False, error: type[AolinkError] = 
         cannot be created.
     """
     check_target(target, overwrite=overwrite, error=error)
-    flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
-    existed = target.exists()
+    flags = os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
     try:
-        descriptor = os.open(target, flags | (0 if overwrite else os.O_EXCL), 0o666)
+        if target.exists():
+            partial, descriptor = _begun(target, error)
+            return NewFile(partial, target, descriptor, error)
+        descriptor = os.open(target, flags, 0o666)
         try:
             if not _lock(descriptor) or _others_write(target):
-                if not existed:
-                    target.unlink()
+                target.unlink()
                 raise error(_in_use(target))
-            os.ftruncate(descriptor, 0)
             _sync_folder(target.parent)
         except BaseException:
             os.close(descriptor)
@@ -154,7 +227,7 @@ def create(target: Path, *, overwrite: bool = False, error: type[AolinkError] = 
         raise error(_exists(target)) from None
     except OSError as problem:
         raise error(f"cannot create {target}: {why_not(problem)}") from None
-    return descriptor
+    return NewFile(target, target, descriptor, error)
 
 
 def write_csv(file: TextIO, columns: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> None:
@@ -184,6 +257,11 @@ def is_being_written(target: Path) -> bool:
         return _others_write(target)
 
 
+def is_being_replaced(target: Path) -> bool:
+    """Whether another command is writing a file that is to take the place of ``target``."""
+    return _others_write(target)
+
+
 def remove_unfinished(target: Path) -> None:
     """Remove the unfinished files of ``target`` that killed commands have left."""
     _others_write(target)
@@ -208,26 +286,35 @@ def _in_use(target: Path) -> str:
 @contextmanager
 def _unfinished(target: Path, error: type[AolinkError]) -> Iterator[tuple[Path, int]]:
     """A temporary file beside ``target``, open and locked, which is removed after the block unless it was renamed."""
+    partial, descriptor = _begun(target, error)
+    try:
+        yield partial, descriptor
+    finally:
+        with suppress(OSError):
+            partial.unlink()
+        os.close(descriptor)
+
+
+def _begun(target: Path, error: type[AolinkError]) -> tuple[Path, int]:
+    """A new file beside ``target``, open and locked, with its descriptor."""
     for attempt in range(_ATTEMPTS):
         if attempt:
             time.sleep(random.uniform(0, _STEP_BACK_S))
         partial = target.with_name(f"{_prefix_of(target)}{secrets.token_hex(8)}.partial")
         if os.path.lexists(partial):
             continue
-        descriptor = -1
+        descriptor, good = _open_new(partial, target), False
         try:
-            descriptor = _open_new(partial, target)
             # Another command that looks for dead files may take ours for one before it is locked.
-            if not (_lock(descriptor) and _is_open_as(partial, descriptor)):
-                continue
-            if _others_write(target, but=partial) or (target.exists() and _locked_by_another(target)):
-                continue
-            yield partial, descriptor
-            return
+            good = _lock(descriptor) and _is_open_as(partial, descriptor)
+            good = good and not _others_write(target, but=partial)
+            good = good and not (target.exists() and _locked_by_another(target))
+            if good:
+                return partial, descriptor
         finally:
-            with suppress(OSError):
-                partial.unlink()
-            if descriptor >= 0:
+            if not good:
+                with suppress(OSError):
+                    partial.unlink()
                 os.close(descriptor)
     raise error(_in_use(target))
 

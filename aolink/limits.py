@@ -5,6 +5,7 @@ from __future__ import annotations
 import gzip
 import io
 import math
+import mmap
 import os
 import zipfile
 from dataclasses import dataclass, fields
@@ -38,8 +39,11 @@ class Limits:
     """Bytes of a chunk without its compression: the largest that aolink writes has 64 MiB, and its last message."""
     attachment_bytes: int = 256 << 20
     """Bytes of all attachments of a file together; they are kept in memory."""
+    description_bytes: int = 32 << 20
+    """Bytes of all metadata, channels and schemas of a file together; they are kept in memory."""
     records_per_kilobyte: int = 256
-    """Messages, channels and schemas in each thousand bytes of a file, beside the first 100,000 of them."""
+    """Messages in each thousand bytes of a file, beside the first 100,000 of them. A chunk and its
+    place in the index count as 32 messages each, a channel, a schema, metadata or an attachment as 128."""
     expansion: int = 255
     """Bytes without compression in each byte of a file, beside the first GiB. LZ4 cannot exceed it."""
     unpacked_bytes: int = 1 << 30
@@ -85,19 +89,37 @@ def exceeded(what: str, name: str, error: type[AolinkError] = RecordingError) ->
     )
 
 
+def check_room(count: int, what: str, error: type[AolinkError]) -> None:
+    """Raise ``error`` where a limit of this process leaves fewer bytes than ``what`` takes, in words."""
+    try:
+        mmap.mmap(-1, count, mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS).close()
+    except (OSError, MemoryError):
+        raise error(
+            f"{what} takes {count >> 20} MiB of memory, and this process may not have them: raise its limit (ulimit -v,"
+            " ulimit -d)"
+        ) from None
+
+
 class Budget:
     """The remaining budget for one reading of a file of ``size`` bytes."""
 
     def __init__(self, name: str, size: int) -> None:
-        self._what = f"the {size} bytes of {name}"
+        self._name, self._what = name, f"the {size} bytes of {name}"
         self.records = _FREE_RECORDS + size * limits().records_per_kilobyte // 1000
         self._bytes = _FREE_BYTES + size * limits().expansion
+        self._description_bytes = limits().description_bytes
 
     def take_records(self, count: int) -> None:
         """Raise RecordingError where a file has more records than its size allows."""
         self.records -= count
         if self.records < 0:
             raise exceeded(f"{self._what} hold very many tiny records", "records_per_kilobyte")
+
+    def take_description(self, count: int) -> None:
+        """Raise RecordingError where metadata, channels and schemas take more bytes than is allowed."""
+        self._description_bytes -= count
+        if self._description_bytes < 0:
+            raise exceeded(f"{self._name} holds very long metadata, channels or schemas", "description_bytes")
 
     def take_bytes(self, count: int) -> None:
         """Raise RecordingError where a file expands more than is allowed."""

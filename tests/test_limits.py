@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import gzip
+import resource
 import struct
+import subprocess
 import zipfile
 import zlib
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +20,7 @@ from aolink.limits import VARIABLE, limits, load_array
 from aolink.optics.frame_file import read_frame
 from aolink.optics.pictures import read_picture
 
+Run = Callable[..., subprocess.CompletedProcess[str]]
 CARDS = ("SIMPLE  =                    T", "BITPIX  =                    8", "NAXIS   =                    2")
 
 
@@ -101,3 +105,19 @@ def test_the_limits_are_those_of_the_environment(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setenv(VARIABLE, "picture_pixels=1e9, chunk_bytes=2000")
     assert (limits().picture_pixels, limits().chunk_bytes) == (10**9, 2000)
     assert limits().record_bytes == usual.record_bytes
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("limit_mb", "code"), [(200, 1), (500, 6)])
+def test_a_process_with_too_little_memory_ends_with_one_line(
+    aolink: Run, tmp_path: Path, limit_mb: int, code: int
+) -> None:
+    """Too little for the libraries, and for an estimator: both end such a process without a word, or never."""
+    recording = Path(__file__).parents[1] / "recordings" / "section-vi.mcap"
+    done = aolink(
+        "estimate", recording, "-e", "o3",
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_AS, (limit_mb << 20, limit_mb << 20)),
+    )  # fmt: skip
+    assert (done.returncode, len(done.stderr.splitlines())) == (code, 1), done.stderr
+    assert "raise " in done.stderr
+    assert "ulimit -v" in done.stderr

@@ -20,7 +20,7 @@ from aolink.cli import (  # noqa: F401  their commands
     rigs,
     sessions,
 )
-from aolink.cli.common import app, stderr
+from aolink.cli.common import app, say_more_damage, stderr
 from aolink.errors import AolinkError
 from aolink.signals import ending_the_command
 
@@ -33,10 +33,12 @@ def _print_version(wanted: bool) -> None:
 
 @app.callback()
 def _options(
+    context: typer.Context,
     version: Annotated[
         bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and end.")
     ] = False,
-) -> None: ...
+) -> None:
+    context.call_on_close(say_more_damage)
 
 
 def main() -> None:
@@ -47,9 +49,6 @@ def main() -> None:
     except AolinkError as error:
         stderr.print(f"aolink: {escape(str(error))}")
         sys.exit(error.exit_code)
-    except MemoryError:
-        stderr.print("aolink: this needs more memory than there is: take a part of the recording, or fewer axes")
-        sys.exit(AolinkError.exit_code)
     except OSError as error:  # a file or folder without a message of ours, such as that for temporary files
         what = f"{error.filename}: " if error.filename else ""
         stderr.print(f"aolink: {what}{(error.strerror or str(error)).lower()}", markup=False)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.markup import escape
 
-from aolink.cli.common import JsonOption, KeyOption, OverwriteOption, app, progress, stderr, stdout
+from aolink.cli.common import JsonOption, KeyOption, OverwriteOption, app, local_file, progress, stderr, stdout
 from aolink.cli.terminal import ask, progress_bar
 from aolink.errors import AolinkError, CalibrationError
 from aolink.files import check_target, writing
@@ -36,7 +36,11 @@ def calibrate(
     ],
     files: Annotated[
         list[Path] | None,
-        typer.Argument(metavar="[FILE]...", help="Recordings made with `aolink record --calibration`, or with pokes."),
+        typer.Argument(
+            metavar="[FILE]...",
+            help="Recordings made with `aolink record --calibration`, or with pokes.",
+            parser=local_file,
+        ),
     ] = None,
     camera: Annotated[
         str | None, typer.Option(metavar="PORT", help="Port of the camera, to record the frames now.")

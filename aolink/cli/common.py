@@ -32,6 +32,8 @@ app = typer.Typer(
 stdout = PlainConsole(highlight=False, soft_wrap=True, width=None if sys.stdout.isatty() else 120)
 stderr = PlainConsole(stderr=True, highlight=False, soft_wrap=True)
 
+_opened: "list[tuple[Recording, str]]" = []
+"""The recordings that this command has opened, and their damage as it was known then."""
 RigArgument = Annotated[str, typer.Argument(help="A rig file, or the name of a rig that comes with aolink.")]
 
 
@@ -106,10 +108,23 @@ def open_recording(file: "str | Path | Url", *, check: bool = False, side: "Sequ
     """Open a recording with its side files, and print a warning where it is not whole."""
     from aolink.recording.reader import Recording
 
-    recording = Recording(file, check=check, side=side)
+    return say_damage(Recording(file, check=check, side=side))
+
+
+def say_damage(recording: "Recording") -> "Recording":
+    """Print a warning where a recording is not whole: now, and at the command's end if more was found by then."""
     if recording.damage:
         warn(f"{recording.path}: {recording.damage}")
+    _opened.append((recording, recording.damage))
     return recording
+
+
+def say_more_damage() -> None:
+    """Print the warnings of `say_damage` that are due at the command's end."""
+    while _opened:
+        recording, known = _opened.pop()
+        if recording.damage != known:
+            warn(f"{recording.path}: {recording.damage}")
 
 
 def spot_of(sensor: "BaseSensor", lenslet: str) -> int:

@@ -243,7 +243,7 @@ def _estimate_one(
 ) -> None:  # fmt: skip
     from aolink.cli.tables import scores as tables
     from aolink.estimation.registry import DEFAULT_ESTIMATOR
-    from aolink.recording import reestimate
+    from aolink.recording import reestimate, topics
     from aolink.recording.reader import Recording
     from aolink.recording.reestimate import (
         check_has_exposures,
@@ -253,13 +253,12 @@ def _estimate_one(
         scored_and_compared,
     )
 
-    recording = model.applied_to(common.open_recording(file))
+    recording = common.say_damage(model.applied_to(Recording(file)))
     check_has_exposures(recording)
     names = list(dict.fromkeys(estimator or own_estimators(recording, warn) or [DEFAULT_ESTIMATOR]))
-    total, known = recording.n_frames, recording.damage
     try:
         common.get_ready(recording.rig, names)
-        with progress("estimate", total) as tell:
+        with progress("estimate", recording.n_frames) as tell:
             if output is not None:
                 reestimate.write_reestimated(
                     recording, names, output,
@@ -275,13 +274,11 @@ def _estimate_one(
         if recording.rig_is_recorded:
             raise
         raise EstimatorError(f"{file} cannot be estimated with this rig: {error!r}; check its numbers") from None
-    if recording.damage != known:
-        warn(f"{file}: {recording.damage}")
     if as_json:
         print(json.dumps({**tables.scores_as_json(scores), "differs_from_recorded": differences}, allow_nan=False))
     else:
         stdout.print(tables.scores(scores))
-        begun_late = "cut" in recording.metadata or recording.metadata.get("part", "1") != "1"
+        begun_late = "cut" in recording.metadata or recording.metadata.get(topics.PART, "1") != "1"
         why = " (the recording begins in the middle of its session, where estimators begin anew)" if begun_late else ""
         for name, difference in differences.items():
             text = difference + why if difference else "the same as recorded, bit for bit"

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from aolink.cli.common import OverwriteOption, app, open_recording, progress, stdout, warn
+from aolink.cli.common import OverwriteOption, app, open_recording, progress, stdout
 
 
 @app.command(epilog="Example: aolink export session.mcap -o session.parquet -e moments")
@@ -37,9 +37,6 @@ def export(
 
     recording = open_recording(location(file))
     check_stands_alone(recording)
-    known = recording.damage
     with progress("export", recording.n_frames) as tell:
         export_series(recording, output, estimator, overwrite=overwrite, progress=tell)
-    if recording.damage != known:
-        warn(f"{recording.path}: {recording.damage}")
     stdout.print(f"written: {output}", markup=False)

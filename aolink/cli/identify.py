@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from aolink.cli.common import JsonOption, OverwriteOption, app, open_recording, progress, stdout, warn
+from aolink.cli.common import JsonOption, OverwriteOption, app, open_recording, progress, say_damage, stdout
 from aolink.errors import IdentificationError
 from aolink.files import check_target, writing
 
@@ -132,7 +132,7 @@ def _follow(
 
     if taken := sorted(output.parent.glob(f"{glob.escape(output.stem)}-[0-9]*{glob.escape(output.suffix)}")):
         raise IdentificationError(f"{taken[0]} exists, and further offers would have such names: give another -o")
-    recording = GrowingRecording(place, lambda: time.sleep(_LOOK_S), rig=rig)
+    recording = say_damage(GrowingRecording(place, lambda: time.sleep(_LOOK_S), rig=rig))
     with progress("follow", None) as tell:
 
         def on_progress(what: str, done: int, of: int) -> None:
@@ -146,8 +146,6 @@ def _follow(
                         partial.write_text(each.result.text, newline="")
                 _say(each, as_json=as_json)
             tell(following.exposures)
-    if recording.damage:
-        warn(f"{recording.path}: {recording.damage}")
     if not following.judged:
         raise IdentificationError(
             f"{recording.path} ended after {following.exposures} exposures: {WINDOW} or more that show a spot are"

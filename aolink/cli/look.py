@@ -148,7 +148,12 @@ def _first_steps(recording: "Recording") -> list[int]:
 
 @app.command(epilog="Example: aolink slopes frame.fits --reference flat.fits --pitch-m 600e-6 --focal-m 0.04 -o s.npz")
 def slopes(
-    frame: Annotated[Path, typer.Argument(metavar="FRAME", help="A Shack-Hartmann frame: .fits, .fits.gz or .npy.")],
+    frame: Annotated[
+        Path,
+        typer.Argument(
+            metavar="FRAME", help="A Shack-Hartmann frame: .fits, .fits.gz or .npy.", parser=common.local_file
+        ),
+    ],
     reference: Annotated[Path, typer.Option(metavar="FILE", help="A frame of the same camera with a flat wavefront.")],
     output: Annotated[
         Path | None, typer.Option("--output", "-o", metavar="FILE.npz", help="Write all results.")

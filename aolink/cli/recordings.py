@@ -2,7 +2,6 @@
 
 import json
 import math
-import shutil
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -12,10 +11,10 @@ import typer
 from aolink.cli import common
 from aolink.cli.common import JsonOption, OutputOption, OverwriteOption, app, open_recording, progress, stdout, warn
 from aolink.errors import RecordingError
-from aolink.files import writing
 
 if TYPE_CHECKING:
     from aolink.recording.editing import Edited
+    from aolink.recording.reader import Recording
 
 
 CutTime = Annotated[float | None, typer.Option(metavar="S", help="Seconds from the recording's start.")]
@@ -57,66 +56,40 @@ def compare(
     ] = None,
     relative: Annotated[float, typer.Option(min=0, help="Relative tolerance of numbers.")] = 1e-9,
     absolute: Annotated[float, typer.Option(min=0, help="Tolerance in a number's own unit, added.")] = 1e-12,
-    accept: Annotated[
-        bool, typer.Option("--accept", help="Where they differ, put B (or the new estimates) in A's place.")
-    ] = False,
     as_json: JsonOption = False,
 ) -> None:
     """List field by field how two recordings differ. Exit code 1 if they do.
 
     A side file is compared with the recording's own estimates by the same names.
     """
-    from tempfile import TemporaryDirectory
-
     from aolink.cli.tables import recordings as tables
     from aolink.recording import topics
     from aolink.recording.compare import compare as compare_recordings
-    from aolink.recording.reestimate import own_estimators, write_reestimated
+    from aolink.recording.compare import is_wanted
+    from aolink.recording.reestimate import Reestimated, own_estimators
     from aolink.recording.side_files import check_is_side_of
 
     one = open_recording(first)
-    if accept and topic:
-        raise typer.BadParameter(f"--accept would replace the whole of {first}, other topics too: leave --topic out")
-    own = own_estimators(one, warn) if second is None else []
-    if second is None and not own:
-        raise RecordingError(f"{first} holds no estimates to make again: give a second recording")
-    with TemporaryDirectory(prefix="aolink-") as folder:
-        if second is None:
-            second = f"{folder}/{one.path.name}"
-            with progress("estimate", one.n_frames) as tell:
-                write_reestimated(one, own, second, progress=tell, as_recorded=True)
+    if second is None:
+        two: Recording = Reestimated(one, own_estimators(one, warn))
+        if not (topic := [each for each in two.counts if is_wanted(each, topic or ())]):
+            raise RecordingError(f"{first} holds no such estimates to make again: give a second recording")
+    else:
         two = open_recording(second)
         if two.side_of and not one.side_of:
             check_is_side_of(two, one)
-            if accept:
-                raise typer.BadParameter(f"{second} is a side file, which cannot take the place of {first}")
             topic = topic or [topics.estimate_topic(name) for name in two.estimators]
-        total = sum(one.counts.values()) + sum(two.counts.values())
-        with progress("compare", total) as tell:
-            found = compare_recordings(
-                one, two, relative=relative, absolute=absolute, only=topic or (), progress=tell
-            )  # fmt: skip
-        same_rig = one.rig.digest == two.rig.digest
-        same = same_rig and all(each.same for each in found.values())
-        if as_json:
-            print(json.dumps(tables.comparison_as_json(found, same_rig=same_rig), allow_nan=False))
-        else:
-            stdout.print(tables.comparison(found))
-            if not same_rig:
-                stdout.print("the rig files differ")
-        damage = [f"{each.path}: {each.damage}" for each in (one, two) if each.damage]
-        for text in damage:
-            warn(text)
-        if accept and not same:
-            if damage:
-                raise RecordingError(f"{damage[0]}: a damaged recording is not accepted; `aolink recover` it first")
-            if not (isinstance(one.path, Path) and isinstance(two.path, Path)):
-                raise typer.BadParameter("--accept is for files of this machine, not for URLs")
-            with writing(one.path, overwrite=True, sources=[two.path], error=RecordingError) as partial:
-                shutil.copyfile(two.path, partial)
-            stdout.print(f"accepted: {first} is replaced", markup=False)
-            return
-    if not as_json:
+    total = sum(count for side in (one, two) for name, count in side.counts.items() if is_wanted(name, topic or ()))
+    with progress("compare", total) as tell:
+        found = compare_recordings(one, two, relative=relative, absolute=absolute, only=topic or (), progress=tell)
+    same_rig = one.rig.digest == two.rig.digest
+    same = same_rig and all(each.same for each in found.values())
+    if as_json:
+        print(json.dumps(tables.comparison_as_json(found, same_rig=same_rig), allow_nan=False))
+    else:
+        stdout.print(tables.comparison(found))
+        if not same_rig:
+            stdout.print("the rig files differ")
         stdout.print("the same" if same else "they differ")
     if not same:
         raise typer.Exit(1)
@@ -158,7 +131,9 @@ def cut(
 
 @app.command(epilog="Example: aolink merge session-001.mcap session-002.mcap -o session.mcap")
 def merge(
-    files: Annotated[list[Path], typer.Argument(metavar="FILE...", help="The parts of one session.")],
+    files: Annotated[
+        list[Path], typer.Argument(metavar="FILE...", help="The parts of one session.", parser=common.local_file)
+    ],
     output: OutputOption,
     overwrite: OverwriteOption = False,
     as_json: JsonOption = False,
@@ -179,6 +154,6 @@ def _print_edited(edited: "Edited", as_json: bool) -> None:
         stdout.print(f"lost: {loss.text()}", markup=False)
     stdout.print(
         f"written: {edited.path}: {edited.messages} messages, {edited.exposures} exposures"
-        + (f"; {len(edited.losses)} part(s) of the source lost" if edited.losses else ""),
+        + (f"; {sum(loss.count for loss in edited.losses)} part(s) of the source lost" if edited.losses else ""),
         markup=False,
     )

@@ -13,7 +13,7 @@ import typer
 from aolink.cli import common
 from aolink.cli.common import EstimatorOption, JsonOption, KeyOption, app, get_ready, program, progress, stdout, warn
 from aolink.cli.terminal import progress_bar
-from aolink.errors import EstimatorError
+from aolink.errors import EstimatorError, RecordingError
 from aolink.signals import Interrupted, StopRequest
 
 if TYPE_CHECKING:
@@ -193,7 +193,10 @@ def _print_session(report: "Report", output: Path, as_json: bool) -> None:
         print(json.dumps(tables.session_as_json(report), allow_nan=False), flush=True)
     else:
         stdout.print(tables.session(report))
-        written = report.files[0] if report.files else output
+        if not report.files:
+            stdout.print(f"{output}: nothing is written, {report.ended}", markup=False)
+            return
+        written = report.files[0]
         parts = f" in {len(report.files)} files" if len(report.files) > 1 else ""
         text = f"{written}: {report.exposures} exposures{parts}, {report.ended}; view it: {program()} view {written}"
         stdout.print(text, markup=False)
@@ -330,6 +333,9 @@ def _replay_to_rig(
         )  # fmt: skip
     for warning in report.warnings:
         warn(warning)
+    if not report.files:
+        stop.raise_if_asked()
+        raise RecordingError(f"{output}: nothing is written, there is nothing to compare")
     only = [row.name for row in TOPICS if row.repeatable]
     found = compare(recording, Recording(output), only=only, relative_to_start=True)
     if as_json:

@@ -19,6 +19,7 @@ import numpy as np
 
 from aolink.errors import EstimatorError
 from aolink.extensions import names_with, row_named
+from aolink.limits import check_room
 from aolink.plant.alike import MANY_STATES, alike_systems
 from aolink.rig import Rig
 
@@ -38,6 +39,8 @@ RETIRED = {"mixture": "profile"}
 and shown."""
 # Spots of one copy of the plant, by `moments`.
 _MOST_SPOTS = 128
+_LOADED_BYTES = 384 << 20
+"""Address space of the libraries and of the compiled code of an estimator. LLVM ends a process that lacks it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -103,6 +106,7 @@ def make_estimator(rig: Rig, name: str, **options: Any) -> Estimator:
     EstimatorError
         There is no such estimator or option, or it cannot work on this rig.
     """
+    check_room(_LOADED_BYTES, "making an estimator", EstimatorError)
     # Not before: whoever wants no more of a row than its colour and rank waits for none of these.
     from aolink.estimation.compiled import make_ready
     from aolink.estimation.estimator import Estimator

@@ -103,7 +103,7 @@ def compare(
         Neither recording has any of the topics; or messages without a counterpart do not fit on the disk.
     """
     wanted = [*only, *(topics.FORMER_TOPICS[each] for each in only if each in topics.FORMER_TOPICS)]
-    names = {topic for recording in (first, second) for topic in recording.counts if _is_wanted(topic, wanted)}
+    names = {topic for recording in (first, second) for topic in recording.counts if is_wanted(topic, wanted)}
     if not names:
         asked = f" of {', '.join(only)}" if only else ""
         raise RecordingError(f"there is nothing{asked} to compare in {first.path} and {second.path}")
@@ -179,7 +179,8 @@ class _Waiting:
         yield from self._file.execute("SELECT topic, name, is_first FROM kept ORDER BY number")
 
 
-def _is_wanted(topic: str, only: Sequence[str]) -> bool:
+def is_wanted(topic: str, only: Sequence[str]) -> bool:
+    """Whether a topic is one of these, as `compare` takes them."""
     return not only or any(topic == each or (each.endswith("/") and topic.startswith(each)) for each in only)
 
 
@@ -203,13 +204,16 @@ def _alternating(
 
 
 def _messages(recording: Recording, names: Sequence[str]) -> Iterator[tuple[str, Message]]:
-    """Topics and messages; messages of unknown kinds are given as bytes."""
+    """Topics and messages. Those that cannot be used are compared too, and are among the recording's losses; what
+    cannot be decoded, or is of an unknown kind, is given as bytes."""
     for raw in recording.raw_messages(*names):
-        kind = topics.SCHEMAS.get(raw.schema)
-        try:
-            yield raw.topic, kind.FromString(raw.data) if kind else BytesValue(value=raw.data)
-        except DecodeError:
-            raise RecordingError(f"{recording.path}: a message on {raw.topic} is damaged") from None
+        message = recording.decoded(raw)
+        if message is None:
+            try:
+                message = topics.SCHEMAS[raw.schema].FromString(raw.data)
+            except (DecodeError, KeyError):
+                message = BytesValue(value=raw.data)
+        yield raw.topic, message
 
 
 def _from_start(messages: Iterator[tuple[str, Message]], recording: Recording) -> Iterator[tuple[str, Message]]:

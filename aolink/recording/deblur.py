@@ -109,9 +109,9 @@ def _written(
         _score(summary, recording.rig, true_scene, exposure, estimate, done)
         progress(summary.exposures)
 
-    for raw in recording.raw_messages():
-        if raw.topic == topics.EXPOSURE:
-            frame_id = schemas_pb2.ExposureInfo.FromString(raw.data).frame_id
+    for raw, message in recording.sound_messages():
+        if raw.topic == topics.EXPOSURE and isinstance(message, schemas_pb2.ExposureInfo):
+            frame_id = message.frame_id
             # All messages that belong to the exposures before this one have gone by.
             while held is not None and held[0].frame_id < frame_id:
                 emit(*held)

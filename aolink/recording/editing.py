@@ -7,12 +7,12 @@ from __future__ import annotations
 
 import heapq
 import math
+from collections import OrderedDict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
 
-from google.protobuf.message import DecodeError
 from mcap.records import Schema
 from mcap.well_known import MessageEncoding
 
@@ -20,7 +20,7 @@ from aolink.errors import RecordingError
 from aolink.estimation import Estimate
 from aolink.exporting.common import Progress, no_progress
 from aolink.files import open_unfinished, writing
-from aolink.recording import convert, topics
+from aolink.recording import convert, schemas_pb2, topics
 from aolink.recording.lead import Lead
 from aolink.recording.mcap_file import McapFile, WriteOptions, schema_of
 from aolink.recording.messages import RawMessage, in_time
@@ -77,7 +77,7 @@ class RecordingCopy:
     def add(self, message: RawMessage) -> None:
         schema = self._schemas.get(message.schema) or self._schema(message.schema)
         self.messages += 1
-        self.exposures += message.topic == topics.EXPOSURE
+        self.exposures += message.topic == topics.IMAGE
         encoding = self._encodings.get(message.topic, MessageEncoding.Protobuf)
         self._file.add(message.topic, schema, message.data, message.log_time_ns, self.messages, encoding)
 
@@ -131,7 +131,8 @@ def recover(source: Path, target: Path, *, overwrite: bool = False, progress: Pr
     if not recording.counts:
         raise RecordingError(f"{source} holds no whole message: there is nothing to recover")
     notes = recording.metadata | {"recovered_from": source.name}
-    return _copied([recording], target, recording.raw_messages(), notes, overwrite, progress)
+    messages = (raw for raw, _ in recording.sound_messages())
+    return _copied([recording], target, messages, notes, overwrite, progress)
 
 
 def cut(
@@ -189,7 +190,7 @@ def merge(
 
 def _begun(recording: Recording) -> dict[str, str]:
     """Facts from the session's start, without the number of the part."""
-    later = recording.end_metadata.keys() | {"part"}
+    later = recording.end_metadata.keys() | {topics.PART, topics.PART_OF}
     return {name: value for name, value in recording.metadata.items() if name not in later}
 
 
@@ -212,25 +213,17 @@ def _copied(
             progress(copy.exposures)
         if nothing and not copy.exposures:
             raise RecordingError(nothing)
-        copy.finish(first.losses, end)
-    return Edited(target, copy.messages, copy.exposures, [loss for each in recordings for loss in each.losses])
-
-
-def _decoded(message: RawMessage) -> Any:
-    """A message that has what its row of the table says; None of a kind that aolink does not know."""
-    kind = topics.SCHEMAS.get(message.schema)
-    try:
-        return kind.FromString(message.data) if kind else None
-    except DecodeError:
-        raise RecordingError(f"a message on {message.topic} is damaged: `aolink recover` leaves it out") from None
+        losses = [loss for each in recordings for loss in each.losses]
+        copy.finish(losses, end)
+    return Edited(target, copy.messages, copy.exposures, losses)
 
 
 def _between(recording: Recording, low: int, high: int) -> Iterator[RawMessage]:
     lead, frames = Lead(), set[int]()
     wanted: set[str] = set()  # pictures that belong to an exposure between the two
     last_step = -1
-    for raw in recording.raw_messages():
-        message = _decoded(raw)
+    message: Any  # it has what its row of the table says
+    for raw, message in recording.sound_messages():
         row = topics.find(raw.topic, message)
         inside = low <= raw.log_time_ns < high
         if raw.topic in topics.PICTURES:
@@ -260,17 +253,18 @@ def _between(recording: Recording, low: int, high: int) -> Iterator[RawMessage]:
 
 
 def _joined(recordings: Sequence[Recording]) -> Iterator[RawMessage]:
-    recent: dict[tuple[str, int, bytes], int] = {}
+    recent: OrderedDict[tuple[str, int, bytes], int] = OrderedDict()  # its first key is found at once, unlike a dict's
     frames: dict[int, int] = {}
-    for key, raw in heapq.merge(*(in_time(each.raw_messages()) for each in recordings), key=lambda each: each[0]):
+    sound = ((raw for raw, _ in each.sound_messages()) for each in recordings)
+    for key, raw in heapq.merge(*map(in_time, sound), key=lambda each: each[0]):
         name = (raw.topic, raw.log_time_ns, raw.data)
         if name in recent:
             continue
-        if len(recent) > 100 and recent[next(iter(recent))] < key - _ALIKE_NS:
-            recent = {each: time for each, time in recent.items() if time >= key - _ALIKE_NS}
+        while recent and recent[next(iter(recent))] < key - _ALIKE_NS:
+            recent.popitem(last=False)
         recent[name] = key
-        if raw.topic == topics.EXPOSURE and (message := _decoded(raw)) is not None:
-            frame_id = message.frame_id
+        if raw.topic == topics.EXPOSURE and raw.schema == schemas_pb2.ExposureInfo.DESCRIPTOR.full_name:
+            frame_id = schemas_pb2.ExposureInfo.FromString(raw.data).frame_id
             if frame_id in frames:
                 raise RecordingError(
                     f"frame {frame_id} is in two of the recordings, but not the same: nothing to merge"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterator, Sequence
-from itertools import count
 
 from google.protobuf.message import Message
 
@@ -19,29 +18,28 @@ class EstimatePairs:
 
     Parameters
     ----------
-    first:
-        Number of the first exposure that will be complete.
     start, stop:
         Numbers of the exposures that are wanted, from the former to below the latter; None: to the last.
     """
 
-    def __init__(self, first: int, start: int, stop: int | None) -> None:
-        self._numbers, self._start, self._stop = count(first), start, stop
+    def __init__(self, start: int, stop: int | None) -> None:
+        self._start, self._stop = start, stop
         self._exposures: dict[int, Exposure] = {}
         self._waiting: deque[schemas_pb2.Estimate] = deque()
         self._all_came = False
         self._last_paired = -1
 
     def take(
-        self, received: Message | None, completed: Sequence[Exposure]
+        self, received: Message | None, completed: Sequence[tuple[int, Exposure]]
     ) -> Iterator[tuple[schemas_pb2.Estimate, Exposure]]:
-        """The pairs that are there with a message and the exposures that it completes; None at the recording's end."""
+        """The pairs that are there with a message and the exposures that it completes, with their numbers; None at the
+        recording's end."""
         exposures, waiting = self._exposures, self._waiting
         if isinstance(received, schemas_pb2.Estimate):
             waiting.append(received)
         elif isinstance(received, schemas_pb2.Estimation) and received.skipped:
             exposures.pop(received.frame_id, None)
-        for exposure, number in zip(completed, self._numbers, strict=False):
+        for number, exposure in completed:
             self._all_came = self._stop is not None and number >= self._stop - 1
             if self._start <= number and (self._stop is None or number < self._stop):
                 exposures[exposure.frame_id] = exposure

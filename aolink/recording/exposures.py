@@ -20,27 +20,43 @@ from aolink.wire.runs_pb2 import Run
 
 
 class ExposureAssembly:
-    """Assembles exposures from the messages of a recording, as the session did."""
+    """Assembles exposures from the messages of a recording, as the session did.
 
-    def __init__(self, rig: Rig) -> None:
+    Parameters
+    ----------
+    before:
+        Number of frames before the first message that it will take.
+    """
+
+    def __init__(self, rig: Rig, before: int = 0) -> None:
         self._assembler = Assembler(rig)
         self._info: schemas_pb2.ExposureInfo | None = None
+        self._number, self._is_frame = before, False
+        self._numbers: dict[int, int] = {}
+        """Numbers of the frames whose exposures have not been asked for, by frame id."""
 
-    def take(self, topic: str, message: Message) -> list[Exposure]:
-        """Take any message; gives the exposures that are complete with it."""
+    def take(self, topic: str, message: Message | None) -> list[Exposure]:
+        """Take any message, None for one that cannot be used; gives the exposures that are complete with it."""
         if topic == topics.IMAGE:
-            if isinstance(message, RawImage) and self._info is not None:
-                info, self._info = self._info, None
+            info, self._info = self._info, None
+            number, self._number = self._number, self._number + self._is_frame
+            self._is_frame = False
+            if isinstance(message, RawImage) and info is not None:
+                self._numbers[info.frame_id] = number
                 return self._assembler.add_frame(convert.frame_from_messages(info, message))
         elif topic == topics.EXPOSURE:
-            if isinstance(message, schemas_pb2.ExposureInfo):
-                self._info = message
+            # The picture of a frame whose facts are lost does not belong to the frame before.
+            self._info, self._is_frame = message if isinstance(message, schemas_pb2.ExposureInfo) else None, True
         elif topic == topics.APPLIED:
             if isinstance(message, (Run, wire.Applied)):
                 return self._assembler.add_applied(message)
         elif topic == topics.COMMAND and isinstance(message, (Run, wire.CommandBlock)):
             self._assembler.add_command(message)
         return []
+
+    def number(self, exposure: Exposure) -> int:
+        """The number of an exposure among the frames, those that cannot be used included; to be asked for once."""
+        return self._numbers.pop(exposure.frame_id, self._number)
 
     def flush(self) -> list[Exposure]:
         """Exposures that were still incomplete when the recording ended."""
@@ -65,15 +81,18 @@ class Companions:
         self._waiting.extend(exposures)
         return self._ready()
 
-    def take(self, topic: str, message: Message) -> list[Exposure]:
-        """Take a message that belongs to an exposure; gives exposures as `add` does."""
+    def take(self, topic: str, message: Message | None) -> list[Exposure]:
+        """Take a message that belongs to an exposure, None for one that cannot be used; gives exposures as `add`
+        does."""
         if isinstance(message, wire.Truth):
             self._truths[message.frame_id] = convert.truth_from_message(message)
-        elif topic == topics.SCENE_EXPOSURE and isinstance(message, schemas_pb2.ExposureInfo):
-            self._info = message
-        elif topic == topics.SCENE and isinstance(message, RawImage) and self._info is not None:
-            frame = convert.frame_from_messages(self._info, message)
-            self._scenes[frame.frame_id], self._info = Picture(pixels=frame.pixels, mask=frame.mask), None
+        elif topic == topics.SCENE_EXPOSURE:
+            self._info = message if isinstance(message, schemas_pb2.ExposureInfo) else None
+        elif topic == topics.SCENE:
+            info, self._info = self._info, None
+            if isinstance(message, RawImage) and info is not None:
+                frame = convert.frame_from_messages(info, message)
+                self._scenes[frame.frame_id] = Picture(pixels=frame.pixels, mask=frame.mask)
         return self._ready()
 
     def flush(self) -> list[Exposure]:

@@ -8,8 +8,6 @@ from dataclasses import asdict
 from datetime import UTC, datetime
 from typing import Any
 
-from google.protobuf.message import DecodeError
-
 from aolink.estimation import Status
 from aolink.estimation.score import UnusedCounter
 from aolink.recording import topics
@@ -87,21 +85,18 @@ def _gaps_estimates_answers(recording: Recording) -> tuple[dict[str, float], dic
     names = recording.estimators
     counts, unused = dict.fromkeys(names, 0), {name: UnusedCounter() for name in names}
     answers = AnswerCounter()
-    of_mirror = (topics.ANSWER, topics.APPLIED) if topics.ANSWER in recording.counts else ()
-    for raw in recording.raw_messages(topics.EXPOSURE, *of_mirror, *map(topics.estimate_topic, names)):
-        if topics.RUNS.get(raw.topic) == raw.schema:  # without looking at its inputs, which may be thousands
-            with contextlib.suppress(DecodeError):
-                answers.applied(Applied.FromString(raw.data))
-            continue
-        message = recording.decoded(raw)
+    for recorded in recording.messages():  # all of them, because one that cannot be used is found when it is read
+        message = recorded.message
         if isinstance(message, CommandAnswer):
             answers.answered(message)
+        elif isinstance(message, Applied):
+            answers.applied(message)
         elif isinstance(message, ExposureInfo):
             if last is not None and message.first_step - last != period:
                 gaps.append(message.first_step - last - period)
             last = message.first_step
         elif isinstance(message, EstimateMessage):
-            name = raw.topic.removeprefix(topics.ESTIMATE)
+            name = recorded.topic.removeprefix(topics.ESTIMATE)
             counts[name] += 1
             with contextlib.suppress(ValueError):  # a status of a later aolink
                 unused[name].add(Status(message.status), message.reason, message.frame_id)
@@ -118,7 +113,7 @@ def _losses(recording: Recording) -> dict[str, int]:
         if value.isdigit() and int(value):
             counted[name] = int(value)
     if recording.losses:
-        counted["parts_of_the_file"] = len(recording.losses)
+        counted["parts_of_the_file"] = sum(loss.count for loss in recording.losses)
     return counted
 
 

@@ -72,8 +72,11 @@ class GrowingRecording(Recording):
 
     def _written(self, path: Path) -> Iterator[McapRecord]:
         """The records of the file, those in chunks too, as they are written."""
-        while path.exists() and path.stat().st_size < len(MAGIC) and _is_being_written(path):
-            self._wait()  # the session has only just begun
+        # The session may have only just begun: an old file is in its place until the first exposure.
+        while files.is_being_replaced(path) or (
+            path.exists() and path.stat().st_size < len(MAGIC) and _is_being_written(path)
+        ):
+            self._wait()
         with open_recording(path) as file:
             position, ended, written = len(MAGIC), False, True
             while not ended:

@@ -99,15 +99,13 @@ class McapFile:
     Raises
     ------
     RecordingError
-        The file exists and not ``overwrite``, another command is writing it, or it cannot be created.
+        The file exists, another command is writing it, or it cannot be created.
     """
 
-    def __init__(
-        self, path: Path, options: WriteOptions, *, overwrite: bool = False, descriptor: int | None = None
-    ) -> None:
+    def __init__(self, path: Path, options: WriteOptions, *, descriptor: int | None = None) -> None:
         self.path = path
         if descriptor is None:
-            descriptor = files.create(path, overwrite=overwrite, error=RecordingError)
+            descriptor = files.create(path, error=RecordingError).descriptor
         self._file = _File(descriptor)
         self._flush_ns = round(options.flush_s * 1e9)
         self._writer = Writer(

@@ -14,6 +14,7 @@ from google.protobuf.message import Message
 from mcap.records import Attachment, Channel, ChunkIndex, McapRecord, Metadata, Schema
 from mcap.records import Message as McapMessage
 
+from aolink.errors import RecordingError
 from aolink.limits import Budget, exceeded, limits
 from aolink.recording import topics
 from aolink.recording.mcap_file import unsealed
@@ -88,6 +89,7 @@ class RecordedMessages:
         self.left_out: frozenset[str] = frozenset()
         """Topics that are read from side files instead."""
         self._second_rig_text: str | None = None
+        self._attached_bytes = 0
         self.rig_text = self.survey(check=check)
         """The text of the rig file; None where the file has none."""
 
@@ -100,7 +102,7 @@ class RecordedMessages:
     def damage(self) -> str:
         """The reason why the file cannot be read whole, in words; empty where it can."""
         losses = self.losses
-        more = f" and {len(losses) - 1} more" if len(losses) > 1 else ""
+        more = f" and {count} more" if (count := sum(each.count for each in losses[1:])) else ""
         return f"{losses[0].what}{more}" if losses else ""
 
     @property
@@ -193,16 +195,17 @@ class RecordedMessages:
         """Read the attachments and metadata that the index names, and check that they are undamaged."""
         for record in (*summary.schemas.values(), *summary.channels.values()):
             yield record, True
-        others = sorted(summary.others, key=lambda each: each.offset)
+        others, budget = sorted(summary.others, key=lambda each: each.offset), Budget(str(self.path), self.size)
         with open_recording(self.path, [(each.offset, each.length) for each in others]) as file:
             for each in others:
-                if (found := record_at(file, each, self.lose)) is not None:
+                if (found := record_at(file, each, self.lose, budget)) is not None:
                     yield found, True
 
     def _attach(self, record: Attachment) -> None:
         self.attachments[record.name] = record.data
-        if (held := sum(map(len, self.attachments.values()))) > limits().attachment_bytes:
-            raise exceeded(f"{self.path} holds attachments of {held} bytes", "attachment_bytes")
+        self._attached_bytes += len(record.data)
+        if self._attached_bytes > limits().attachment_bytes:
+            raise exceeded(f"{self.path} holds attachments of {self._attached_bytes} bytes", "attachment_bytes")
 
     def add_channel(self, number: int, topic: str, schema: str) -> str:
         """Keep a channel of the file by the present names of its topic and its schema. Gives the topic's name."""
@@ -251,6 +254,20 @@ class RecordedMessages:
     def lose(self, loss: Loss) -> None:
         """Add to `losses`; of several at one place, the first counts."""
         self.lost.setdefault(loss.offset, loss)
+
+
+def first_facts(path: Path) -> dict[str, str]:
+    """The facts from a session's start; none where a file is no recording, or they are damaged."""
+    try:
+        with open_recording(path) as file:
+            for record, in_chunk in scan(file, lambda loss: None):
+                if in_chunk:
+                    break  # they come before all messages
+                if isinstance(record, Metadata) and record.name == topics.SESSION_METADATA:
+                    return next(unsealed([record]))[1] or {}
+    except RecordingError:
+        pass
+    return {}
 
 
 def in_time(messages: Iterator[RawMessage]) -> Iterator[tuple[int, RawMessage]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import heapq
+from collections import deque
 from collections.abc import Iterator, Sequence
 from functools import cached_property, lru_cache
 from itertools import islice
@@ -86,6 +87,9 @@ class Recording(RecordedMessages, NumberedSeries):
         self.rig: Rig = rig or recorded_rig
         self.rig_is_recorded = self.rig.toml == rig_text
         """Whether ``rig`` is the one in the file, so that the estimates in the file can be read with it."""
+        self._side: list[Recording] = []
+        if check:
+            deque(self.sound_messages(), maxlen=0)
         self._side = [Recording(each, check=check) for each in side]
         if self._side:
             self._take_side(rig)
@@ -98,7 +102,7 @@ class Recording(RecordedMessages, NumberedSeries):
         for (topic, wrong), messages in self._unusable.items():
             times = [time_ns for _, time_ns in messages]
             what = f"{len(messages)} message(s) on {topic} {wrong}"
-            found.append(Loss(0, sum(messages.values()), what, min(times), max(times)))
+            found.append(Loss(0, sum(messages.values()), what, min(times), max(times), len(messages)))
         return found + [loss for each in self._side for loss in each.losses]
 
     @property
@@ -151,11 +155,18 @@ class Recording(RecordedMessages, NumberedSeries):
             message = kind.FromString(raw.data)
         except DecodeError:
             message = None
-        if message is None or (wrong := what_is_wrong(message, self.rig)):
+        if message is None or (wrong := what_is_wrong(message, self.rig, raw.topic)):
             what = "cannot be decoded" if message is None else f"cannot be used: {wrong}"
             self._unusable.setdefault((raw.topic, what), {})[raw.sequence, raw.log_time_ns] = len(raw.data)
             return None
         return message
+
+    def sound_messages(self) -> Iterator[tuple[RawMessage, Message | None]]:
+        """All messages as bytes, each with its decoded message, which is None if aolink does not know the kind. Those
+        that cannot be used are left out, as losses."""
+        for raw in self.raw_messages():
+            if (message := self.decoded(raw)) is not None or raw.schema not in topics.SCHEMAS:
+                yield raw, message
 
     def decoded_run(self, raw: RawMessage) -> Run | None:
         """A command or a report of the mirror, with its inputs as bytes; None for another message, or one of another
@@ -211,21 +222,29 @@ class Recording(RecordedMessages, NumberedSeries):
         """
         if stop is not None and stop <= start:
             return iter(())
-        chunk, before = self._beginning(start)
-        exposures = (exposure for _, exposure in self.timed_exposures(chunk))
-        return islice(exposures, start - before, None if stop is None else stop - before)
+        return self._between(start, END_OF_TIME if stop is None else stop)
 
-    def timed_exposures(self, first_chunk: int = 0) -> Iterator[tuple[int, Exposure]]:
-        """The exposures as by `exposures`, each after the log time of the message that completed it, ns.
+    def _between(self, start: int, stop: int) -> Iterator[Exposure]:
+        for number, _, exposure in self._numbered(*self._beginning(start)):
+            if start <= number < stop:
+                yield exposure
+            if number >= stop - 1:
+                return
+
+    def timed_exposures(self) -> Iterator[tuple[int, Exposure]]:
+        """The exposures as by `exposures`, each after the log time of the message that completed it, ns."""
+        return ((time_ns, exposure) for _, time_ns, exposure in self._numbered())
+
+    def _numbered(self, first_chunk: int = 0, before: int = 0) -> Iterator[tuple[int, int, Exposure]]:
+        """The exposures, each after its number and the log time of the message that completed it, ns.
 
         With ``first_chunk``, only those that the messages of that chunk and of later ones complete, in a file with an
-        index.
+        index; ``before`` is the number of frames before that chunk.
         """
         now = 0
-        assembly, beside = ExposureAssembly(self.rig), Companions(self.counts)
+        assembly, beside = ExposureAssembly(self.rig, before), Companions(self.counts)
         for raw in self.raw_messages(*_ASSEMBLED, *_BESIDE, first_chunk=first_chunk):
-            if (message := self.decoded_run(raw) or self.decoded(raw)) is None:
-                continue
+            message = self.decoded_run(raw) or self.decoded(raw)
             now = raw.log_time_ns
             if raw.topic in _BESIDE:
                 whole = beside.take(raw.topic, message)
@@ -234,9 +253,9 @@ class Recording(RecordedMessages, NumberedSeries):
             else:
                 continue
             for exposure in whole:
-                yield now, exposure
+                yield assembly.number(exposure), now, exposure
         for exposure in (*beside.add(assembly.flush()), *beside.flush()):
-            yield now, exposure
+            yield assembly.number(exposure), now, exposure
 
     def _beginning(self, number: int) -> tuple[int, int]:
         """The chunk to read from so that an exposure is the same as if read from the file's start, and the number of
@@ -258,10 +277,11 @@ class Recording(RecordedMessages, NumberedSeries):
             reach = {topics.APPLIED: info.first_step, topics.COMMAND: info.first_step - self.rig.mirror.queue_steps}
             reach = {topic: step for topic, step in reach.items() if self.counts.get(topic)}
             chunk = index.first_chunk(first, reach, self._runs_in)
-            known = next(islice(self.timed_exposures(chunk), first - index.before[chunk], None), None)
+            found = self._numbered(chunk, index.before[chunk])
+            known = next((each for each in found if each[0] >= first), None)
             if known is None:
                 break
-            if not known[1].inputs_assumed:
+            if known[0] == first and not known[2].inputs_assumed:
                 return chunk, index.before[chunk]
             back *= 2
         return 0, 0
@@ -321,25 +341,28 @@ class Recording(RecordedMessages, NumberedSeries):
         """
         if stop is not None and stop <= start:
             return
-        chunk, before = self._beginning(start)
-        pairs = EstimatePairs(before, start, stop)
-        for received, completed in self._beside_exposures(name, chunk):
+        pairs = EstimatePairs(start, stop)
+        for received, completed in self._beside_exposures(name, *self._beginning(start)):
             for message, exposure in pairs.take(received, completed):
                 yield convert.estimate_from_message(message, self.model, exposure)
             if pairs.complete:
                 return
 
-    def _beside_exposures(self, name: str, first_chunk: int) -> Iterator[tuple[Message | None, list[Exposure]]]:
-        """Messages of exposures and of an estimator, each with the exposures that it completes.
+    def _beside_exposures(
+        self, name: str, first_chunk: int, before: int
+    ) -> Iterator[tuple[Message | None, list[tuple[int, Exposure]]]]:
+        """Messages of exposures and of an estimator, each with the exposures that it completes and their numbers.
 
         The exposures that were incomplete when the recording ended come last, with None.
         """
-        assembly = ExposureAssembly(self.rig)
+        assembly = ExposureAssembly(self.rig, before)
         wanted = (topics.estimate_topic(name), topics.estimation_topic(name), *_ASSEMBLED)
         for raw in self.raw_messages(*wanted, first_chunk=first_chunk):
-            if (message := self.decoded(raw)) is not None:
-                yield message, assembly.take(raw.topic, message)
-        yield None, assembly.flush()
+            message = self.decoded(raw)
+            completed = assembly.take(raw.topic, message)
+            if message is not None:
+                yield message, [(assembly.number(each), each) for each in completed]
+        yield None, [(assembly.number(each), each) for each in assembly.flush()]
 
     def _take_side(self, rig: Rig | None) -> None:
         """Put the estimates of side files in the place of the file's own."""

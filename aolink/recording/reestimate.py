@@ -18,7 +18,7 @@ from aolink.files import writing
 from aolink.recording import schemas_pb2, topics
 from aolink.recording.editing import RecordingCopy, recorded_estimate
 from aolink.recording.exposures import ExposureAssembly
-from aolink.recording.messages import RawMessage
+from aolink.recording.messages import END_OF_TIME, RawMessage
 from aolink.recording.reader import Recording
 from aolink.recording.side_files import check_stands_alone
 
@@ -57,6 +57,25 @@ def reestimated(
     for number, done in enumerate(driver.steps(recording.exposures()), 1):
         yield done
         progress(number)
+
+
+class Reestimated(Recording):
+    """The estimates that a recording has, made again each time they are read: `compare` takes it as a second recording,
+    and nothing is written. An estimator skips the exposures that it had no time for in the session.
+    """
+
+    def __init__(self, recording: Recording, names: Iterable[str]) -> None:
+        super().__init__(recording.path)
+        self._source = recording
+        self.counts = {topics.estimate_topic(name): recording.n_frames for name in names}
+
+    def raw_messages(
+        self, *wanted: str, start_ns: int = 0, end_ns: int = END_OF_TIME, first_chunk: int = 0
+    ) -> Iterator[RawMessage]:
+        names = [topic.removeprefix(topics.ESTIMATE) for topic in wanted or self.counts]
+        for exposure, estimates in reestimated(self._source, names, as_recorded=True):
+            for estimate in estimates:
+                yield recorded_estimate(estimate, exposure.host_receive_ns)
 
 
 def own_estimators(recording: Recording, say: Callable[[str], None]) -> list[str]:
@@ -126,14 +145,13 @@ def check_has_exposures(recording: Recording) -> None:
 
 def write_reestimated(
     recording: Recording, names: Sequence[str], path: str | Path, *, only: bool = False, overwrite: bool = False,
-    progress: Progress = no_progress, engine: Engine = "aolink", as_recorded: bool = False,
+    progress: Progress = no_progress, engine: Engine = "aolink",
 ) -> None:  # fmt: skip
     """Copy a recording with new estimates.
 
     Estimates by other names, and pictures restored with them, stay in the copy, unless ``only``; those that were made
     with another rig than ``recording.rig`` could not be read in it and are left out. Messages of other software are
-    copied unchanged. The same recording and the same version of aolink give the same bytes. With ``as_recorded``
-    estimators skip the exposures that they had no time for in the session.
+    copied unchanged. The same recording and the same version of aolink give the same bytes.
 
     Raises
     ------
@@ -141,12 +159,12 @@ def write_reestimated(
         ``path`` exists and not ``overwrite``, or cannot be written.
     """
     with writing(Path(path), overwrite=overwrite, sources=recording.files, error=RecordingError) as partial:
-        fill_reestimated(recording, names, partial, only, progress, engine, as_recorded)
+        fill_reestimated(recording, names, partial, only, progress, engine)
 
 
 def fill_reestimated(
     recording: Recording, names: Sequence[str], path: Path, only: bool = False, progress: Progress = no_progress,
-    engine: Engine = "aolink", as_recorded: bool = False,
+    engine: Engine = "aolink",
 ) -> None:  # fmt: skip
     """Write the content of `write_reestimated` into an empty file that is there already. Raises OSError for errors of
     the disk."""
@@ -159,11 +177,8 @@ def fill_reestimated(
     }
     if engine != "aolink":
         notes["engine"] = engine
-    skipped = skipped_by(recording, names) if as_recorded else None
-    # The copy says which exposures a session had no time for, if its estimates skip them as well.
-    with_skips = [*kept, *(names if as_recorded else ())]
     with RecordingCopy(recording, path, notes) as copy:
-        for some in _with_estimates(recording, Driver(recording.rig, names, engine, skipped), kept, with_skips):
+        for some in _with_estimates(recording, Driver(recording.rig, names, engine), kept):
             copy.add(some)
             progress(copy.exposures)
         copy.finish(recording.losses)
@@ -176,13 +191,9 @@ def kept_estimators(recording: Recording, names: Sequence[str], *, only: bool) -
     return [name for name in recording.estimators if name not in names]
 
 
-def _without_old_estimates(
-    recording: Recording, kept: Sequence[str], with_skips: Sequence[str]
-) -> Iterator[RawMessage]:
-    """The messages of a recording, with the estimates and restored pictures of the estimators ``kept`` only.
-
-    Only the estimators ``with_skips`` keep their messages about skipped exposures.
-    """
+def _without_old_estimates(recording: Recording, kept: Sequence[str]) -> Iterator[RawMessage]:
+    """The messages of a recording, with the estimates, skipped exposures and restored pictures of the estimators
+    ``kept`` only."""
     restored_with = ""
     for raw in recording.raw_messages():
         if raw.topic == topics.RESTORATION:  # it comes before its pictures
@@ -192,23 +203,21 @@ def _without_old_estimates(
             continue
         if raw.topic.startswith(topics.ESTIMATE) and raw.topic.removeprefix(topics.ESTIMATE) not in kept:
             continue
-        if raw.topic.startswith(topics.ESTIMATION) and raw.topic.removeprefix(topics.ESTIMATION) not in with_skips:
+        if raw.topic.startswith(topics.ESTIMATION) and raw.topic.removeprefix(topics.ESTIMATION) not in kept:
             continue
         yield raw
 
 
-def _with_estimates(
-    recording: Recording, driver: Driver, kept: Sequence[str], with_skips: Sequence[str]
-) -> Iterator[RawMessage]:
+def _with_estimates(recording: Recording, driver: Driver, kept: Sequence[str]) -> Iterator[RawMessage]:
     """The messages of a recording with new estimates after their exposures, and the old estimates of ``kept``."""
     assembly = ExposureAssembly(recording.rig)
     waiting: list[tuple[RawMessage, list[Exposure]]] = []
     exposures = size = 0
-    for raw in _without_old_estimates(recording, kept, with_skips):
+    for raw in _without_old_estimates(recording, kept):
         message = recording.decoded_run(raw) or recording.decoded(raw)
+        completed = assembly.take(raw.topic, message)
         if message is None and raw.schema in topics.SCHEMAS:
-            continue  # it is one of the losses
-        completed = assembly.take(raw.topic, message) if message is not None else []
+            continue  # it is one of the losses, and completes nothing
         waiting.append((raw, completed))
         exposures, size = exposures + len(completed), size + len(raw.data)
         if exposures >= _AT_ONCE or size >= _BYTES_AT_ONCE:

@@ -54,6 +54,10 @@ _PARSERS: dict[int, Callable[[ReadDataStream], McapRecord]] = {
     Opcode.FOOTER: kinds.Footer.read,
 }
 """The kinds of records that are parsed; message indexes and others are skipped."""
+_COSTS = dict.fromkeys(_PARSERS, 128) | {Opcode.MESSAGE: 1, Opcode.CHUNK: 32, Opcode.CHUNK_INDEX: 32}
+"""How many messages a record counts as, by its kind; 8 for any other. There are few of those that take long to read."""
+_LARGE = (Opcode.MESSAGE, Opcode.CHUNK, Opcode.CHUNK_INDEX, Opcode.ATTACHMENT)
+"""The kinds of records that are read and have limits of their own; those of the others together is the same."""
 
 # What the mcap library and the decompressors raise on content that is damaged.
 _DAMAGE = (McapError, struct.error, RuntimeError, ValueError, OverflowError, EOFError, KeyError, zstandard.ZstdError)
@@ -72,6 +76,8 @@ class Loss:
     start_ns: int = 0
     """Log times of the messages that were in it, as far as is known; 0 where it is not."""
     end_ns: int = 0
+    count: int = 1
+    """Number of losses that it stands for: it may stand for several messages that are wrong in the same way."""
 
     def text(self) -> str:
         """The loss in words."""
@@ -163,10 +169,10 @@ def read_summary(file: IO[bytes]) -> Summary | None:
     data = file.read(end - start)
     if crc and zlib.crc32(tail[: HEAD.size + 16], zlib.crc32(data)) != crc:
         return None
-    return _parse_summary(data)
+    return _parse_summary(data, Budget(_name(file), size))
 
 
-def _parse_summary(data: bytes) -> Summary | None:
+def _parse_summary(data: bytes, budget: Budget) -> Summary | None:
     summary = Summary(digest=hashlib.sha256(data).hexdigest())
     records: list[McapRecord] = []
     position = 0
@@ -174,6 +180,7 @@ def _parse_summary(data: bytes) -> Summary | None:
         while position < len(data):
             opcode, length = HEAD.unpack_from(data, position)
             position += HEAD.size
+            _charge(budget, opcode, length)
             if opcode == Opcode.CHUNK_INDEX:
                 records.append(_chunk_index(data[position : position + length]))
             elif opcode in _PARSERS:
@@ -228,7 +235,7 @@ def scan(file: IO[bytes], on_loss: Callable[[Loss], None]) -> Iterator[tuple[Mca
     position = len(MAGIC)
     search, before = Search(file, size), 0
     whole_end: bool | None = None
-    readings, budget = _MOST_READINGS * size, Budget(str(getattr(file, "name", "the file")), size)
+    readings, budget = _MOST_READINGS * size, Budget(_name(file), size)
     while position < size:
         opcode, length = _head_at(file, position)
         end = position + HEAD.size + length
@@ -242,7 +249,7 @@ def scan(file: IO[bytes], on_loss: Callable[[Loss], None]) -> Iterator[tuple[Mca
             position, before = found, 0
             continue
         lost: list[Loss] = []
-        record = _record_at(file, position, lost.append)
+        record = _record_at(file, position, lost.append, budget)
         if lost:
             # Its length may be wrong, and the bytes that it covers may hold whole chunks. Searching for them costs
             # another reading: a file that was made to waste time gets a few.
@@ -252,7 +259,6 @@ def scan(file: IO[bytes], on_loss: Callable[[Loss], None]) -> Iterator[tuple[Mca
         elif isinstance(record, Chunk):
             yield from ((each, True) for each in broken_up(record, position, lose, budget))
         elif record is not None:
-            budget.take_records(1)
             yield record, False
         if opcode == Opcode.DATA_END:
             whole_end = read_summary(file) is not None if whole_end is None else whole_end
@@ -282,7 +288,7 @@ def grown(file: IO[bytes], position: int, on_loss: Callable[[Loss], None]) -> tu
     RecordingError
         The bytes there are not a valid record, or are no longer there.
     """
-    size, name = file.seek(0, os.SEEK_END), str(getattr(file, "name", "the file"))
+    size, name = file.seek(0, os.SEEK_END), _name(file)
     if size < position:
         raise RecordingError(f"{name} has become shorter while it was read: it was cut or replaced; begin again")
     opcode, length = _head_at(file, position)
@@ -291,9 +297,9 @@ def grown(file: IO[bytes], position: int, on_loss: Callable[[Loss], None]) -> tu
         return position, [], False
     if not is_plausible(opcode, length, file, 0):
         raise RecordingError(f"{name} makes no sense at byte {position}: `aolink recover` copies what is whole")
-    record = _record_at(file, position, on_loss)
+    record = _record_at(file, position, on_loss, budget := Budget(name, size))
     if isinstance(record, Chunk):
-        return end, list(broken_up(record, position, on_loss, Budget(name, size))), False
+        return end, list(broken_up(record, position, on_loss, budget)), False
     return end, [] if record is None else [record], opcode == Opcode.DATA_END
 
 
@@ -317,19 +323,19 @@ def chunk_at(
     if opcode != Opcode.CHUNK or length > limits().record_bytes:
         on_loss(_chunk_loss(index.chunk_start_offset, index.chunk_length, index))
         return
-    record = _record_at(file, index.chunk_start_offset, on_loss)
+    record = _record_at(file, index.chunk_start_offset, on_loss, budget)
     if isinstance(record, Chunk):
         yield from broken_up(record, index.chunk_start_offset, on_loss, budget)
 
 
 def record_at(
-    file: IO[bytes], index: AttachmentIndex | MetadataIndex, on_loss: Callable[[Loss], None]
+    file: IO[bytes], index: AttachmentIndex | MetadataIndex, on_loss: Callable[[Loss], None], budget: Budget
 ) -> McapRecord | None:
     """An attachment or metadata that the summary names; None, and a loss, if it is damaged."""
     kind = Opcode.ATTACHMENT if isinstance(index, AttachmentIndex) else Opcode.METADATA
     opcode, length = _head_at(file, index.offset)
     if opcode == kind and length <= limits().record_bytes:
-        return _record_at(file, index.offset, on_loss)
+        return _record_at(file, index.offset, on_loss, budget)
     on_loss(Loss(index.offset, index.length, f"the {kind.name.lower()} {index.name!r} is damaged"))
     return None
 
@@ -337,20 +343,22 @@ def record_at(
 def broken_up(chunk: Chunk, offset: int, on_loss: Callable[[Loss], None], budget: Budget) -> Iterator[McapRecord]:
     """The records in a chunk, one by one; none if it is damaged."""
     try:
-        data, count = _decompressed(chunk, budget), 0
+        data, cost = _decompressed(chunk, budget), 0
         if chunk.uncompressed_crc and zlib.crc32(data) != chunk.uncompressed_crc:
             raise ValueError("checksum")
-        for count, (opcode, at, length) in enumerate(_heads(data), 1):
-            if count > budget.records:
+        for opcode, at, length in _heads(data):
+            cost += _COSTS.get(opcode, 8)
+            if cost > budget.records:
                 break
             if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+                budget.take_description(length)
                 _parsed(opcode, data[at : at + length])
             elif opcode == Opcode.MESSAGE and length < MESSAGE_HEAD.size:
                 raise ValueError("a message without its times")
     except _DAMAGE:
         on_loss(_chunk_loss(offset, HEAD.size + len(chunk.data), chunk))
         return
-    budget.take_records(count)
+    budget.take_records(cost)
     for opcode, at, length in _heads(data):
         if opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE):
             yield _parsed(opcode, data[at : at + length])
@@ -393,9 +401,21 @@ def _head_at(file: IO[bytes], position: int) -> tuple[int, int]:
     return HEAD.unpack(head) if len(head) == HEAD.size else (0, 0)
 
 
-def _record_at(file: IO[bytes], position: int, on_loss: Callable[[Loss], None]) -> McapRecord | None:
+def _name(file: IO[bytes]) -> str:
+    return str(getattr(file, "name", "the file"))
+
+
+def _charge(budget: Budget, opcode: int, length: int) -> None:
+    """Raise RecordingError where a file has more records, or longer ones, than is allowed."""
+    budget.take_records(_COSTS.get(opcode, 8))
+    if opcode in _PARSERS and opcode not in _LARGE:
+        budget.take_description(length)
+
+
+def _record_at(file: IO[bytes], position: int, on_loss: Callable[[Loss], None], budget: Budget) -> McapRecord | None:
     """The record at a position, whose length is known to be possible; None if it is damaged or of no interest."""
     opcode, length = _head_at(file, position)
+    _charge(budget, opcode, length)
     if opcode not in _PARSERS and opcode != Opcode.MESSAGE:
         return None
     if opcode == Opcode.ATTACHMENT and length > limits().attachment_bytes:
@@ -403,8 +423,10 @@ def _record_at(file: IO[bytes], position: int, on_loss: Callable[[Loss], None]) 
     content = file.read(length)
     try:
         record = _parsed(opcode, content)
-        if opcode == Opcode.ATTACHMENT and struct.unpack("<I", content[-4:])[0] not in (0, zlib.crc32(content[:-4])):
-            raise ValueError("checksum")
+        if opcode == Opcode.ATTACHMENT:
+            (crc,) = struct.unpack("<I", content[-4:])
+            if crc and crc != zlib.crc32(memoryview(content)[:-4]):
+                raise ValueError("checksum")
     except _DAMAGE:
         kind = Opcode(opcode).name.lower().replace("_", " ")
         on_loss(Loss(position, HEAD.size + length, f"the {kind} at byte {position} is damaged"))

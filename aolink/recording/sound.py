@@ -11,6 +11,7 @@ from google.protobuf.message import Message
 
 from aolink.estimation.estimate import Status
 from aolink.recording import schemas_pb2 as pb
+from aolink.recording import topics
 from aolink.recording.convert import is_compressed
 from aolink.rig import Rig
 from aolink.wire import messages_pb2 as wire
@@ -25,8 +26,11 @@ _FEW = 10_000
 _WITHOUT_INPUTS = (wire.Applied.AWAITED, wire.Applied.NOT_REPORTED)
 
 
-def what_is_wrong(message: Message, rig: Rig) -> str:
-    """The field of a message that contradicts itself, the rig or the calendar, in words; empty where none does."""
+def what_is_wrong(message: Message, rig: Rig, topic: str = "") -> str:
+    """The field of a message that contradicts itself, its topic, the rig or the calendar, in words; empty where none
+    does."""
+    if isinstance(message, RawImage):
+        return _of_picture(message, rig, topic) if topics.named(topic).after else ""
     check = _CHECKS.get(type(message))
     return check(message, rig) if check else ""
 
@@ -59,6 +63,8 @@ def _of_exposure(info: pb.ExposureInfo, rig: Rig) -> str:
         return "frame_id is beyond all counts"
     if not 0 < info.last_step + 1 - info.first_step <= rig.timing.exposure_steps:
         return "last_step is beyond the end of an exposure"
+    if len(info.missing_offset) != len(info.missing_length):
+        return "missing_offset and missing_length are not of one length"
     if info.last_step * rig.timing.fast_step_ns > _LAST_NS:
         return "first_step is beyond all times"
     if info.exposure_offset_ns >= rig.timing.fast_step_ns:
@@ -111,8 +117,18 @@ def _of_truth(message: wire.Truth, rig: Rig) -> str:
     return "" if fits else "its states do not fit its axes"
 
 
-def _of_picture(picture: RawImage, rig: Rig) -> str:
-    return "" if picture.width and picture.height else "a picture without pixels"
+def _of_picture(picture: RawImage, rig: Rig, topic: str) -> str:
+    if not (picture.width and picture.height):
+        return "a picture without pixels"
+    encoding, width = ("32FC1", 4) if topic.startswith(topics.RESTORED) else ("mono16", 2)
+    if picture.encoding != encoding:
+        return f"its encoding is not {encoding}"
+    if picture.step not in (0, width * picture.width):  # 0 where other software does not state it
+        return "its step is not that of its width"
+    if len(picture.data) != width * picture.width * picture.height:
+        return "its data are not as long as its size says"
+    sensor = {topics.IMAGE: rig.sensor, topics.SCENE: rig.scene}.get(topic)
+    return "" if sensor is None or sensor.shape == (picture.height, picture.width) else "its size is not the sensor's"
 
 
 _CHECKS: dict[type[Message], Callable[[Any, Rig], str]] = {
@@ -123,5 +139,4 @@ _CHECKS: dict[type[Message], Callable[[Any, Rig], str]] = {
     pb.ExposureInfo: _of_exposure,
     pb.Estimate: _of_estimate,
     wire.Truth: _of_truth,
-    RawImage: _of_picture,
 }

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import os
 import re
 import threading
 import time
@@ -26,6 +27,7 @@ from aolink.estimation import exposure_model
 from aolink.recording import topics
 from aolink.recording.lead import Lead
 from aolink.recording.mcap_file import McapFile, WriteOptions, schema_of
+from aolink.recording.messages import first_facts
 from aolink.rig import Rig
 
 _QUEUE_BYTES = 256 << 20
@@ -35,6 +37,8 @@ _POLL_S = 0.005
 _STALL_S = 5.0
 """A disk that takes longer over one write stops the session."""
 _AGAIN_S = 0.1
+_LOOK_S = 1.0
+"""Time between two comparisons of the open file with its path, s."""
 _LOOK_BYTES = 16 << 10
 """Bytes that go to the file between two readings of the clock, by which a stalled disk and the next synchronisation are
 noticed."""
@@ -84,7 +88,8 @@ class RecordingWriter:
     ----------
     path:
         The file; it must not exist unless ``overwrite``. Where the options ask for several files, their
-        names are this one with -001, -002 ... before the suffix.
+        names are this one with -001, -002 ... before the suffix. An old file stays as it was until the first exposure
+        is on the disk, and so do the parts of an older session of this name.
     rig:
         The rig, which goes into the file as an attachment, with its exposure basis.
     metadata:
@@ -110,7 +115,9 @@ class RecordingWriter:
     ) -> None:  # fmt: skip
         self.path = Path(path)
         self.paths: list[Path] = []
-        """The files so far."""
+        """The files so far; none while the first is still beside the old one."""
+        self.notes: list[str] = []
+        """What it did with files of others, in sentences."""
         self._options = options or WriteOptions()
         self._rig, self._metadata, self._overwrite = rig, metadata, overwrite
         self._attachments = attachments or {}
@@ -120,7 +127,10 @@ class RecordingWriter:
         self._schemas: dict[str, Schema] = {}
         """The schema of each topic so far."""
         self._lead = Lead() if self._options.split_bytes or self._options.split_s else None
+        self._part = 0
+        self._old_parts: list[Path] = []
         self._sequence = 0
+        self._has_exposure = False
         self._end_metadata: dict[str, str] = {}
         self._error: RecordingError | None = None
         self._closed = False
@@ -130,7 +140,7 @@ class RecordingWriter:
         self._busy_since: float | None = None
         """The time at which the thread began its present work on the file."""
         if self._lead is not None:
-            self._clear_parts()
+            self._old_parts = self._parts_before()
         try:
             self._begin(start_ns)
         except OSError as error:
@@ -194,40 +204,82 @@ class RecordingWriter:
             with contextlib.suppress(RecordingError):
                 self.close({"ended": f"error: {error}"})
 
-    def _clear_parts(self) -> None:
-        """Remove parts of another session with the same name, which would seem to belong to this one."""
-        name = re.compile(re.escape(self.path.stem) + r"-\d{3,}" + re.escape(self.path.suffix))
-        folder = self.path.parent
+    def _parts_before(self) -> list[Path]:
+        """The parts of an older session of this name, by their own metadata. Raises RecordingError where they, or
+        another file, stand in the way."""
+        name = re.compile(re.escape(self.path.stem) + r"-(\d{3,})" + re.escape(self.path.suffix))
+        folder, known, session = self.path.parent, list[Path](), None
         try:
-            known = sorted(each for each in folder.iterdir() if name.fullmatch(each.name)) if folder.is_dir() else []
-            if known and not self._overwrite:
-                raise RecordingError(
-                    f"{known[0]} exists and is not overwritten: give another name, or --overwrite to remove"
-                    f" {'it' if len(known) == 1 else f'all {len(known)} parts'}"
-                )
-            for each in known:
-                if files.is_being_written(each):
-                    raise RecordingError(f"{each} is being written by another command: give another name")
-            for each in known:
-                each.unlink()
-        except OSError as error:
-            raise RecordingError(f"cannot write {self.path}: {files.why_not(error)}") from None
+            found = sorted((int(match[1]), each) for each in folder.iterdir() if (match := name.fullmatch(each.name)))
+        except OSError:  # there is no such folder, or it may not be read: creating the file will tell
+            return []
+        for number, each in found:
+            facts = first_facts(each)
+            of_this_name = facts.get(topics.PART_OF, self.path.name) == self.path.name  # older parts do not say it
+            if each == self._part_path(number) and facts.get(topics.PART) == str(number) and of_this_name:
+                session = session or facts.get("session")
+                if facts.get("session") == session:
+                    known.append(each)
+        if (first := self._part_path(1)) not in known and os.path.lexists(first):
+            raise RecordingError(
+                f"{first} exists and is no part of an older session {self.path.name}, so it is not replaced: give"
+                " another name"
+            )
+        if known and not self._overwrite:
+            raise RecordingError(
+                f"{known[0]} exists and is not overwritten: give another name, or --overwrite to remove"
+                f" {'it' if len(known) == 1 else f'all {len(known)} parts'}"
+            )
+        for each in known:
+            if files.is_being_written(each):
+                raise RecordingError(f"{each} is being written by another command: give another name")
+        return known
+
+    def _part_path(self, number: int) -> Path:
+        return self.path.with_name(f"{self.path.stem}-{number:03d}{self.path.suffix}")
 
     def _begin(self, start_ns: int) -> None:
         """Create the file, or the next of several."""
         metadata, path = self._metadata, self.path
-        if self._options.split_bytes or self._options.split_s:
-            part = len(self.paths) + 1
-            path = path.with_name(f"{path.stem}-{part:03d}{path.suffix}")
-            metadata = metadata | {"part": str(part)}
-        self.paths.append(path)
-        self._file = McapFile(path, self._options, overwrite=self._overwrite)
+        if self._lead is not None:
+            self._part += 1
+            while self._part > 1 and os.path.lexists(self._part_path(self._part)):
+                self.notes.append(f"{self._part_path(self._part)} was there already, and is no part of this session")
+                self._part += 1
+            path = self._part_path(self._part)
+            metadata = metadata | {topics.PART: str(self._part), topics.PART_OF: self.path.name}
+        self._place = files.create(path, overwrite=self._overwrite and not self._has_exposure, error=RecordingError)
+        self._file = McapFile(path, self._options, descriptor=os.dup(self._place.descriptor))
+        if not self._place.is_aside:
+            self.paths.append(path)
         self._part_start_ns = start_ns
         begin_recording(self._file, self._rig, metadata, start_ns, self._attachments)
 
+    def _take_place(self) -> None:
+        """Put the file in the place of the old one, and remove the parts of the older session: there is an exposure."""
+        self._has_exposure = True
+        self._file.flush()
+        if self._place.is_aside:
+            self._file.sync()
+            self._place.take_place()
+            self.paths.append(self._place.path)
+        removed = []
+        for each in self._old_parts:
+            with contextlib.suppress(OSError):  # where it may not be removed, the parts of this session go round it
+                if each not in self.paths:
+                    each.unlink()
+                    removed.append(str(each))
+        if removed:
+            self.notes.append(f"parts of an older session were removed: {', '.join(removed)}")
+
+    def _look(self) -> None:
+        """End the session where the file's name is no longer its own."""
+        if self._error is None and not self._place.is_there():
+            self._error = RecordingError(f"{self._place.path} was removed, renamed or replaced by another program")
+
     def _run(self) -> None:
         options = self._options
-        last_sync = last_write = time.monotonic()
+        last_sync = last_write = last_look = time.monotonic()
         while True:
             ending = self._ending.is_set()  # read first: nothing is queued after it is set
             self._busy_since = now = time.monotonic()
@@ -239,6 +291,9 @@ class RecordingWriter:
                         self._file.flush()
                         self._file.sync()
                         self._busy_since = last_sync = time.monotonic()
+                if now - last_look > _LOOK_S:
+                    self._look()
+                    last_look = now
                 if ending:
                     self._finish(self._end_metadata)
                     return
@@ -266,13 +321,15 @@ class RecordingWriter:
             self._sequence += 1
             schema = schemas.get(topic) or self._schema(topic)
             self._file.add(topic, schema, data, log_time_ns, self._sequence)
+            if topic == topics.IMAGE and not self._has_exposure:
+                self._take_place()
             taken += _MESSAGE_BYTES + len(data)
             self._taken_bytes += len(data)
 
     def _lead_in(self, lead: Lead, topic: str, message: Message | None, log_time_ns: int) -> None:
         """Begin the next part if this one is full, with the messages that it needs from this one; keep those that the
         part after it may need."""
-        if topic == topics.EXPOSURE and self._part_is_full(log_time_ns):
+        if topic == topics.EXPOSURE and self._has_exposure and self._part_is_full(log_time_ns):
             self._finish({"ended": "goes on in the next part"})
             self._begin(log_time_ns)
             for lead_topic, each, time_ns, sequence in lead.messages():
@@ -293,14 +350,30 @@ class RecordingWriter:
         if end_metadata:
             self._file.add_metadata(topics.END_METADATA, end_metadata)
         self._file.finish(sync=not self._deterministic)
+        self._look()
+        if not (self._place.is_there() or self._place.is_aside):
+            self._busy_since = None  # a copy may take long, and nothing waits for it but the session's end
+            self._save()
+        self._place.close()
+
+    def _save(self) -> None:
+        """Say where a file is whose name is no longer its own; one that was removed is copied beside its name."""
+        assert self._error is not None
+        if (place := self._place.moved_to()) is not None:
+            said = f"the recording is {place} now"
+        else:
+            try:
+                said = f"what was recorded is saved as {self._place.saved()}"
+            except OSError as error:
+                said = f"what was recorded is lost, because a copy cannot be written: {files.why_not(error)}"
+        self._error.args = (f"{self._error}; {said}",)
 
     def _give_up(self, error: Exception) -> None:
         """Cut the file back to its last whole part, because the disk is full or gone."""
         self._file.cut_back()
-        if isinstance(error, RecordingError):
-            self._error = error
-            return
-        what = files.why_not(error) if isinstance(error, OSError) else repr(error)
-        self._error = RecordingError(
-            f"cannot write {self.paths[-1]}: {what}; what was recorded until then is in it and can be read"
-        )
+        if not isinstance(error, RecordingError):
+            what = files.why_not(error) if isinstance(error, OSError) else repr(error)
+            kept = "; what was recorded until then is in it and can be read" if self.paths else ""
+            error = RecordingError(f"cannot write {self._place.target}: {what}{kept}")
+        self._error = self._error or error
+        self._place.close()

@@ -68,8 +68,11 @@ def _true_scene(rig: Rig, camera: Camera) -> dict[str, bytes]:
     return {topics.TRUE_SCENE_ATTACHMENT: data.getvalue()}
 
 
-def _saved(report: Report, paths: Sequence[Path]) -> str:
+def _saved(report: Report, writer: RecordingWriter) -> str:
     """The part of a session that was saved before an error ended it, in words."""
+    paths = writer.paths
+    if not paths:
+        return f"no exposure had come by then: {writer.path} is as it was"
     where = str(paths[-1]) if len(paths) == 1 else f"{len(paths)} files, the last of them {paths[-1]}"
     exposures = max(report.exposures, report.frames_received)  # also those whose inputs were not reported any more
     if not exposures:
@@ -220,14 +223,23 @@ def record(
             if not (isinstance(error, PortError | DeviceError) and stop()):
                 with contextlib.suppress(AolinkError):
                     writer.close(report.counts())
-                if isinstance(error, PortError | DeviceError):
-                    raise type(error)(f"{error}; {_saved(report, writer.paths)}") from None
+                said = list(writer.notes)
+                if isinstance(error, PortError | DeviceError) or not writer.paths:
+                    said.insert(0, _saved(report, writer))
+                if isinstance(error, AolinkError):
+                    error.args = ("; ".join([str(error), *said]),)
                 raise
             # The session was to end anyway, so a device that no longer answers is only a warning.
             report.ended = "interrupted"
             report.warnings.append(str(error))
         writer.close(report.counts())
-    report.files = [str(each) for each in writer.paths]
+    report.files = [str(each) for each in writer.paths if each.exists()]
+    report.warnings += writer.notes
+    report.warnings += [
+        f"{each} was removed or moved after it was complete" for each in writer.paths if not each.exists()
+    ]
+    if not writer.paths:
+        report.warnings.append(f"no exposure came: {path} is as it was")
     return report
 
 

@@ -66,7 +66,7 @@ def test_a_session_of_another_process_is_followed_up_to_its_end(aolink, start_ao
 @pytest.mark.slow
 def test_ctrl_c_ends_it_while_the_session_goes_on(start_aolink, steady, tmp_path):
     """The file stays locked and unfinished, as that of a session does."""
-    data, descriptor = unfinished(steady), files.create(tmp_path / "session.mcap")
+    data, descriptor = unfinished(steady), files.create(tmp_path / "session.mcap").descriptor
     try:
         os.write(descriptor, data)
         following = start_aolink("identify", "session.mcap", "--follow", "-o", "identified.toml")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import shutil
+import resource
 import sqlite3
 import subprocess
 from collections.abc import Callable
@@ -22,6 +22,7 @@ from aolink.recording import schemas_pb2 as pb
 from aolink.recording import topics
 from aolink.recording.compare import compare
 from aolink.recording.reader import Recording
+from aolink.recording.reestimate import Reestimated
 from aolink.recording.writer import RecordingWriter
 from aolink.rig import load_rig
 from aolink.wire.messages_pb2 import Truth
@@ -128,26 +129,50 @@ def test_nan_is_equal_to_nan_and_to_nothing_else() -> None:
 
 
 @pytest.mark.slow
-def test_the_command_accepts_a_change_when_told_to(aolink: Run, recorded: Session, tmp_path: Path) -> None:
+def test_a_recording_is_compared_with_itself_without_a_copy(aolink: Run, recorded: Session, tmp_path: Path) -> None:
     def change(topic: str, message: Message) -> list[Message]:
         if topic == "/estimate/o1" and isinstance(message, pb.Estimate):
             message.nis[0] *= 2
         return [message]
 
-    shutil.copy(recorded.path, tmp_path / "right.mcap")
-    rewritten(recorded.path, tmp_path / "wrong.mcap", change)
-    assert aolink("compare", "right.mcap").returncode == 0
-    before = (tmp_path / "wrong.mcap").read_bytes()
-    refused = aolink("compare", "wrong.mcap")
-    assert refused.returncode == 1
-    assert "/estimate/o1" in refused.stdout
-    assert "frame 1: " in refused.stdout
-    assert (tmp_path / "wrong.mcap").read_bytes() == before
-    accepted = aolink("compare", "wrong.mcap", "--accept")
-    assert accepted.returncode == 0
-    assert "accepted: wrong.mcap is replaced" in accepted.stdout
-    assert aolink("compare", "wrong.mcap").returncode == 0
-    assert [each.name for each in tmp_path.iterdir() if each.name.startswith((".", "aolink-"))] == []
+    path = rewritten(recorded.path, tmp_path / "wrong.mcap", change).path
+    before = path.read_bytes()
+    assert aolink("compare", recorded.path).returncode == 0
+    assert aolink("compare", "wrong.mcap", "-t", "/estimate/o3").returncode == 0
+
+    def no_files() -> None:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0))
+
+    differs = aolink("compare", "wrong.mcap", preexec_fn=no_files)
+    assert differs.returncode == 1, differs.stderr
+    assert "/estimate/o1" in differs.stdout
+    assert "frame 1: " in differs.stdout
+    refused = aolink("compare", "wrong.mcap", "-t", "/camera/")
+    assert refused.returncode == 5
+    assert "holds no such estimates to make again" in refused.stderr
+    assert path.read_bytes() == before
+
+
+def test_exposures_that_were_skipped_are_skipped_again(recorded: Session, tmp_path: Path) -> None:
+    def change(topic: str, message: Message) -> list[Message]:
+        if topic == "/estimate/o1" and isinstance(message, pb.Estimate) and message.frame_id == 5:
+            return []
+        if topic == topics.EXPOSURE and isinstance(message, pb.ExposureInfo) and message.frame_id == 5:
+            return [message, pb.Estimation(frame_id=5, skipped=True)]
+        return [message]
+
+    def write(target: Path) -> Recording:
+        recording = Recording(recorded.path)
+        with RecordingWriter(target, recording.rig, {}, recording.start_ns, deterministic=True) as writer:
+            for each in recording.messages():
+                for message in change(each.topic, each.message):
+                    topic = topics.estimation_topic("o1") if isinstance(message, pb.Estimation) else each.topic
+                    writer.write(topic, message, each.log_time_ns)
+        return Recording(target)
+
+    recording = write(tmp_path / "skipped.mcap")
+    found = compare(recording, Reestimated(recording, ["o1"]), only=["/estimate/o1"])["/estimate/o1"]
+    assert (found.missing, found.added, found.compared) == (0, 0, EXPOSURES - 1)
 
 
 def test_a_topic_that_nobody_has_is_an_error_not_the_same(aolink: Run, recorded: Session) -> None:
@@ -243,16 +268,3 @@ def test_of_two_sessions_of_a_rig_clock_times_are_left_out(recorded: Session, tm
     assert {*compare(one, two)[topics.EXPOSURE].fields} == {"device_start_ns", "host_start_ns"}
     assert {*compare(one, two)[topics.IMAGE].fields} == {"timestamp"}
     assert all(each.same for each in compare(one, two, relative_to_start=True).values())
-
-
-def test_accept_is_refused_where_it_would_replace_more(aolink: Run, recorded: Session, tmp_path: Path) -> None:
-    shutil.copy(recorded.path, tmp_path / "a.mcap")
-    part = aolink("compare", "a.mcap", recorded.path, "--topic", "/log", "--accept")
-    assert part.returncode == 2
-    data = bytearray((tmp_path / "a.mcap").read_bytes())
-    data[len(data) // 2] ^= 1
-    (tmp_path / "a.mcap").write_bytes(data)
-    damaged = aolink("compare", "a.mcap", recorded.path, "--accept")
-    assert damaged.returncode == 5
-    assert "a damaged recording is not accepted" in damaged.stderr
-    assert (tmp_path / "a.mcap").read_bytes() == data

@@ -50,7 +50,7 @@ def by_messages(source: Path, target: Path) -> Iterator[bool]:
 
 def by_bytes(source: Path, target: Path, end: int | None = None) -> Iterator[bool]:
     """The same, some bytes at a time: records are torn, as the operating system may tear them."""
-    data, descriptor = source.read_bytes()[:end], files.create(target)
+    data, descriptor = source.read_bytes()[:end], files.create(target).descriptor
     for begin in range(0, len(data), 997):
         os.write(descriptor, data[begin : begin + 997])
         yield False

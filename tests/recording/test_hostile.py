@@ -158,6 +158,34 @@ def test_attachments_that_are_holes_are_refused(tmp_path: Path) -> None:
         Recording(path)
 
 
+def test_metadata_that_are_holes_are_refused(tmp_path: Path) -> None:
+    """Each is below the limit for one record, and takes no room on the disk; all would be kept in memory."""
+    _, end = in_place_of_the_end(rig_only(path := tmp_path / "a.mcap"))
+    with path.open("r+b") as file:
+        file.truncate(end)
+        for k in range(4):
+            head = struct.pack("<I1sII1sI", 1, b"%d" % k, 9 + (20 << 20), 1, b"k", 20 << 20)
+            file.seek(0, os.SEEK_END)
+            file.write(struct.pack("<BQ", Opcode.METADATA, len(head) + (20 << 20)) + head)
+            file.truncate(file.tell() + (20 << 20))
+    with pytest.raises(RecordingError, match=r"very long metadata, channels or schemas, .* of 33554432 for"):
+        Recording(path)
+
+
+@pytest.mark.parametrize("in_chunk", [False, True])
+def test_very_many_channels_are_refused(tmp_path: Path, in_chunk: bool) -> None:
+    head = struct.pack("<HHI1sI4sI", 1, 0, 1, b"t", 4, b"json", 0)
+    data = 20_000 * (struct.pack("<BQ", Opcode.CHANNEL, len(head)) + head)
+    if in_chunk:
+        packed = zstandard.compress(data)
+        chunk = struct.pack("<QQQII", 1, 1, len(data), 0, 4) + b"zstd" + struct.pack("<Q", len(packed)) + packed
+        data = struct.pack("<BQ", Opcode.CHUNK, len(chunk)) + chunk
+    whole, end = in_place_of_the_end(rig_only(path := tmp_path / "a.mcap"))
+    path.write_bytes(whole[:end] + data)
+    with pytest.raises(RecordingError, match="very many tiny records"):
+        Recording(path)
+
+
 def header(shape: str, descr: str = "<f8") -> bytes:
     text = f"{{'descr': '{descr}', 'fortran_order': False, 'shape': {shape}, }}".ljust(117) + "\n"
     return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(text)) + text.encode()

@@ -204,11 +204,11 @@ def test_nothing_is_waited_for_after_the_last_wanted_estimate(skipped: bool) -> 
     """The second exposure has an estimate, or the session says that there was no time for one."""
     first, second = Recording(REFERENCES[0]).exposures(0, 2)
     one, two = (pb.Estimate(frame_id=each.frame_id) for each in (first, second))
-    pairs = EstimatePairs(0, 0, 2)
+    pairs = EstimatePairs(0, 2)
     assert list(pairs.take(one, [])) == []
-    assert list(pairs.take(pb.ExposureInfo(), [first])) == [(one, first)]
+    assert list(pairs.take(pb.ExposureInfo(), [(0, first)])) == [(one, first)]
     assert not pairs.complete
-    assert list(pairs.take(pb.ExposureInfo(), [second])) == []
+    assert list(pairs.take(pb.ExposureInfo(), [(1, second)])) == []
     assert not pairs.complete
     last = pb.Estimation(frame_id=second.frame_id, skipped=True) if skipped else two
     assert list(pairs.take(last, [])) == ([] if skipped else [(two, second)])

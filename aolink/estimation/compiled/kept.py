@@ -20,11 +20,16 @@ from contextlib import suppress
 from functools import cache
 from pathlib import Path
 
+from aolink.errors import EstimatorError
+from aolink.limits import check_room
+
 HERE = Path(__file__).parent
 _PACKAGE = HERE.parents[1]
 SOURCES = (*sorted(HERE.glob("*.py")), _PACKAGE / "numerics" / "covariance.py", _PACKAGE / "numerics" / "entrywise.py")
 """All that is compiled: the loops, and what they take from `aolink.numerics`."""
 _NEEDED_BYTES = 50_000_000
+_COMPILE_BYTES = 768 << 20
+"""Address space that compiling takes. LLVM ends a process that lacks it."""
 # So long nothing is written while code is compiled.
 _SILENCE_S = 3.0
 # Folders of other contents that stay, for checkouts that share a user's cache.
@@ -76,7 +81,10 @@ def compile_once(groups: Sequence[str], program: Callable[[list[str]], str]) -> 
         Gives the program's text for the missing groups.
     """
     kept = folder()
-    if kept is None or not _missing(kept, groups):
+    if not (groups if kept is None else _missing(kept, groups)):
+        return
+    check_room(_COMPILE_BYTES, "compiling the loops of the estimators", EstimatorError)
+    if kept is None:
         return
     with open(kept / "compiling.lock", "w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)  # another process may be compiling
