@@ -59,7 +59,7 @@ class Constants:
     """The most points of a round."""
     work: float = 2.5e6
     """And as many as about this number of products allow, so that an exposure of a spot on a plane, whose points are
-    three times the work, takes no longer than its frame."""
+    three times the work, takes about as long as its frame."""
     enough: float = 100.0
     """The effective sample size at which rounds end."""
     share_of_one_mode: float = 0.25
