@@ -396,7 +396,7 @@ def test_lists_of_missing_pixels_that_do_not_fit_are_a_loss(tmp_path: Path) -> N
     assert "missing_offset and missing_length are not of one length" in recording.damage
 
 
-PICTURE = {"width": 40, "height": 1, "step": 80, "encoding": "mono16", "data": bytes(80)}
+PICTURE: dict[str, Any] = {"width": 40, "height": 1, "step": 80, "encoding": "mono16", "data": bytes(80)}
 
 
 @pytest.mark.parametrize(

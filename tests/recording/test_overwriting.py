@@ -7,7 +7,7 @@ import resource
 import shutil
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -44,7 +44,12 @@ class Writing:
 
     def write_on(self) -> None:
         """Write until the writer ends it with an error."""
-        wait_until(lambda: self.writer.write(topics.LOG, Log(), 0) or False)
+
+        def write_one() -> bool:
+            self.writer.write(topics.LOG, Log(), 0)
+            return False
+
+        wait_until(write_one)
 
 
 def wait_until(condition: Callable[[], bool]) -> None:
@@ -131,8 +136,8 @@ def test_what_another_program_has_put_there_meanwhile_is_not_replaced(
         old.mkdir()
     else:
         exchanged(old if what == "old" else aside, b"theirs")
+    writing.write(topics.IMAGE)
     with pytest.raises(RecordingError, match=r"another program has put a file|is a symbolic link|a folder"):
-        writing.write(topics.IMAGE)
         writing.write_on()
     there = old if what != "new" else aside
     assert there.is_symlink() or there.is_dir() or there.read_bytes() == b"theirs"
@@ -231,7 +236,7 @@ def folder_removed(path: Path) -> None:
 
 
 @pytest.fixture
-def seconds(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[float]]:
+def seconds(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     """The clock of the writer's thread alone, whose last element is the time."""
     clock, session, begin = [0.0], threading.current_thread(), time.monotonic()
     monkeypatch.setattr(
