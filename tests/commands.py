@@ -48,7 +48,7 @@ _MODULES = (
     "aolink.cli.tables.scores",
     "aolink.cli.tables.sessions",
     "aolink.estimation.pixels.filter",
-    "aolink.estimation.pixels.updates",
+    "aolink.estimation.pixels.profile",
     "aolink.estimation.pixels.sampled",
     "typer._adapters",  # with which it reads options
 )
@@ -62,11 +62,12 @@ class CommandServer:
         self._socket, theirs = socket.socketpair()
         self._socket.settimeout(TIMEOUT_S)
         code = "import sys; from tests.commands import serve; serve(int(sys.argv[1]))"
-        with theirs, spared():
-            self._process = subprocess.Popen(
-                [sys.executable, "-c", code, str(theirs.fileno())],
-                pass_fds=[theirs.fileno()], cwd=Path(__file__).parent.parent, stdin=subprocess.DEVNULL,
-            )  # fmt: skip
+        with spared():
+            with theirs:
+                self._process = subprocess.Popen(
+                    [sys.executable, "-c", code, str(theirs.fileno())],
+                    pass_fds=[theirs.fileno()], cwd=Path(__file__).parent.parent, stdin=subprocess.DEVNULL,
+                )  # fmt: skip
             _received(self._socket, 1)
 
     def start(self, arguments: Sequence[str], folder: Path, streams: Sequence[int]) -> int:

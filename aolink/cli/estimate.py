@@ -245,11 +245,17 @@ def _estimate_one(
     from aolink.estimation.registry import DEFAULT_ESTIMATOR
     from aolink.recording import reestimate, topics
     from aolink.recording.reader import Recording
-    from aolink.recording.reestimate import check_has_exposures, kept_estimators, reestimated, scored_and_compared
+    from aolink.recording.reestimate import (
+        check_has_exposures,
+        kept_estimators,
+        own_estimators,
+        reestimated,
+        scored_and_compared,
+    )
 
     recording = common.say_damage(model.applied_to(Recording(file)))
     check_has_exposures(recording)
-    names = list(dict.fromkeys(estimator or recording.estimators or [DEFAULT_ESTIMATOR]))
+    names = list(dict.fromkeys(estimator or own_estimators(recording, warn) or [DEFAULT_ESTIMATOR]))
     try:
         common.get_ready(recording.rig, names)
         with progress("estimate", recording.n_frames) as tell:

@@ -250,9 +250,10 @@ def replay(
     Exposures that an estimator skipped in the session are skipped again; `aolink estimate` skips none.
     """
     from aolink.estimation.registry import DEFAULT_ESTIMATOR
+    from aolink.recording.reestimate import own_estimators
 
     recording = common.open_recording(file)
-    names = list(dict.fromkeys(estimator or recording.estimators or [DEFAULT_ESTIMATOR]))
+    names = list(dict.fromkeys(estimator or own_estimators(recording, common.warn) or [DEFAULT_ESTIMATOR]))
     get_ready(recording.rig, names)
     if to_rig:
         if control:

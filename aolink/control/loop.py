@@ -123,6 +123,8 @@ class ControlLoop:
         self._monitor = FitMonitor()
         timing = rig.timing
         self._patience = (BLIND_EXPOSURES + 1) * timing.frame_period_steps + self.delay_steps
+        self._most_rows = 4 * self._patience + 2 * mirror.queue_steps
+        """Rows that are kept where no exposure comes: those of queued steps, and for exposures that come late."""
 
     @property
     def next_step(self) -> int:
@@ -168,7 +170,7 @@ class ControlLoop:
         those from the returned ``first_step`` on must be sent anew, also where they were sent before.
         """
         end = exposure.first_step + exposure.n_steps
-        first = max(end + self.delay_steps, earliest_step)
+        first = max(end + self.delay_steps, earliest_step, self._oldest)
         while self.next_step < first:
             self._go_on()
         slopes = centroids(self._rig, exposure)
@@ -177,7 +179,7 @@ class ControlLoop:
             self._trusted = 0
             self.lose(f"frame {exposure.frame_id} came {first - end} fast steps late")
         self._forget_from(first)
-        pending = np.array(self._held[end - self._oldest : first - self._oldest]).reshape(-1, len(self._park))
+        pending = np.array(self._held[max(end - self._oldest, 0) : first - self._oldest]).reshape(-1, len(self._park))
         if estimate is not None:
             self.fit = self._monitor.add(estimate)
         change = self._compare(exposure, slopes, estimate)
@@ -253,6 +255,8 @@ class ControlLoop:
         self._limited.append(bool((u != wanted).any()))
         self._sent.append(u)
         self._held.append(self._rig.mirror.quantise(u))
+        if len(self._sent) > self._most_rows:
+            self._drop_before(self._oldest + self._most_rows // 2)
 
     def _forget_from(self, step: int) -> None:
         for rows in (self._sent, self._held, self._limited):

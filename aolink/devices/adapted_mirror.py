@@ -27,7 +27,7 @@ from aolink.rig.device_tables import Delay
 from aolink.wire import messages_pb2 as pb
 
 _PATIENCE_NS = 1_000_000_000
-"""How long the end of a session waits for reports."""
+"""How long reports that are awaited may take, from the newest report on."""
 
 
 class AdaptedMirror(Adapted):
@@ -128,7 +128,7 @@ class AdaptedMirror(Adapted):
             self._commanded.update((first_step + k, (block.block_id, rows[k])) for k in range(ack.late_steps, len(u)))
         self._next = first_step if self._next is None else self._next
         self.last_sent_ns = now_ns
-        self.waiting.append(CommandAnswered(ack, block))
+        self.waiting.append(CommandAnswered(ack, block, now_ns))
         return block
 
     def withdraw(self, step: int) -> int:
@@ -162,7 +162,7 @@ class AdaptedMirror(Adapted):
             return []
         events = self._give_up(first_step)
         begin, end = self._next, int(end)
-        self._next = end
+        self._next, self._deadline_ns = end, self.now_ns() + _PATIENCE_NS
         for (block_id, source), run in groupby(
             range(begin, end), lambda step: self._what_held(step, u[step - first_step], bool(late[step - first_step]))
         ):
@@ -200,7 +200,10 @@ class AdaptedMirror(Adapted):
         return [unknown]
 
     def await_reports(self, end_step: int, now_ns: int) -> list[Event]:
-        self._awaited, self._deadline_ns = end_step, now_ns + _PATIENCE_NS
+        if self._next is not None and end_step > self._awaited:
+            if self._next >= self._awaited:  # until now nothing was awaited
+                self._deadline_ns = now_ns + _PATIENCE_NS
+            self._awaited = end_step
         return []
 
     def next_due_ns(self) -> int | None:
@@ -215,6 +218,9 @@ class AdaptedMirror(Adapted):
             step = int(self._driver.park())
         self._parked_from = step
         return step
+
+    def last_answers(self) -> list[CommandAnswered]:
+        return [event for event in self.take_waiting() if isinstance(event, CommandAnswered)]
 
     def rearm(self) -> int:
         with self._call("when it was asked for the time"):

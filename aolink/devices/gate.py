@@ -244,6 +244,8 @@ class Gate:
         what = f"{self._frame_step}, as the rest of frame {frame_id} has"
         require(frame_id != before or not since, device, "FrameChunk.first_step", first_step, what)
         if frame_id <= before:
+            what = f"above {before}, the id of the frame before it"
+            require(since <= 0, device, "FrameChunk.frame_id", frame_id, what)
             return
         least = self._frame_step + timing.exposure_steps
         what = f"at least {least}, for frame {before} began at {self._frame_step}"

@@ -38,10 +38,17 @@ class ClockSampled:
 
 @dataclass(frozen=True, slots=True)
 class CommandAnswered:
-    """A command block was acknowledged or refused (``ack.code``)."""
+    """A command block was acknowledged or refused (``ack.code``), or its answer is not waited for any more."""
 
-    ack: pb.CommandAck
+    ack: pb.CommandAck | None
+    """The final answer; None where none came."""
     block: pb.CommandBlock
+    sent_ns: int
+    """Host time at which the block was first sent."""
+    tries: int = 1
+    """How often it was sent."""
+    times_full: int = 0
+    """How often the mirror answered before that its queue was full."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,6 +145,7 @@ class Camera(Device, Protocol):
 class Mirror(Device, Protocol):
     """Applies inputs at fast steps, which it counts.
 
+    Each block that it is sent gets one `CommandAnswered`: as an event, or from `last_answers`.
     Its `Applied` events give the input that the mirror held in each fast step, exactly once from the first command on:
     a report, or ``NOT_REPORTED`` where there is none. ``AWAITED`` comes before either where a report is requested
     again.
@@ -211,8 +219,12 @@ class Mirror(Device, Protocol):
     def park(self) -> int:
         """Put the mirror into its safe state and empty its queue; gives the first fast step that this holds for.
 
-        Blocks without an answer are given up. Raises DeviceError if the mirror does not answer.
+        Blocks without an answer are not sent again. It is asked until it confirms that it has parked. Raises
+        DeviceError once nothing more is heard of it, and PortError where its port is gone.
         """
+
+    def last_answers(self) -> list[CommandAnswered]:
+        """At the session's end, the answers to blocks that have not been events; without one where none came."""
 
     def rearm(self) -> int:
         """Release the watchdog's latch; gives the first fast step that had not passed. Otherwise this works as

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from aolink.assembly import Frame, PlanesReassembly, TruthReassembly
 from aolink.devices.clock import ClockExchange, ClockRegression, StepClock
+from aolink.devices.frame_count import FrameCount
 from aolink.devices.gate import MOST_RATE_ERROR, Gate, lie, printable
 from aolink.devices.interfaces import ClockSampled, CommandAnswered, Event, Lacks
 from aolink.devices.port_watch import PortWatch
@@ -34,6 +35,9 @@ _PATIENCE_WATCHDOGS = 2.0
 """A mirror that answers nothing for this many times its watchdog has parked itself, and the session ends."""
 _LEAST_TRIES = 5
 """Least tries before a mirror is given up: a host that was held up has not read the answers yet."""
+_PARK_ANSWER_S = 0.05
+_PARK_SILENT_S = 5.0
+"""A mirror of which nothing is heard for this long, or for twice its watchdog, is not asked to park any more."""
 _START_ANSWER_S = 0.05
 """Wait for the answer to a camera's start, which is at a near step: the next try must not be late."""
 _START_TRIES = 60
@@ -128,13 +132,14 @@ class _NativeDevice:
 
     def _request(
         self, message: pb.CameraControl | pb.Park | pb.Rearm, what: str, answer_s: float = ANSWER_S, tries: int = TRIES,
-        codes: Sequence[int] = (pb.OK,),
+        codes: Sequence[int] = (pb.OK,), *, insist_s: float = 0.0,
     ) -> pb.Ack:  # fmt: skip
         """Send a request until it is answered; gives the answer. Raises DeviceError if its code is not among
         ``codes``."""
         ack = self._hub.request(
-            self.link, message, pb.Ack, lambda ack, sequence: ack.sequence == sequence, answer_s, tries
-        )
+            self.link, message, pb.Ack, lambda ack, sequence: ack.sequence == sequence, answer_s, tries,
+            insist_s=insist_s,
+        )  # fmt: skip
         if ack is None:
             raise DeviceError(f"the {self.link.name} did not answer when asked to {what}: is it still connected?")
         self._gate.passes(self.link, ack, self._hub.now_ns())
@@ -154,6 +159,7 @@ class NativeCamera(_NativeDevice):
         if geometry.scene_width:
             shapes.append((geometry.scene_height, geometry.scene_width))
         self._frames = PlanesReassembly(shapes, identity.fast_step_ns)
+        self._count = FrameCount(geometry.frame_period_steps)
         self._truths = TruthReassembly()
 
     def start(self, first_step: int, exposures: int) -> bool:
@@ -170,6 +176,15 @@ class NativeCamera(_NativeDevice):
     def chunks_refused(self) -> int:
         return self._frames.refused
 
+    def handle(self, received: Received) -> list[Event]:
+        message, what = received.message, ""
+        if isinstance(message, pb.FrameChunk):
+            message.frame_id, what = self._count.take(message.frame_id, message.first_step)
+        elif isinstance(message, pb.TruthChunk):
+            message.frame_id = self._count.of_newest(message.frame_id)
+        events = super().handle(received)
+        return [pb.Event(level=pb.Event.WARNING, text=f"{what}: frames are counted on"), *events] if what else events
+
     def _take(self, message: Message, receive_ns: int) -> list[Event]:
         if isinstance(message, pb.FrameChunk):
             frames = self._frames.add(message, receive_ns)
@@ -183,6 +198,7 @@ class NativeCamera(_NativeDevice):
                 raise lie(self.link.name, "TruthChunk.data", "bytes that are no Truth", "a serialised Truth") from None
             if truth is None:
                 return []
+            truth.frame_id = self._count.of_newest(truth.frame_id)
             self._gate.check_truth(self.link.name, truth, message.frame_id)
             return [truth]
         return self._sample_clock(message, receive_ns) if isinstance(message, pb.ClockReply) else []
@@ -206,6 +222,7 @@ class _Flight:
     put_off_ns: int = 0
     """The time at which a try was due and was not sent, because the one before it could still be answered."""
     timeouts: int = 0
+    times_full: int = 0
     tries: dict[int, int] = field(default_factory=dict)
     """The time at which each try was sent, by the sequence number of its packet."""
 
@@ -217,6 +234,10 @@ class _Flight:
             return since_ns + _LATE_TIMEOUTS * timeout_ns
         due_ns = since_ns + timeout_ns
         return int(self.latest_ns) if since_ns < self.latest_ns < due_ns else due_ns
+
+    def answered(self, ack: pb.CommandAck | None = None) -> CommandAnswered:
+        """The event that ends it; without an answer where none is waited for any more."""
+        return CommandAnswered(ack, self.block, self.first_ns, len(self.tries), self.times_full)
 
 
 class NativeMirror(_NativeDevice):
@@ -242,6 +263,8 @@ class NativeMirror(_NativeDevice):
         self._flights: dict[int, _Flight] = {}
         self._withdrawn: dict[int, _Flight] = {}
         """Blocks that are not sent again, but may still be answered."""
+        self._given_up: list[CommandAnswered] = []
+        """Blocks whose answers are not waited for any more, until that is an event."""
         self._answered_ns: int | None = None
         """The time at which the newest of the blocks that the mirror has accepted was sent."""
         self._reports = AppliedReports(identity.fast_step_ns, round(self._watchdog_s * 1e9))
@@ -297,7 +320,7 @@ class NativeMirror(_NativeDevice):
         for flight in replaced:
             self._withdrawn[flight.block.block_id] = self._flights.pop(flight.block.block_id)
         while len(self._withdrawn) > _MOST_WITHDRAWN:  # their answers were lost
-            del self._withdrawn[next(iter(self._withdrawn))]
+            self._given_up.append(self._withdrawn.pop(next(iter(self._withdrawn))).answered())
         return min([step, *(flight.block.first_step for flight in replaced)])
 
     def go_on_from(self, first_step: int, step: int) -> NDArray[np.float64]:
@@ -353,11 +376,19 @@ class NativeMirror(_NativeDevice):
         return list(self._reports.expect_until(end_step, now_ns))
 
     def park(self) -> int:
-        self._flights.clear()  # a block that came again afterwards would move the mirror
-        return self._request(pb.Park(), "park", self._answer_s()).step
+        self.withdraw(0)  # a block that came again afterwards would move the mirror
+        answer_s = max(self._timeout_ns() / 1e9, _PARK_ANSWER_S)
+        silent_s = min(_PATIENCE_WATCHDOGS * self._watchdog_s, _PARK_SILENT_S)
+        return self._request(pb.Park(), "park", answer_s, insist_s=silent_s).step
+
+    def last_answers(self) -> list[CommandAnswered]:
+        self.withdraw(0)
+        given_up = [*self._given_up, *(flight.answered() for flight in self._withdrawn.values())]
+        self._given_up, self._withdrawn = [], {}
+        return given_up
 
     def rearm(self) -> int:
-        self._flights.clear()  # after re-arming, the session sends the steps that are still to come anew
+        self.withdraw(0)  # after re-arming, the session sends the steps that are still to come anew
         step = self._request(pb.Rearm(), "end the latch of its watchdog", self._answer_s()).step
         self._gate.limits.parked()
         self.latched = False
@@ -375,10 +406,14 @@ class NativeMirror(_NativeDevice):
         self.latched, self.outage_s, self._answered_ns = self.identity.mirror.latched, 0.0, None
 
     def _take(self, message: Message, receive_ns: int) -> list[Event]:
+        given_up, self._given_up = self._given_up, []
+        return [*given_up, *self._answers_to(message, receive_ns)]
+
+    def _answers_to(self, message: Message, receive_ns: int) -> Sequence[Event]:
         if isinstance(message, pb.CommandAck):
             return self._take_ack(message, receive_ns)
         if isinstance(message, pb.Applied):
-            return list(self._reports.take(message, receive_ns))
+            return self._reports.take(message, receive_ns)
         if isinstance(message, pb.ClockReply):
             # While a block is sent again the line is busy in one direction, so such a sample is useless.
             clean = all(len(flight.tries) == 1 for flight in self._flights.values())
@@ -394,20 +429,23 @@ class NativeMirror(_NativeDevice):
             self._measure(max(0, receive_ns - sent_ns) / 1e9)
         if ack.code == pb.QUEUE_FULL:  # this answer is not final: the block is sent again when its time-out comes
             flight.heard_ns = receive_ns
+            flight.times_full += 1
             if (full_s := (receive_ns - flight.first_ns) / 1e9) > self._full_s:
                 expected = f"room in a queue of {self.identity.mirror.queue_steps} steps by then"
                 raise lie(self.name, "CommandAck.code", f"QUEUE_FULL for {full_s:.1f} s", expected)
             return []
-        for flights in (self._flights, self._withdrawn):
-            flights.pop(ack.block_id, None)
+        withdrawn = self._flights.pop(ack.block_id, None) is None
+        self._withdrawn.pop(ack.block_id, None)
         self.queue_end_step = ack.queue_end_step
-        if ack.code == pb.LATCHED:
+        if ack.code == pb.LATCHED and withdrawn:
+            pass  # it was sent before the mirror was re-armed or parked, or another block says the same
+        elif ack.code == pb.LATCHED:
             self.latched = True
             self.outage_s = 0.0 if self._answered_ns is None else (receive_ns - self._answered_ns) / 1e9
         else:
             self._answered_ns = max(self._answered_ns or 0, flight.last_ns if sent_ns is None else sent_ns)
         ack.text = printable(ack.text)
-        return [CommandAnswered(ack, flight.block)]
+        return [flight.answered(ack)]
 
     def _measure(self, round_trip_s: float) -> None:
         if math.isnan(self.round_trip_s):

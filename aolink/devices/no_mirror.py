@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aolink.devices.clock import ClockExchange, ClockRegression
-from aolink.devices.interfaces import Event, Lacks
+from aolink.devices.interfaces import CommandAnswered, Event, Lacks
 from aolink.errors import DeviceError
 from aolink.rig import Rig
 from aolink.wire import messages_pb2 as pb
@@ -89,6 +89,9 @@ class NoMirror:
 
     def park(self) -> int:
         return 0 if self._reported is None else self.since_zero_ns(self._now_ns()) // self._rig.timing.fast_step_ns
+
+    def last_answers(self) -> list[CommandAnswered]:
+        return []
 
     def rearm(self) -> int:
         raise DeviceError("there is no mirror to re-arm")

@@ -82,10 +82,12 @@ class AppliedReports:
         """Request every step before ``end`` that has not been reported, also without a later report."""
         if self._start is None or end <= self._next:
             return []
-        gap = _Gap(self._next, end, now_ns)
-        self._gaps.append(gap)
-        self._next = end
-        return [pb.Applied(first_step=gap.first, n_steps=end - gap.first, source=pb.Applied.AWAITED)]
+        first, self._next = self._next, end
+        if self._gaps and self._gaps[-1].end == first:  # one query will do
+            self._gaps[-1].end = end
+        else:
+            self._gaps.append(_Gap(first, end, now_ns))
+        return [pb.Applied(first_step=first, n_steps=end - first, source=pb.Applied.AWAITED)]
 
     def ask_anew(self, now_ns: int) -> None:
         """Request all missing steps as if they were missing since now: the device could not be asked before."""

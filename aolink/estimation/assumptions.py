@@ -9,9 +9,8 @@ import math
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
-from aolink.numerics.arrays import BoolArray, FloatArray
+from aolink.numerics.arrays import FloatArray
 from aolink.optics.camera import effective_noise_density, shot_gain
 from aolink.rig import Rig
 
@@ -26,10 +25,6 @@ LEAST_KERNEL_PIXELS = 0.8
 """Least sigma of the kernel, pixels."""
 LEAST_PEAK_SNR, MOST_PEAK_SNR = 1.0, 300.0
 """Least and largest signal to noise in the brightest pixel of a resting spot."""
-
-_BRIGHT = 100.0
-"""Signal to noise from which on several processes, with a vibration that outlasts a frame period among them, give
-posteriors that importance sampling takes to be narrower than they are."""
 
 # An eigenmode that makes less than this share of the motion's variance does not count.
 _LEAST_SHARE = 0.01
@@ -87,8 +82,7 @@ def broken_assumptions(rig: Rig) -> Iterator[tuple[str, str]]:
         yield (
             "plant.A",
             f"{count} eigenmodes of the plant move the spot along one axis, estimators were judged with up to"
-            f" {MOST_MODES}: with more, intervals of profile and mixture may be too narrow; compare them with those of"
-            " moments",
+            f" {MOST_MODES}: with more, intervals of profile may be too narrow; compare them with those of moments",
         )
     if fastest > MOST_SWINGS + _ROUNDING:
         yield (
@@ -115,78 +109,13 @@ def broken_assumptions(rig: Rig) -> Iterator[tuple[str, str]]:
             )
 
 
-def importance_is_too_sure(rig: Rig) -> bool:
-    """Whether importance sampling often takes posteriors to be narrower than they are, and its weights do not show it:
-    with a bright spot that several processes move along one axis, one of them a vibration that goes on for longer than
-    a frame period.
-
-    False where processes cannot be told apart: their matrix is defective, or there are more than two outputs.
-    """
-    if peak_snr(rig) < _BRIGHT or rig.plant.n_outputs > _MOST_OUTPUTS:
-        return False
-    values, seen, apart = _eigenmodes(rig)
-    return apart and bool(((seen.sum(axis=1) > 1) & (seen & _outlasts(rig, values)).any(axis=1)).any())
-
-
-def modes_stay_lost(rig: Rig) -> bool:
-    """Whether a mode of the posterior that an estimator misses stays lost for long: with a vibration that makes a whole
-    swing or more in an exposure, of which the centroid tells little, and goes on for longer than a frame period, so
-    that a wrong state is carried on.
-
-    False with more than two outputs.
-    """
-    if rig.plant.n_outputs > _MOST_OUTPUTS:
-        return False
-    values, seen, _ = _eigenmodes(rig)
-    hardly_moves_centroid = _swings(rig, values) >= 1 - _ROUNDING
-    return bool((seen & _outlasts(rig, values) & hardly_moves_centroid).any())
-
-
-def _outlasts(rig: Rig, values: NDArray[np.complex128]) -> BoolArray:
-    """Which eigenvalues are those of a vibration that goes on for longer than a frame period."""
-    return np.asarray((values.imag > 0) & (np.abs(values) > math.exp(-1 / rig.timing.frame_period_steps)))
-
-
-def _swings(rig: Rig, values: NDArray[np.complex128]) -> FloatArray:
-    """Swings in an exposure, by eigenvalues."""
-    return np.angle(values) / (2 * math.pi) * rig.timing.exposure_steps
-
-
-def narrow_intervals(rig: Rig) -> Iterator[tuple[str, str]]:
-    """The rig file's key and a sentence for a rig on which importance sampling is often too sure."""
-    if importance_is_too_sure(rig):
-        what = (
-            "profile misses some of the paths that explain a blur on such a rig, and its 95 % intervals are often too"
-            " narrow; mixture searches at length, which takes some 0.2 s an axis and exposure"
-        )
-        if modes_stay_lost(rig):
-            what = (
-                "paths that explain a blur are easily missed on such a rig; profile searches at length there, as"
-                " mixture does, which takes up to a second or so an axis and exposure, and the 95 % intervals may still"
-                " be too narrow"
-            )
-        yield (
-            "sensor.noise_density",
-            f"signal to noise is {peak_snr(rig):.3g}, and several motions (eigenmodes of the plant) move the spot, one"
-            f" of them a vibration that lasts for longer than a frame period: {what}; compare both with moments",
-        )
-
-
 def _modes(rig: Rig) -> tuple[int, FloatArray]:
     """The number of eigenmodes that move the spot along one axis, an oscillation counting as one; and the swings of
-    each in an exposure."""
-    values, seen, _ = _eigenmodes(rig)
-    return int(seen.sum(axis=1).max()), _swings(rig, values[seen.any(axis=0)])
-
-
-def _eigenmodes(rig: Rig) -> tuple[NDArray[np.complex128], BoolArray, bool]:
-    """The eigenvalues for a fast step, (n,); which of them move which output, one of each conjugate pair, (outputs, n);
-    and whether they can be told apart: where not, all count."""
+    each in an exposure. Where they cannot be told apart, all count."""
     plant = rig.plant
     values, vectors = np.linalg.eig(plant.A)
     share = np.ones((plant.n_outputs, len(values)))
-    apart = bool(np.linalg.cond(vectors) < _MOST_CONDITION)
-    if apart:
+    if np.linalg.cond(vectors) < _MOST_CONDITION:
         back = np.linalg.inv(vectors)
         own = np.einsum("is,st,it->i", back, plant.initial_covariance, back.conj()).real
         # Both of a pair: together they make up to four times what one does.
@@ -194,4 +123,5 @@ def _eigenmodes(rig: Rig) -> tuple[NDArray[np.complex128], BoolArray, bool]:
         variance = np.diag(plant.C @ plant.initial_covariance @ plant.C.T)
         share = motion / np.maximum(variance, 1e-300)[:, None]
     seen = (values.imag >= 0) & (share > _LEAST_SHARE)
-    return values.astype(complex), seen, apart
+    swings = np.angle(values[seen.any(axis=0)]) / (2 * math.pi) * rig.timing.exposure_steps
+    return int(seen.sum(axis=1).max()), swings

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from aolink.errors import EstimatorError
-from aolink.estimation.assumptions import importance_is_too_sure, modes_stay_lost
 from aolink.estimation.frames.centroid_noise import centroid_covariance
 from aolink.estimation.frames.frame_data import Profile, SpotWindows
 from aolink.estimation.kalman.filter import BlurFilter, Filter, TwoStateFilter
@@ -26,9 +25,6 @@ from aolink.numerics.arrays import FloatArray
 from aolink.optics.sensor import SpotSensor
 from aolink.plant.alike import alike_systems
 from aolink.rig import Rig
-
-if TYPE_CHECKING:
-    from aolink.estimation.pixels.updates import ImportanceUpdater
 
 
 def _blur_filter(rig: Rig, options: Options, observation: Observation[Any] | None, **more: Any) -> BlurFilter:
@@ -122,30 +118,11 @@ def _warm_up_line(rig: Rig, options: Options) -> None:
 
 def profile(rig: Rig, options: Options) -> Filter:
     if alike_systems(rig.plant) is None:
-        from aolink.estimation.pixels.updates import PROFILE
+        from aolink.estimation.pixels.profile import ProfileUpdater
 
-        return _of_pixels(rig, options, _budgeted(rig, options, PROFILE))
+        return _of_pixels(rig, options, ProfileUpdater(options.draws / 100))
     _warm_up(rig)
     return _blur_filter(rig, options, JointProfile(_spots(rig), rig.plant.n_outputs))
-
-
-def mixture(rig: Rig, options: Options) -> Filter:
-    from aolink.estimation.pixels.updates import MIXTURE
-
-    return _of_pixels(rig, options, _budgeted(rig, options, MIXTURE))
-
-
-def _budgeted(rig: Rig, options: Options, updates: ImportanceUpdater) -> ImportanceUpdater:
-    """The updater for a rig and a budget: that of `mixture` where importance sampling does not show that it missed a
-    mode, and the mode would stay lost."""
-    from aolink.estimation.pixels.updates import MIXTURE
-
-    # The copies of a rig whose parameter wanders are to work alike, or their evidence could not be compared.
-    wanders = rig.plant.wandering is not None
-    too_sure, stay_lost = not wanders and importance_is_too_sure(rig), wanders or modes_stay_lost(rig)
-    if too_sure and stay_lost and options.tempered != 0:
-        updates = MIXTURE
-    return updates.within(options.tempered, options.draws / 100, too_sure=too_sure, stay_lost=stay_lost)
 
 
 def sampled(rig: Rig, options: Options) -> Filter:
@@ -157,10 +134,8 @@ def sampled(rig: Rig, options: Options) -> Filter:
 def _of_pixels(rig: Rig, options: Options, updates: Any) -> Filter:
     """The filters that use every pixel; their compiled code is loaded when the first one is made."""
     from aolink.estimation.pixels.filter import MixtureFilter
-    from aolink.estimation.pixels.updates import MIXTURE
 
     pixels = MixtureFilter(rig.plant, rig.sensor, updates, gate=options.gate)
-    # mixture compiles at once what profile would compile at the first posterior of several modes.
-    pixels.warm_up(MIXTURE)
+    pixels.warm_up(updates)
     updates.reduction(exposure_model(rig.plant, rig.timing.exposure_steps, rig.timing.exposure_offset), rig.sensor)
     return pixels

@@ -14,7 +14,7 @@ Engine = Literal["aolink", "filterpy"]
 
 _HIGHEST_ORDER = 8
 # Fewer particles than this do not describe a posterior of a dozen coefficients and more.
-_FEWEST_TEMPERED = 100
+_FEWEST_PARTICLES = 100
 _MOST_DRAWS = 400
 
 
@@ -40,16 +40,10 @@ class Options:
     """Orders of the moments that `moments` takes, in its basis; 0 is the light in the window."""
     basis: Basis = "monomial"
     """Basis of `moments`: "monomial", "legendre" or "fourier"."""
-    tempered: int | None = None
-    """Points that `profile` and `mixture` temper for an axis and exposure where importance sampling is not enough: the
-    budget of work, beside that of the importance sampling which weighs them. None: 600 and 1200. 0: none; such
-    estimates are as wide as their few effective points make them, and too narrow where importance sampling is too
-    sure."""
     draws: int = 100
-    """Points that `profile` and `mixture` draw for importance sampling, in per cent of the usual number: a budget of
-    work as well; it does not count where tempered points are weighed. With 5 an exposure takes a sixth of the time, the
-    estimates have larger errors, and the log-evidence, which is not from these points, still tells models that differ
-    much apart."""
+    """Points that `profile` draws for importance sampling, in per cent of the usual number: the budget of work. With 5
+    an exposure takes a sixth of the time, the estimates have larger errors, and the log-evidence, which is not from
+    these points, still tells models that differ much apart."""
     particles: int | None = None
     """Number of particles of `sampled`. None: 500 to 2000, fewer where the pixels and coefficients of a rig make each
     more work, so that an exposure takes about a second at most."""
@@ -100,12 +94,8 @@ def checked_options(**options: Any) -> Options:
     for key, kind in get_type_hints(Options).items():
         if get_origin(kind) is Literal and getattr(chosen, key) not in (values := get_args(kind)):
             raise EstimatorError(f"{key} = {getattr(chosen, key)!r} is not known: use one of {', '.join(values)}")
-    if chosen.tempered is not None and chosen.tempered != 0 and chosen.tempered < _FEWEST_TEMPERED:
-        raise EstimatorError(
-            f"tempered = {chosen.tempered}: use at least {_FEWEST_TEMPERED} points, or 0 for no tempering"
-        )
-    if chosen.particles is not None and chosen.particles < _FEWEST_TEMPERED:
-        raise EstimatorError(f"particles = {chosen.particles}: use at least {_FEWEST_TEMPERED}")
+    if chosen.particles is not None and chosen.particles < _FEWEST_PARTICLES:
+        raise EstimatorError(f"particles = {chosen.particles}: use at least {_FEWEST_PARTICLES}")
     if not 1 <= chosen.draws <= _MOST_DRAWS:
         raise EstimatorError(f"draws = {chosen.draws}: use 1 to {_MOST_DRAWS} per cent of the usual points")
     if chosen.second_order and chosen.engine == "filterpy":

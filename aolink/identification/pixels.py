@@ -30,9 +30,8 @@ from aolink.numerics.arrays import FloatArray
 from aolink.numerics.workers import in_threads
 from aolink.rig import Rig
 
-_ESTIMATOR = "profile:tempered=0"
-"""Without tempered points: they cost ten times as much, and the evidence is not from them."""
-_QUICK = f"{_ESTIMATOR},draws=5"
+_ESTIMATOR = "profile"
+_QUICK = f"{_ESTIMATOR}:draws=5"
 """With few points, which cost most of the rest: enough to decide between candidates."""
 _RULED_OUT = 30.0
 """Nats by which a candidate is behind where it is left out: the evidence is approximate."""

@@ -26,7 +26,7 @@ from aolink.jobs.tables import COLUMNS
 from aolink.jobs.unit import Model, Settings, estimated, score_row
 from aolink.numerics.workers import processes
 from aolink.recording.reader import Recording
-from aolink.recording.reestimate import check_has_exposures, fill_reestimated, scored
+from aolink.recording.reestimate import check_has_exposures, fill_reestimated, own_estimators, scored
 from aolink.recording.remote import Url, location
 
 _IN_EVERY_ROW = {"recording", "model", "estimator", "exposures", "output"}
@@ -348,13 +348,14 @@ def _estimated(job: Job, target: Path) -> list[dict[str, Any]]:
     begin = time.perf_counter()
     recording = job.model.applied_to(Recording(job.source))
     check_has_exposures(recording)
-    names = list(job.estimators or recording.estimators or [DEFAULT_ESTIMATOR])
+    left_out: list[str] = []
+    names = list(job.estimators or own_estimators(recording, left_out.append) or [DEFAULT_ESTIMATOR])
     fill_reestimated(recording, names, target, only=job.only, engine=job.engine)
     seconds = time.perf_counter() - begin
     return [
         {"recording": str(job.source), "model": job.model.name, "estimator": name, "output": job.output.name}
         | score_row(score)
-        | {"seconds": round(seconds, 3), "damage": recording.damage or None}
+        | {"seconds": round(seconds, 3), "damage": "; ".join(filter(None, [recording.damage, *left_out])) or None}
         for name, score in scored(Recording(target), names).items()
     ]
 

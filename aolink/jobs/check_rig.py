@@ -14,7 +14,7 @@ import numpy as np
 from aolink.devices.drivers import KINDS, NATIVE, check_driver, native_port
 from aolink.devices.interfaces import lacks_of
 from aolink.errors import AolinkError
-from aolink.estimation.assumptions import broken_assumptions, narrow_intervals, peak_snr
+from aolink.estimation.assumptions import broken_assumptions, peak_snr
 from aolink.estimation.frames.moments import least_significance, spot_significance
 from aolink.numerics.arrays import FloatArray
 from aolink.optics.kernel import exposure_density
@@ -77,7 +77,6 @@ def check_rig(rig: Rig) -> list[Finding]:
                 *_check_timing(rig), *_check_sensor(rig), *_check_signal(rig, path), *_check_motion(rig, path),
                 *_check_field(rig, path, sd), *_check_mirror(rig), *_check_simulation(rig), *_check_observability(rig),
                 *(_warning(*each) for each in broken_assumptions(rig)),
-                *(_info(*each) for each in narrow_intervals(rig)),
             ]  # fmt: skip
     except (ArithmeticError, ValueError) as error:  # a LinAlgError is a ValueError
         return [_error("rig", f"it has numbers that are too large or too small to compute with ({error})")]

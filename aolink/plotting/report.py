@@ -23,6 +23,7 @@ from aolink.plotting.scene import plot_scene
 from aolink.plotting.session import plot_blur, plot_errors, plot_nis
 from aolink.plotting.style import TimeUnit, new_figure, paper
 from aolink.recording import topics
+from aolink.recording.answers import Answers
 from aolink.recording.facts import recording_facts
 from aolink.recording.reader import Recording
 from aolink.units import duration, with_unit
@@ -131,6 +132,7 @@ class _Session:
             **self.recording.facts(),
             "gaps": f"{facts['gaps']['count']}, the longest {facts['gaps']['longest_steps']} fast steps",
             "steps": _counts(facts["commands"]) or "no counts of commanded steps",
+            "answers": "; ".join(Answers.of(facts["answers"]).lines()),
             "losses": _counts(facts["losses"]) or "none counted",
             "damage": facts["damage"],
         }

@@ -11,9 +11,11 @@ from typing import Any
 from aolink.estimation import Status
 from aolink.estimation.score import UnusedCounter
 from aolink.recording import topics
+from aolink.recording.answers import AnswerCounter, Answers
 from aolink.recording.reader import Recording
+from aolink.recording.schemas_pb2 import CommandAnswer, ExposureInfo
 from aolink.recording.schemas_pb2 import Estimate as EstimateMessage
-from aolink.recording.schemas_pb2 import ExposureInfo
+from aolink.wire.messages_pb2 import Applied
 
 _LOSSES = (
     "frames_lost", "frames_incomplete", "scenes_lost", "scenes_incomplete", "connection_sequence_gaps",
@@ -36,7 +38,7 @@ _ENDS = ("commanded", "applied", "superseded", "late", "refused", "not_reported"
 def recording_facts(recording: Recording) -> dict[str, Any]:
     """The summary of a recording as plain data, which `aolink info --json` prints."""
     duration_s = (recording.end_ns - recording.start_ns) / 1e9
-    gaps, estimates = _gaps_and_estimates(recording)
+    gaps, estimates, answers = _gaps_estimates_answers(recording)
     return {
         "file": str(recording.path),
         "bytes": recording.size,
@@ -56,6 +58,7 @@ def recording_facts(recording: Recording) -> dict[str, Any]:
         "commands": {
             end: int(steps) for end in _ENDS if (steps := recording.end_metadata.get(f"steps_{end}", "")).isdigit()
         },
+        "answers": asdict(answers),
         "losses": _losses(recording),
         "damaged_parts": [loss.text() for loss in recording.losses],
         "truth": topics.TRUTH in recording.counts,
@@ -72,17 +75,23 @@ def _date(time_ns: int) -> str | None:
         return None
 
 
-def _gaps_and_estimates(recording: Recording) -> tuple[dict[str, float], dict[str, Any]]:
+def _gaps_estimates_answers(recording: Recording) -> tuple[dict[str, float], dict[str, Any], Answers]:
     """Number and longest length of the gaps between the camera's frames, in fast steps.
 
-    Also the number of estimates of each estimator, and the reasons why some could not use their exposure.
+    Also the number of estimates of each estimator, and the reasons why some could not use their exposure; and what the
+    mirror answered to its commands, and why some had no effect.
     """
     period, last, gaps = recording.rig.timing.frame_period_steps, None, []
     names = recording.estimators
     counts, unused = dict.fromkeys(names, 0), {name: UnusedCounter() for name in names}
+    answers = AnswerCounter()
     for recorded in recording.messages():  # all of them, because one that cannot be used is found when it is read
         message = recorded.message
-        if isinstance(message, ExposureInfo):
+        if isinstance(message, CommandAnswer):
+            answers.answered(message)
+        elif isinstance(message, Applied):
+            answers.applied(message)
+        elif isinstance(message, ExposureInfo):
             if last is not None and message.first_step - last != period:
                 gaps.append(message.first_step - last - period)
             last = message.first_step
@@ -92,7 +101,7 @@ def _gaps_and_estimates(recording: Recording) -> tuple[dict[str, float], dict[st
             with contextlib.suppress(ValueError):  # a status of a later aolink
                 unused[name].add(Status(message.status), message.reason, message.frame_id)
     estimates = {name: {"count": n, "unused": [asdict(u) for u in unused[name].result()]} for name, n in counts.items()}
-    return {"count": len(gaps), "longest_steps": max(gaps, default=0)}, estimates
+    return {"count": len(gaps), "longest_steps": max(gaps, default=0)}, estimates, answers.result()
 
 
 def _losses(recording: Recording) -> dict[str, int]:

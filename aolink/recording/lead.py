@@ -10,6 +10,9 @@ from google.protobuf.message import Message
 
 from aolink.recording import topics
 
+_MOST_STEPS = 100_000
+"""How far an exposure looks back, as in `aolink.assembly`."""
+
 
 class Lead:
     """Reads the messages of a recording, and keeps those that later exposures need."""
@@ -22,6 +25,8 @@ class Lead:
         row = topics.find(topic, message)
         if row.belongs_to == "steps":
             self._kept.append((topic, message, log_time_ns, sequence))
+            while self._kept[0][1].first_step + self._kept[0][1].n_steps <= message.first_step - _MOST_STEPS:
+                self._kept.popleft()
         elif row.name == topics.EXPOSURE:
             # Exposures still to come begin after the last step of this one.
             self._kept = deque(

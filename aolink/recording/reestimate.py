@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from importlib.metadata import version
 from pathlib import Path
 
@@ -11,6 +11,7 @@ import numpy as np
 from aolink.errors import RecordingError
 from aolink.estimation import Driver, Engine, Estimate, Score, Scorer
 from aolink.estimation.estimate import COMPARED
+from aolink.estimation.registry import retired
 from aolink.exporting.common import Progress, no_progress
 from aolink.exposure import Exposure
 from aolink.files import writing
@@ -63,10 +64,10 @@ class Reestimated(Recording):
     and nothing is written. An estimator skips the exposures that it had no time for in the session.
     """
 
-    def __init__(self, recording: Recording) -> None:
+    def __init__(self, recording: Recording, names: Iterable[str]) -> None:
         super().__init__(recording.path)
         self._source = recording
-        self.counts = {topics.estimate_topic(name): recording.n_frames for name in recording.estimators}
+        self.counts = {topics.estimate_topic(name): recording.n_frames for name in names}
 
     def raw_messages(
         self, *wanted: str, start_ns: int = 0, end_ns: int = END_OF_TIME, first_chunk: int = 0
@@ -75,6 +76,13 @@ class Reestimated(Recording):
         for exposure, estimates in reestimated(self._source, names, as_recorded=True):
             for estimate in estimates:
                 yield recorded_estimate(estimate, exposure.host_receive_ns)
+
+
+def own_estimators(recording: Recording, say: Callable[[str], None]) -> list[str]:
+    """The estimators of a recording that can run again; ``say`` gets a line about each of an earlier version."""
+    for reason in filter(None, map(retired, recording.estimators)):
+        say(f"{recording.path.name} has estimates that are not made again: {reason}")
+    return [name for name in recording.estimators if not retired(name)]
 
 
 def skipped_by(recording: Recording, names: Sequence[str]) -> dict[str, frozenset[int]]:

@@ -67,6 +67,54 @@ class ClockSample(_message.Message):
     sigma_ns: float
     def __init__(self, device: _Optional[str] = ..., host_send_ns: _Optional[int] = ..., device_receive_ns: _Optional[int] = ..., device_send_ns: _Optional[int] = ..., host_receive_ns: _Optional[int] = ..., round_trip_ns: _Optional[int] = ..., accepted: _Optional[bool] = ..., offset_ns: _Optional[float] = ..., frequency_ppm: _Optional[float] = ..., sigma_ns: _Optional[float] = ...) -> None: ...
 
+class CommandAnswer(_message.Message):
+    __slots__ = ("block_id", "first_step", "n_steps", "answer", "text", "late_steps", "superseded_steps", "queue_end_step", "tries", "times_full", "sent_ns", "answered_ns", "device_ns")
+    class Answer(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+        __slots__ = ()
+        OK: _ClassVar[CommandAnswer.Answer]
+        OUT_OF_RANGE: _ClassVar[CommandAnswer.Answer]
+        WRONG_SHAPE: _ClassVar[CommandAnswer.Answer]
+        QUEUE_FULL: _ClassVar[CommandAnswer.Answer]
+        NOT_SUPPORTED: _ClassVar[CommandAnswer.Answer]
+        TOO_LATE: _ClassVar[CommandAnswer.Answer]
+        LATCHED: _ClassVar[CommandAnswer.Answer]
+        NONE: _ClassVar[CommandAnswer.Answer]
+    OK: CommandAnswer.Answer
+    OUT_OF_RANGE: CommandAnswer.Answer
+    WRONG_SHAPE: CommandAnswer.Answer
+    QUEUE_FULL: CommandAnswer.Answer
+    NOT_SUPPORTED: CommandAnswer.Answer
+    TOO_LATE: CommandAnswer.Answer
+    LATCHED: CommandAnswer.Answer
+    NONE: CommandAnswer.Answer
+    BLOCK_ID_FIELD_NUMBER: _ClassVar[int]
+    FIRST_STEP_FIELD_NUMBER: _ClassVar[int]
+    N_STEPS_FIELD_NUMBER: _ClassVar[int]
+    ANSWER_FIELD_NUMBER: _ClassVar[int]
+    TEXT_FIELD_NUMBER: _ClassVar[int]
+    LATE_STEPS_FIELD_NUMBER: _ClassVar[int]
+    SUPERSEDED_STEPS_FIELD_NUMBER: _ClassVar[int]
+    QUEUE_END_STEP_FIELD_NUMBER: _ClassVar[int]
+    TRIES_FIELD_NUMBER: _ClassVar[int]
+    TIMES_FULL_FIELD_NUMBER: _ClassVar[int]
+    SENT_NS_FIELD_NUMBER: _ClassVar[int]
+    ANSWERED_NS_FIELD_NUMBER: _ClassVar[int]
+    DEVICE_NS_FIELD_NUMBER: _ClassVar[int]
+    block_id: int
+    first_step: int
+    n_steps: int
+    answer: CommandAnswer.Answer
+    text: str
+    late_steps: int
+    superseded_steps: int
+    queue_end_step: int
+    tries: int
+    times_full: int
+    sent_ns: int
+    answered_ns: int
+    device_ns: int
+    def __init__(self, block_id: _Optional[int] = ..., first_step: _Optional[int] = ..., n_steps: _Optional[int] = ..., answer: _Optional[_Union[CommandAnswer.Answer, str]] = ..., text: _Optional[str] = ..., late_steps: _Optional[int] = ..., superseded_steps: _Optional[int] = ..., queue_end_step: _Optional[int] = ..., tries: _Optional[int] = ..., times_full: _Optional[int] = ..., sent_ns: _Optional[int] = ..., answered_ns: _Optional[int] = ..., device_ns: _Optional[int] = ...) -> None: ...
+
 class ConnectionStatistics(_message.Message):
     __slots__ = ("device", "messages_received", "bytes_received", "messages_sent", "bytes_sent", "bad_crc", "bad_framing", "bad_payload", "sequence_gaps", "duplicates", "retransmits", "commands_in_flight", "round_trip_s", "queue_end_step", "reports_asked")
     DEVICE_FIELD_NUMBER: _ClassVar[int]

@@ -53,6 +53,11 @@ def _of_run(run: wire.Applied | wire.CommandBlock | Run, rig: Rig) -> str:
     return "" if fine else "u has an input that is no number, or beyond all"
 
 
+def _of_answer(answer: pb.CommandAnswer, rig: Rig) -> str:
+    beyond = (answer.first_step + answer.n_steps) * rig.timing.fast_step_ns > _LAST_NS
+    return "first_step is beyond all times" if beyond else ""
+
+
 def _of_exposure(info: pb.ExposureInfo, rig: Rig) -> str:
     if info.frame_id > _LAST_NS:
         return "frame_id is beyond all counts"
@@ -132,6 +137,7 @@ _CHECKS: dict[type[Message], Callable[[Any, Rig], str]] = {
     Run: _of_run,
     wire.Applied: _of_run,
     wire.CommandBlock: _of_run,
+    pb.CommandAnswer: _of_answer,
     pb.ExposureInfo: _of_exposure,
     pb.Estimate: _of_estimate,
     wire.Truth: _of_truth,

@@ -17,6 +17,7 @@ EXPOSURE = "/camera/exposure"
 IMAGE = "/camera/image"
 COMMAND = "/mirror/command"
 APPLIED = "/mirror/applied"
+ANSWER = "/mirror/ack"
 SCENE_EXPOSURE = "/scene/exposure"
 SCENE = "/scene/image"
 TRUTH = "/truth"
@@ -65,6 +66,7 @@ TOPICS = (
     Topic(IMAGE, RawImage, "exposure", after=EXPOSURE, repeatable=True, shown_by="camera.log_frames"),
     Topic(COMMAND, wire.CommandBlock, "steps", repeatable=True, shown_by="devices.log_commands"),
     Topic(APPLIED, wire.Applied, "steps", repeatable=True, shown_by="devices.log_applied"),
+    Topic(ANSWER, pb.CommandAnswer, "steps", shown_by="devices.log_answers"),
     Topic(SCENE_EXPOSURE, pb.ExposureInfo, "exposure", shown_by="scene.log_scenes"),
     Topic(SCENE, RawImage, "exposure", after=SCENE_EXPOSURE, shown_by="scene.log_scenes"),
     Topic(TRUTH, wire.Truth, "exposure", repeatable=True, shown_by="motion.log_truth"),
@@ -84,8 +86,8 @@ SCHEMAS = {row.message.DESCRIPTOR.full_name: row.message for row in TOPICS}
 """Message class by the full name of its schema."""
 PICTURES = {row.after: tuple(each.name for each in TOPICS if each.after == row.after) for row in TOPICS if row.after}
 """The topics with facts about an exposure's pictures, and the topics of the pictures that follow them."""
-RUNS = {row.name: row.message.DESCRIPTOR.full_name for row in TOPICS if row.belongs_to == "steps"}
-"""The topics with runs of steps, and their schemas."""
+RUNS = {row.name: row.message.DESCRIPTOR.full_name for row in TOPICS if "u" in row.message.DESCRIPTOR.fields_by_name}
+"""The topics with the inputs of runs of steps, and their schemas."""
 _UNKNOWN = Topic("", Message)
 
 FORMER_TOPICS = {"/link": CONNECTION}

@@ -36,6 +36,7 @@ _POLL_S = 0.005
 """Time between two checks of the queue, s: waking the thread for each message would cost more than the writing."""
 _STALL_S = 5.0
 """A disk that takes longer over one write stops the session."""
+_AGAIN_S = 0.1
 _LOOK_S = 1.0
 """Time between two comparisons of the open file with its path, s."""
 _LOOK_BYTES = 16 << 10
@@ -163,6 +164,8 @@ class RecordingWriter:
         self._queue.append((topic, None if self._lead is None else message, data, log_time_ns))
 
     def _wait_for_room(self) -> None:
+        if self._is_stalled():  # or this whole process was stopped, and the thread has not gone on yet
+            time.sleep(_AGAIN_S)
         while self._is_stalled() or self._is_full():
             if self._error:
                 raise self._error

@@ -33,6 +33,7 @@ from aolink.session.live import Show
 from aolink.session.loop import ESTIMATES_S, SessionLoop
 from aolink.session.report import EstimatorReport, Report
 from aolink.session.waiting import Aside, most_waiting
+from aolink.signals import Interrupted
 
 __all__ = ["EstimatorReport", "Report", "record"]
 
@@ -209,13 +210,14 @@ def record(
         except BaseException as error:
             clock.hurry()
             try:
-                loop.make_safe()
+                _make_safe(loop)
                 if isinstance(error, ControlError):
                     error.args = (f"{error}; the mirror is parked",)
             except AolinkError as unsafe:
                 report.warnings.append(str(unsafe))
             report.ended = f"error: {error}" if isinstance(error, AolinkError) else f"error: {error!r}"
-            loop.close_account()
+            with contextlib.suppress(AolinkError):
+                loop.close_account()
             with contextlib.suppress(AolinkError):
                 loop.finish_estimates(ESTIMATES_S if isinstance(error, PortError | DeviceError) else 0.0)
             if not (isinstance(error, PortError | DeviceError) and stop()):
@@ -239,6 +241,14 @@ def record(
     if not writer.paths:
         report.warnings.append(f"no exposure came: {path} is as it was")
     return report
+
+
+def _make_safe(loop: SessionLoop) -> None:
+    """Park the mirror, again after each interruption, until it has confirmed that or an error says that it cannot be
+    reached."""
+    while True:
+        with contextlib.suppress(Interrupted, KeyboardInterrupt):
+            return loop.make_safe()
 
 
 @contextlib.contextmanager

@@ -24,6 +24,8 @@ class _Block:
     steps: NDArray[np.int8]
     """State of each step: one of the four above."""
     ack: wire.CommandAck | None = None
+    awaited: bool = True
+    """Whether its answer may still come."""
 
     @property
     def end(self) -> int:
@@ -52,11 +54,11 @@ class Account:
         self._blocks[block.block_id] = _Block(block.first_step, steps)
         self._report.steps_commanded += block.n_steps
 
-    def answered(self, ack: wire.CommandAck) -> None:
-        """Note that the mirror has acknowledged or refused a block."""
-        if block := self._blocks.get(ack.block_id):
-            block.ack = ack
-            self._settle(ack.block_id, block)
+    def answered(self, block_id: int, ack: wire.CommandAck | None) -> None:
+        """Note that the mirror has acknowledged or refused a block; None if its answer is not waited for any more."""
+        if block := self._blocks.get(block_id):
+            block.ack, block.awaited = ack, False
+            self._settle(block_id, block)
 
     def reported(self, applied: wire.Applied) -> None:
         """Take a report of the inputs that the mirror held in some steps, or that there is none; each step must be
@@ -86,10 +88,7 @@ class Account:
         """End every step that is still open: no more answers or reports will come."""
         for block_id, block in list(self._blocks.items()):
             block.steps[block.steps == _OPEN] = _UNKNOWN
-            self._settle(block_id, block)
-            self._count("steps_late", block.steps, block.steps == _PASSED)
-            self._count("steps_not_reported", block.steps, block.steps == _UNKNOWN)
-        self._blocks.clear()
+            self.answered(block_id, block.ack)
 
     def _settle(self, block_id: int, block: _Block) -> None:
         """Count the steps that have ended, as far as the answer to their block is known."""
@@ -100,6 +99,9 @@ class Account:
             late = steps[: ack.late_steps]
             self._count("steps_late", late, (late == _PASSED) | (late == _UNKNOWN))
             self._count("steps_superseded", steps, steps == _PASSED)
+        elif not block.awaited:
+            self._count("steps_late", steps, steps == _PASSED)
+        if not block.awaited:
             self._count("steps_not_reported", steps, steps == _UNKNOWN)
         if (steps == _ENDED).all():
             del self._blocks[block_id]

@@ -92,6 +92,17 @@ class Commanding:
         self.queued_until = max(self._first_step, self.device_step() + self._rig.mirror.block_steps)
         return self.queued_until
 
+    def catch_up(self) -> None:
+        """Go on from the fast step that the device is in, where it had been believed to be in another: steps that have
+        gone by are not commanded, and steps that its queue has no room for not yet."""
+        step = self.device_step() + self._rig.mirror.block_steps
+        if self.queued_until < step + self._rig.mirror.queue_steps:
+            self._leave_out()
+        else:
+            self._mirror.withdraw(step)
+            self._mirror.go_on_from(step, step)
+            self.queued_until = step
+
     def send(self, newest_frame: int) -> None:
         """Send what is due; the inputs can depend on the exposures up to ``newest_frame``."""
         self._send(self.device_step(), newest_frame)
@@ -144,10 +155,10 @@ class Commanding:
         ones."""
         if self._controlling is None or self.ended:
             return
-        message, first_step, warning = self._controlling.see(exposure, estimate, self._reached_step())
+        message, first_step, warnings = self._controlling.see(exposure, estimate, self._reached_step())
         if first_step < self.queued_until:
             # No later than the first changed step: the limits apply from the input that the controller continues from.
             self.queued_until = min(first_step, max(self.device_step() + 1, self._mirror.withdraw(first_step)))
         self._journal.record(topics.CONTROL, message, log_time_ns)
-        if warning:
+        for warning in warnings:
             self._journal.warn(warning)

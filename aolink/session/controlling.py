@@ -70,18 +70,20 @@ class Controlling:
         if applied.u:
             self.loop.applied(applied.first_step, np.array(applied.u).reshape(applied.n_steps, self._n_inputs))
 
-    def see(self, exposure: Exposure, estimate: Estimate | None, earliest_step: int) -> tuple[pb.Control, int, str]:
+    def see(
+        self, exposure: Exposure, estimate: Estimate | None, earliest_step: int
+    ) -> tuple[pb.Control, int, list[str]]:
         """Take the next exposure, or its estimate. Raises ControlError where the controller fails.
 
-        Gives what is recorded, the fast step from which on commands are to be sent anew, and a warning for the user,
-        which is empty while nothing has changed.
+        Gives what is recorded, the fast step from which on commands are to be sent anew, and warnings for the user,
+        none while nothing has changed.
         """
         act = self.loop.see(exposure, estimate, earliest_step)
         self.cause_frame = act.frame_id
         self.report.add(act, self._step_s)
         return convert.control_message(act, self.loop.name, self.estimator), act.first_step, self._news(act)
 
-    def _news(self, act: Act) -> str:
+    def _news(self, act: Act) -> list[str]:
         news, frame = [], act.frame_id
         if act.state is not self._state:
             held = "the mirror holds its input" if act.state is State.HELD else "the mirror goes to its safe input"
@@ -95,7 +97,7 @@ class Controlling:
             pays = f"{act.acting} would have left {100 * act.gained:.0f} % less of the slopes (rms) than {self._acting}"
             news.append(f"{pays}, and acts from frame {frame} on")
         self._state, self._acting = act.state, act.acting
-        return "; ".join(news)
+        return news
 
 
 def facts(rig: Rig, controlling: Controlling, stability: str) -> dict[str, str]:

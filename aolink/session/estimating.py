@@ -35,6 +35,9 @@ from aolink.session.waiting import Waiting, most_waiting
 _SLICE_S = 0.1
 """Longest single wait for processes that start, so that a request to stop is noticed within it."""
 _READ_BYTES = 1 << 20
+_HANGS_S = 5.0
+"""An estimator that has not answered for this long, and for `_HANGS_FACTOR` times as long as it ever took, hangs."""
+_HANGS_FACTOR = 10.0
 _END_S = 1.0
 """Longest wait for a process that was asked to end."""
 _REAP_S = 0.01
@@ -81,6 +84,10 @@ class Estimating(Protocol):
     def failures(self) -> Mapping[str, str]:
         """Why an estimator has failed and skips all exposures from now on, by its name."""
 
+    @property
+    def hanging(self) -> Mapping[str, str]:
+        """How long an estimator has not answered, in words, by its name, where that is too long."""
+
     def get_ready(self, stop: Callable[[], bool]) -> None:
         """Load, compile and compute in advance all that a session must not wait for, until done or ``stop()``.
 
@@ -104,6 +111,7 @@ class InTheLoop:
         self._driver = driver
         self.names = [estimator.name for estimator in driver.estimators]
         self.failures: dict[str, str] = {}
+        self.hanging: dict[str, str] = {}
 
     def get_ready(self, stop: Callable[[], bool]) -> None:
         pass
@@ -147,6 +155,10 @@ class BesideTheLoop:
     def failures(self) -> dict[str, str]:
         return {each.name: each.failed for each in self.processes if each.failed}
 
+    @property
+    def hanging(self) -> dict[str, str]:
+        return {each.name: each.hangs for each in self.processes if each.hangs}
+
     def get_ready(self, stop: Callable[[], bool]) -> None:
         while not stop() and not all(each.ready for each in self.processes):
             self.serve(_SLICE_S)
@@ -164,7 +176,7 @@ class BesideTheLoop:
     def finish(self, patience_s: float) -> list[Outcome]:
         deadline = time.monotonic() + patience_s
         while any(each.busy for each in self.processes) and (left_s := deadline - time.monotonic()) > 0:
-            self.serve(left_s)
+            self.serve(min(left_s, _SLICE_S))
         for each in self.processes:
             each.give_up(_OVER)
         return self.outcomes()
@@ -195,6 +207,9 @@ class EstimatorProcess:
         """The reason why it will estimate no more; empty while it works."""
         self._exposure: Exposure | None = None
         """The exposure that the process has."""
+        self._served_s = self._busy_s = self._longest_s = 0.0
+        """Time at which it was served last; how long it has had the exposure, without the time for which this process
+        itself was held up; and the longest time that it took for one."""
         self._waiting = Waiting[Exposure](most_waiting(rig.timing))
         self._skipped = SkippedInputs()
         self._outcomes: list[Outcome] = []
@@ -225,6 +240,13 @@ class EstimatorProcess:
         return self._exposure is not None
 
     @property
+    def hangs(self) -> str:
+        """How long it has not answered, in words; empty where that is not too long."""
+        if self._exposure is None or self._busy_s < max(_HANGS_S, _HANGS_FACTOR * self._longest_s):
+            return ""
+        return f"it has not answered for {self._busy_s:.0f} s, since it got frame {self._exposure.frame_id}"
+
+    @property
     def has_to_send(self) -> bool:
         return bool(self._to_send)
 
@@ -246,6 +268,8 @@ class EstimatorProcess:
 
     def serve(self) -> None:
         """Send and receive as much as goes without waiting."""
+        before_s, self._served_s = self._served_s, time.monotonic()
+        self._busy_s += min(self._served_s - before_s, 2 * _SLICE_S)
         self._flush()
         ended = False
         try:
@@ -268,7 +292,10 @@ class EstimatorProcess:
             self._fail(f"its process ended{_how(self._process)}")
 
     def give_up(self, reason: str) -> None:
-        """Skip the exposure that the process has and those that wait."""
+        """Skip the exposure that the process has and those that wait; an estimator that hangs has failed."""
+        if not self.failed and self.hangs:
+            self.failed = self.hangs
+            reason = self._why_failed()
         had = [] if self._exposure is None else [self._exposure]
         self._exposure = None
         self._skip([*had, *self._waiting.clear()], reason)
@@ -290,6 +317,7 @@ class EstimatorProcess:
         elif self._exposure is not None:
             data, took_ns = message
             estimate, exposure = pb.Estimate.FromString(data), self._exposure
+            self._longest_s = max(self._longest_s, took_ns / 1e9)
             self._outcomes.append(Outcome(estimator=self.name, exposure=exposure, message=estimate, took_ns=took_ns))
             self._exposure = None
         self._go_on()
@@ -297,7 +325,7 @@ class EstimatorProcess:
     def _go_on(self) -> None:
         """Hand over the next exposure if the process has none."""
         if self.ready and not self.busy and (exposure := self._waiting.take()) is not None:
-            self._exposure = exposure
+            self._exposure, self._busy_s = exposure, 0.0
             self._send(self._skipped.leading(exposure))
 
     def _send(self, message: object) -> None:

@@ -3,19 +3,24 @@ and connections."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import asdict
+from typing import cast
 
 from foxglove_schemas_protobuf.Log_pb2 import Log
 
-from aolink.devices.interfaces import Camera, ClockSampled, Device, Mirror, Time
+from aolink.devices.interfaces import Camera, ClockSampled, CommandAnswered, Device, Mirror, Time
 from aolink.recording import schemas_pb2 as pb
 from aolink.recording import topics
+from aolink.recording.answers import AnswerCounter
 from aolink.recording.writer import RecordingWriter
 from aolink.session.report import Report
 
 _COUNTS = {each.name for each in pb.ConnectionStatistics.DESCRIPTOR.fields} - {"device"}
 """What a device may count."""
+_NUMBER = re.compile(r"(?<![\w.:=-])[-+]?\d[\d.e+-]*")
+"""A number, but not one that is part of a name, as in ``o3`` or ``sampled:particles=1000``."""
 
 
 class Journal:
@@ -25,6 +30,9 @@ class Journal:
         self.report = report
         self.record = writer.write
         self._time = time
+        self.answers = AnswerCounter()
+        self._said: dict[str, tuple[int, str, int]] = {}
+        """The warnings by their kind: place in the report, text of the first one, how many there were."""
 
     def log(self, text: str, level: Log.Level.ValueType = Log.INFO) -> None:
         """Record a sentence about the session."""
@@ -34,8 +42,15 @@ class Journal:
         self.record(topics.LOG, entry, now)
 
     def warn(self, text: str, level: Log.Level.ValueType = Log.WARNING) -> None:
-        """Record a warning, which the report has as well."""
-        self.report.warnings.append(text)
+        """Record a warning, which the report has as well. Those that differ only in their numbers are of one kind: the
+        first one is recorded, and the report has the number of the others."""
+        warnings = self.report.warnings
+        place, first, before = self._said.get(kind := _NUMBER.sub("", text), (len(warnings), text, 0))
+        self._said[kind] = place, first, before + 1
+        if before:
+            warnings[place] = f"{first} ({before + 1} times)"
+            return
+        warnings.append(text)
         self.log(text, level)
 
     def latency(self, latency: pb.Latency, log_time_ns: int) -> None:
@@ -61,6 +76,22 @@ class Journal:
                 f"the {device.name}'s clock was set {direction} by {abs(size_s):.6f} s: host times of its stamps"
                 f" in the {period_s:.3f} s from {sampled.step.after_ns} ns on may be off by as much"
             )
+
+    def answer(self, mirror: Mirror, answered: CommandAnswered, receive_ns: int) -> None:
+        """Record the mirror's answer to a command block, or that none came."""
+        block, ack, kind = answered.block, answered.ack, pb.CommandAnswer
+        message = kind(
+            block_id=block.block_id, first_step=block.first_step, n_steps=block.n_steps, answer=kind.NONE,
+            tries=answered.tries, times_full=answered.times_full, sent_ns=answered.sent_ns,
+        )  # fmt: skip
+        if ack is not None:
+            message.answer = cast(pb.CommandAnswer.Answer, ack.code)
+            message.text, message.answered_ns = ack.text, receive_ns
+            message.late_steps, message.superseded_steps = ack.late_steps, ack.superseded_steps
+            message.queue_end_step = ack.queue_end_step
+            message.device_ns = mirror.clock.device_ns(receive_ns)[0] if mirror.clock.ready else 0
+        self.record(topics.ANSWER, message, receive_ns)
+        self.answers.answered(message)
 
     def statistics(self, devices: Sequence[Camera | Mirror], now: int) -> None:
         """Record what each connection has counted."""

@@ -47,6 +47,8 @@ class LiveExposures:
         """The exposure that has not been given to the session's watcher yet."""
         self._unseen_estimates: list[Outcome] = []
         """The estimates that have not been given to the session's watcher yet."""
+        self._hanging: set[str] = set()
+        """The estimators that hang."""
 
     def take(self, exposures: Sequence[Exposure], log_time_ns: int) -> None:
         """Take the next exposures."""
@@ -70,8 +72,12 @@ class LiveExposures:
         self._show_unseen()
 
     def take_estimates(self) -> None:
-        """Take the estimates that have become known."""
+        """Take the estimates that have become known, and warn of an estimator that hangs."""
         self._take_outcomes(self._estimating.outcomes(), self._time.now_ns())
+        hanging = self._estimating.hanging
+        for name in hanging.keys() - self._hanging:
+            self._journal.warn(f"the estimator {name} hangs, its exposures are skipped: {hanging[name]}")
+        self._hanging = {*hanging}
 
     def finish(self, patience_s: float) -> None:
         """Wait for the estimates under way, and record exposures without an estimate as skipped."""
@@ -117,7 +123,7 @@ class LiveExposures:
     def _know(self, frame_id: int, estimated_ns: int) -> None:
         """Note that commands from now on depend on a frame: its first estimate is there, or there will be none."""
         self.newest_frame = max(self.newest_frame, frame_id)
-        self._latencies.estimated(frame_id, estimated_ns)
+        self._latencies.estimated(frame_id, estimated_ns, self._time.now_ns())
 
     def _show_unseen(self, *, ready: bool = False) -> None:
         """Give the waiting exposure to the watcher when it is complete, or, if ``ready``, as it is.

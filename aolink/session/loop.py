@@ -39,10 +39,12 @@ ANSWER_NS = 200_000_000
 """How long the start waits for the answer to one clock query."""
 _GRACE_S = 1.5
 """In real time, how long a frame may take after its exposure's end before it counts as lost, s."""
+_HELD_UP_S = 1.0
+"""In real time, a turn of the loop that takes longer is one in which this process did not run, s."""
 _KEEP_ALIVES = 3
 """Least number of messages that a mirror is sent in the time of its watchdog."""
 _OUTAGE_WATCHDOGS = 2.0
-"""A mirror that was out of reach for more than this many times its watchdog's time is not re-armed."""
+"""A mirror that answers nothing for this many times its watchdog's time ends the session."""
 ESTIMATES_S = 5.0
 """In real time, how long the session's end waits for estimates that are under way, s."""
 _NOT_YET = 1 << 63
@@ -73,18 +75,22 @@ class SessionLoop:
         """The devices in the order in which their clocks are queried; the next one first."""
         self._last_query_ns = self._next_statistics_ns = 0
         self._last_frame_ns = 0
+        self._turn_ns = self._held_up_until_ns = 0
+        """Host times: when this turn of the loop began, and when this process went on after it last did not run."""
+        self._catching_up = False
+        """Whether nothing is commanded, until the mirror's clock says in which fast step it is after a hold-up."""
         self._end_step: int | None = None
         """First fast step after the session; None if it goes on until it is stopped."""
-        self._is_safe = False
         self._parked_from: int | None = None
-        """First fast step of the safe state that `make_safe` asked for."""
+        """First fast step of the safe state, once the mirror has confirmed that `make_safe` has parked it."""
+        self._camera_stopped = False
         self._absent: list[Device] = []
         """Devices whose port has vanished, until the session goes on with them."""
         self._returned: list[Device] = []
         """Vanished devices that have been identified again; their clocks are being queried."""
         self._account = Account(self.report)
         self._journal = Journal(writer, self.report, time)
-        self._latencies = LatencyBook(self.report, self._journal.latency)
+        self._latencies = LatencyBook(self.report, self._journal.latency, commanded=mirror.commanded)
         self._frames = ReceivedFrames(rig, time, camera, mirror, self._journal, self._latencies)
         self._commanding = Commanding(
             rig, time, mirror, inputs, controlling, self._assembler, self._account, self._journal, self._latencies
@@ -109,12 +115,13 @@ class SessionLoop:
             self._end_step = self._first_step + (exposures - 1) * timing.frame_period_steps + timing.exposure_steps
         self._commanding.begin(self._first_step, self._end_step)
         self._receive(0.0)
-        self._last_frame_ns = time.now_ns()
+        self._last_frame_ns = self._turn_ns = time.now_ns()
         self._journal.log(f"session of {exposures or 'unlimited'} exposures from fast step {self._first_step}")
         self.report.ended = "interrupted"
         while not stop():
             self._receive(self._send_due())
             progress(self.report.exposures)
+            self._go_on_after_hold_up()
             if self._is_over(exposures):
                 self.report.ended = "complete"
                 break
@@ -122,21 +129,29 @@ class SessionLoop:
         self._finish(exposures)
 
     def make_safe(self) -> None:
-        """Park the mirror and stop the camera, once; try both even if one cannot be reached."""
-        if self._is_safe:
-            return
-        self._is_safe = self._commanding.ended = True
+        """Park the mirror and stop the camera; try both even if one cannot be reached. Called again, after an error or
+        an interruption, it asks for what has not been confirmed."""
+        self._commanding.ended = True
         try:
-            self._parked_from = self._mirror.park()
+            if self._parked_from is None:
+                self._parked_from = self._mirror.park()
         finally:
-            self._camera.stop()
+            if not self._camera_stopped:
+                self._camera.stop()
+                self._camera_stopped = True
 
     def close_account(self) -> None:
-        """End each commanded step that is still open: no more reports of the mirror will come."""
+        """End each commanded step that is still open: no more answers and reports of the mirror will come."""
+        last_answers, now = self._mirror.last_answers(), self._time.now_ns()
+        for each in last_answers:
+            self._account.answered(each.block.block_id, each.ack)
         if self._parked_from is not None:
             self._account.parked_from(self._parked_from)
         self._account.close()
         self._count_tries()
+        for each in last_answers:  # the recording may be what has failed
+            self._journal.answer(self._mirror, each, now)
+        self.report.answers = self._journal.answers.result()
 
     def finish_estimates(self, patience_s: float = ESTIMATES_S) -> None:
         """Wait for the estimates under way, and record exposures without an estimate as skipped."""
@@ -201,6 +216,9 @@ class SessionLoop:
         for device in [each for each in self._returned if not each.clock.suspected]:
             self._go_on_with(device)
         is_there = self._mirror not in self._absent
+        if self._catching_up and not (self._mirror.clock.suspected and self._was_held_up()):
+            self._catching_up = False
+            self._commanding.catch_up()
         if self._mirror.latched and is_there:
             self._rearm("in this session")
         now, due_ns = time.now_ns(), self._mirror.next_due_ns() if is_there else None
@@ -216,7 +234,7 @@ class SessionLoop:
         if now >= self._next_statistics_ns:
             self._note_statistics(now)
             self._next_statistics_ns = now + round(_STATISTICS_PERIOD_S * 1e9)
-        if is_there and not (time.virtual and self._mirror.in_flight):
+        if is_there and not self._catching_up and not (time.virtual and self._mirror.in_flight):
             self._commanding.send(self._live.newest_frame)
         if time.virtual:
             return 0.0
@@ -227,24 +245,39 @@ class SessionLoop:
             due.append(due_ns - now)
         return max(0, min(due)) / 1e9
 
+    def _go_on_after_hold_up(self) -> None:
+        """Where this turn of the loop took so long that this process cannot have run, say so and go on."""
+        now = self._time.now_ns()
+        turn_ns, self._turn_ns = now - self._turn_ns, now
+        if self._time.virtual or turn_ns < _HELD_UP_S * 1e9:
+            return
+        self._held_up_until_ns = now
+        self._last_frame_ns += turn_ns
+        self._journal.warn(
+            f"the session was held up for {turn_ns / 1e9:.1f} s after {self.report.exposures} exposure(s): its process"
+            " was stopped, or the computer slept or was too busy; what came meanwhile may be lost"
+        )
+        if self._mirror.commanded:
+            self._catching_up = True
+            self._mirror.clock.suspect(self._step_ns, now)
+
+    def _was_held_up(self) -> bool:
+        """Whether that is so short a time ago that what has come meanwhile may not have been read."""
+        return self._time.now_ns() - self._held_up_until_ns < _GRACE_S * 1e9
+
     def _keep_alive_ns(self) -> int:
         """Host time by which the mirror must be sent something, command or not."""
         return self._mirror.last_sent_ns + round(self._rig.mirror.watchdog_s * 1e9 / _KEEP_ALIVES)
 
     def _rearm(self, when: str) -> None:
-        """Re-arm a mirror that its watchdog has parked, unless it was out of reach for too long."""
-        watchdog_s, outage_s = self._rig.mirror.watchdog_s, self._mirror.outage_s
-        if outage_s > _OUTAGE_WATCHDOGS * watchdog_s:
-            raise DeviceError(
-                f"the mirror was parked by its watchdog: it took no command for {outage_s:.1f} s, more than twice the"
-                f" {watchdog_s:g} s of its watchdog; find out why (a slow host, the line), and begin a new session"
-            )
-        step = self._mirror.rearm()
+        """Re-arm a mirror that its watchdog has parked; one that answers nothing for too long has ended the session."""
+        outage_s, step = self._mirror.outage_s, self._mirror.rearm()
         self.report.rearmed += 1
         out = f", {outage_s:.2f} s after its last command" if outage_s else ""
         parked = f"the mirror was parked by its watchdog {when}"
         self._journal.log(f"{parked}: re-armed at fast step {step}{out}", Log.WARNING)
         self._commanding.go_back_to(step)  # the queued inputs are dropped
+        self._turn_ns = self._time.now_ns()  # until now it was the mirror that was waited for
 
     def _vanished(self, device: Device, why: str) -> None:
         if device not in self._absent:
@@ -290,7 +323,7 @@ class SessionLoop:
             step = self._start_camera(begin, left)
             self._journal.log(f"the camera goes on with the exposure from fast step {step}")
         self._frames.camera_restarted()
-        self._last_frame_ns = self._time.now_ns()
+        self._last_frame_ns = self._turn_ns = self._time.now_ns()
 
     def _is_over(self, exposures: int) -> bool:
         if self._time.virtual:
@@ -302,7 +335,8 @@ class SessionLoop:
             return False
         if self._end_step is not None:
             late_step = self._end_step + _GRACE_S * 1e9 / self._step_ns
-            if self.report.exposures >= exposures or self._commanding.device_step() > late_step:
+            is_late = self._commanding.device_step() > late_step
+            if self.report.exposures >= exposures or (is_late and not self._was_held_up()):
                 return True
         patience_ns = 3 * timing.frame_period_steps * self._step_ns + (_GRACE_S + _START_DELAY_S) * 1e9
         # A camera and a mirror of one device are held up together, and the mirror is waited for that long.
@@ -370,10 +404,15 @@ class SessionLoop:
             self._live.take_scene(frame)
         else:
             self._last_frame_ns = receive_ns
+            if self._mirror.commanded and not self._time.virtual:
+                # A mirror may report nothing at all, so that no gap shows.
+                late = frame.first_step - round(_GRACE_S * 1e9) // self._step_ns
+                self._take(self._mirror, self._mirror.await_reports(late, receive_ns), receive_ns)
             self._live.take(self._assembler.add_frame(frame), receive_ns)
 
     def _take_applied(self, applied: wire.Applied, receive_ns: int) -> None:
         self._journal.record(topics.APPLIED, applied, receive_ns)
+        self._journal.answers.applied(applied)
         if applied.source != wire.Applied.AWAITED:
             self._account.reported(applied)
         if self._controlling is not None:
@@ -392,7 +431,10 @@ class SessionLoop:
 
     def _take_answer(self, answer: CommandAnswered, receive_ns: int) -> None:
         ack = answer.ack
-        self._account.answered(ack)
+        self._account.answered(answer.block.block_id, ack)
+        self._journal.answer(self._mirror, answer, receive_ns)
+        if ack is None:
+            return
         self._latencies.acknowledged(ack.block_id, receive_ns)
         if ack.code in REFUSALS and ack.code != wire.LATCHED:
             raise DeviceError(

@@ -10,11 +10,14 @@ from typing import Any
 
 from aolink.control import Act, State
 from aolink.recording import schemas_pb2 as pb
+from aolink.recording.answers import Answers
 from aolink.recording.topics import CONNECTION_FAULTS
 from aolink.session.estimating import Outcome
 from aolink.wire import messages_pb2 as wire
 
 _KEPT_LATENCIES = 10_000
+_MOST_OPEN = 1000
+"""Most frames whose latency has not ended: a command that an older one waits for is not coming any more."""
 
 
 @dataclass(kw_only=True)
@@ -133,6 +136,9 @@ class Report:
     """Applied steps whose input the device's own protection had changed."""
     steps_parked: int = 0
     """Fast steps of the session in which the mirror held its safe input, however the commands for them ended."""
+    answers: Answers = field(default_factory=Answers)
+    """What the mirror answered to the command blocks, once the session has ended; `aolink info` finds the same in the
+    recording."""
     blocks_retransmitted: int = 0
     reports_asked: int = 0
     """How often missing reports of the mirror were requested again."""
@@ -165,7 +171,7 @@ class Report:
     def counts(self) -> dict[str, str]:
         """All counts without the latencies, as text, for the recording's metadata."""
         facts = asdict(replace(self, control=None))
-        for name in ("latencies", "warnings", "files", "estimation", "unwatched", "control"):
+        for name in ("latencies", "warnings", "files", "estimation", "unwatched", "control", "answers"):
             del facts[name]
         facts |= {f"connection_{name}": count for name, count in facts.pop("connection_faults").items()}
         for name, each in self.estimation.items():
@@ -178,15 +184,15 @@ class Report:
 
 
 class LatencyBook:
-    """The latency of each frame, from the end of its exposure to the first command that could depend on it. It is for
-    real time only.
+    """The latency of each frame, from the end of its exposure to the first command that could depend on it, or to its
+    first estimate where nothing is ``commanded``. It is for real time only.
 
     A command can depend on a frame when it is sent after the first estimate of the frame was there, or all estimators
     had skipped it. (`EstimatorReport` has the time of each estimator.)
     """
 
-    def __init__(self, report: Report, record: Callable[[pb.Latency, int], None]) -> None:
-        self._report, self._record = report, record
+    def __init__(self, report: Report, record: Callable[[pb.Latency, int], None], *, commanded: bool) -> None:
+        self._report, self._record, self._commanded = report, record, commanded
         self._open: dict[int, pb.Latency] = {}
         self._blocks: dict[int, int] = {}
         """First command block that could depend on a frame, by frame."""
@@ -196,12 +202,17 @@ class LatencyBook:
     def frame(self, latency: pb.Latency) -> None:
         """Note that a frame is complete."""
         self._open[latency.frame_id] = latency
+        if len(self._open) > _MOST_OPEN:
+            self._close(next(iter(self._open)), latency.complete_ns)
 
-    def estimated(self, frame_id: int, now_ns: int) -> None:
-        """Note that the first estimate of a frame is there; ``now_ns`` is 0 if all estimators have skipped it."""
+    def estimated(self, frame_id: int, estimated_ns: int, now_ns: int) -> None:
+        """Note that the first estimate of a frame is there; ``estimated_ns`` is 0 if all estimators have skipped it."""
         if latency := self._open.get(frame_id):
-            latency.estimated_ns = now_ns
-            self._known.add(frame_id)
+            latency.estimated_ns = estimated_ns
+            if self._commanded:
+                self._known.add(frame_id)
+            else:
+                self._close(frame_id, now_ns)
 
     def sent(self, block: wire.CommandBlock, now_ns: int) -> None:
         for frame_id in self._known:

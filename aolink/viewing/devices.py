@@ -56,6 +56,15 @@ def log_applied(drawing: Drawing, timebase: Timebase, records: Sequence[Timed]) 
     send_states(drawing, f"{STATUS}/mirror", timebase, [b.first_step for b in blocks], names)
 
 
+def log_answers(drawing: Drawing, timebase: Timebase, records: Sequence[Timed]) -> None:
+    """What the mirror answered to its command blocks (CommandAnswer): ``/status/commands``."""
+    answers = sorted((r.message for r in records), key=lambda m: m.first_step)
+    known = schemas_pb2.CommandAnswer.Answer.DESCRIPTOR.values_by_number
+    names = [known[m.answer].name if m.answer in known else f"UNKNOWN {m.answer}" for m in answers]
+    names = ["LATE" if m.late_steps else name for m, name in zip(answers, names, strict=True)]
+    send_states(drawing, f"{STATUS}/commands", timebase, [m.first_step for m in answers], names)
+
+
 def log_latency(drawing: Drawing, timebase: Timebase, records: Sequence[Timed]) -> None:
     """Time since the end of the exposure at which each step of the loop was done, ms: ``/latency/STEP``.
 

@@ -30,6 +30,9 @@ STATUS_COLOURS: dict[str, Colour] = {
     "CLIPPED": (190, 50, 50),
     "WATCHDOG": (190, 50, 50),
     "LATE": (190, 140, 30),
+    "TOO_LATE": (190, 140, 30),
+    "LATCHED": (190, 50, 50),
+    "NONE": (120, 60, 60),
     "NOT_REPORTED": (120, 60, 60),
     "CLOSED": (45, 110, 75),
     "CLOSED LATE": (190, 140, 30),
@@ -39,8 +42,8 @@ STATUS_COLOURS: dict[str, Colour] = {
     "READOUT": (25, 25, 25),
     "LOST": (190, 50, 50),
 }
-"""Colours of an estimate's status, of the source of the mirror's inputs, of the loop's state, and of the camera's
-state."""
+"""Colours of an estimate's status, of the source of the mirror's inputs and its answers, of the loop's state, and of
+the camera's state."""
 
 
 def series_colour(index: int) -> Colour:

@@ -31,6 +31,10 @@ _BUDGET_BYTES = 64 << 20
 _MESSAGE_BYTES = 512
 """Memory that a message takes beyond its own bytes."""
 _MOST_HOST_NS = 1 << 62
+_CLOCK = getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC)
+"""A steady clock that goes on while the computer sleeps, as the devices' clocks do."""
+_MOST_TRIES = 200
+"""Most tries of a request that is insisted on, while anything at all is heard of the device."""
 _LAST_PATIENCE_S = 0.2
 """How long to wait for a device that has already delayed the session's end, s."""
 _SLICE_S = 0.1
@@ -60,14 +64,14 @@ class Hub:
         """Virtual time that passed in time-outs, ns."""
         self.budget_bytes = _BUDGET_BYTES
         """Memory for messages that the session has not taken yet; a device that sends more ends the session."""
-        self._epoch_ns = time.time_ns() - time.monotonic_ns()
+        self._epoch_ns = time.time_ns() - time.clock_gettime_ns(_CLOCK)
         self._virtual_ns = 0
         self.pending: list[tuple[Link, Received]] = []
         """Messages that the next `wait` gives first."""
 
     def now_ns(self) -> int:
         """Host time, ns since 1970: steady within a session; on virtual time the rig sets it."""
-        return self._virtual_ns if self.virtual else self._epoch_ns + time.monotonic_ns()
+        return self._virtual_ns if self.virtual else self._epoch_ns + time.clock_gettime_ns(_CLOCK)
 
     def hurry(self) -> None:
         """Wait from now on as if a stop had been asked for: the session ends with an error."""
@@ -130,17 +134,22 @@ class Hub:
 
     def request(
         self, link: Link, request: Message, answers: type[AnyMessage], is_it: Callable[[AnyMessage, int], bool],
-        answer_s: float = ANSWER_S, tries: int = TRIES,
+        answer_s: float = ANSWER_S, tries: int = TRIES, *, insist_s: float = 0.0,
     ) -> AnyMessage | None:  # fmt: skip
         """Send a request until its answer comes; None if it never does. Other messages wait for `wait`.
 
         ``is_it(answer, sequence)`` says whether an answer belongs to the request of that sequence number: that of the
-        last try or of an earlier one. Each of the ``tries`` waits for ``answer_s``.
+        last try or of an earlier one. Each of the ``tries`` waits for ``answer_s``. With ``insist_s`` a request to stop
+        does not end them, and there are more of them until nothing at all has been heard of the device for so long.
         """
         before = self._memory_bytes()
         sequences: list[int] = []
-        for attempt in range(tries):
-            if attempt and (self._hurried or self._stop() or link.foreign_version is not None):
+        heard_ns = self.now_ns()
+        for attempt in range(_MOST_TRIES if insist_s else tries):
+            if attempt and not insist_s and (self._hurried or self._stop() or link.foreign_version is not None):
+                break
+            heard_ns = max(heard_ns, link.last_heard_ns)
+            if attempt >= tries and self.now_ns() - heard_ns > insist_s * 1e9:
                 break
             sequences.append(link.send(request))
             deadline_ns = self.now_ns() + round(answer_s * 1e9)

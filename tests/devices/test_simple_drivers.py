@@ -148,6 +148,7 @@ def test_what_a_driver_raises_refuses_the_command_in_words() -> None:
     mirror.send_block(0, np.full((8, 1), 0.01), 0, 0)
     (answered,) = mirror.poll()
     assert isinstance(answered, CommandAnswered)
+    assert answered.ack
     assert answered.ack.code == pb.NOT_SUPPORTED
     assert answered.ack.text == "the driver of the mirror failed when it was sent a command: OSError('no such channel')"
     with pytest.raises(DeviceError, match=r"input 0 at fast step 1 is 0.06, beyond the mirror's limits"):
@@ -169,7 +170,7 @@ def test_each_commanded_step_ends_once(
     def take(events: Iterable[Event]) -> None:
         for event in events:
             if isinstance(event, CommandAnswered):
-                account.answered(event.ack)
+                account.answered(event.block.block_id, event.ack)
             elif isinstance(event, pb.Applied):
                 account.reported(event)
 
@@ -362,6 +363,7 @@ def test_a_mirror_that_the_session_leaves_alone_is_parked_by_the_hosts_watchdog(
     mirror.send_block(30, np.full((5, 1), 0.01), 0, 0)
     (answered,) = mirror.poll()
     assert isinstance(answered, CommandAnswered)
+    assert answered.ack
     assert answered.ack.code == pb.LATCHED
     bench.host_ns += 20 * STEP_NS
     assert mirror.rearm() == 41

@@ -19,13 +19,13 @@ from tests.commands import simulated_rig
 
 
 def test_names_come_by_rank():
-    assert ESTIMATOR_NAMES == ("open-loop", "o1", "o2", "o3", "moments", "profile", "mixture", "sampled")
+    assert ESTIMATOR_NAMES == ("open-loop", "o1", "o2", "o3", "moments", "profile", "sampled")
     assert [row.rank for row in estimator_rows()] == sorted(row.rank for row in estimator_rows())
 
 
 def test_hundreds_of_spots_of_one_plant_are_refused_by_all_that_compare_every_two():
     rig = load_rig("sh-30x30")
-    for name in ("moments", "profile", "mixture", "sampled"):
+    for name in ("moments", "profile", "sampled"):
         with pytest.raises(EstimatorError, match=f"{name} takes at most 128 spots .* sh-30x30 has 900: use o3"):
             make_estimator(rig, name)
 
@@ -33,7 +33,7 @@ def test_hundreds_of_spots_of_one_plant_are_refused_by_all_that_compare_every_tw
 def test_a_row_refuses_what_making_the_estimator_refuses():
     rig = load_rig("sh-8x8")
     refused = {row.name: reason for row in estimator_rows() if (reason := row.refusal(rig))}
-    assert refused.keys() == {"mixture", "sampled"}
+    assert refused.keys() == {"sampled"}
     for name, reason in refused.items():
         with pytest.raises(EstimatorError) as raised:
             make_estimator(rig, name)
@@ -65,6 +65,9 @@ def test_options_may_follow_the_name():
         ("moments:orders=0-2", "orders = '0-2', expected digits, such as 012"),
         ("o3:flux=some", "flux = 'some' is not known"),
         ("o4:second_order", "no estimator 'o4': use one of open-loop, o1"),
+        ("profile:tempered=0", "profile:tempered=0: estimators have no option 'tempered': use gain"),
+        ("mixture", "mixture is an estimator of earlier versions: use profile"),
+        ("mixture:draws=50", "mixture is an estimator of earlier versions: use profile"),
     ],
 )
 def test_an_option_that_makes_no_sense_is_named(text, message):

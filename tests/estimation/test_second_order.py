@@ -8,7 +8,7 @@ from aolink.estimation import make_estimator
 from aolink.estimation.estimate import Status
 from aolink.rig import load_rig
 from aolink.simulation.model import simulate
-from tests.estimation.pixels.test_hand_over import vibrating
+from tests.estimation.vibrating import vibrating
 from tests.kinds import truth_of
 
 

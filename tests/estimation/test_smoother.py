@@ -68,7 +68,7 @@ def test_it_is_one_least_squares_solve_where_all_is_linear(period):
 @pytest.mark.slow
 def test_the_last_estimate_is_the_filters_and_the_others_know_more():
     exposures = simulate(RIG, 60, seed=6)
-    for name, estimates in run(RIG, exposures, ["open-loop", "o1", "moments", "profile", "mixture"]).items():
+    for name, estimates in run(RIG, exposures, ["open-loop", "o1", "moments", "profile"]).items():
         smoothed = smooth(RIG.plant, exposures, estimates)
         assert smoothed[-1] is estimates[-1]
         before, after = score(exposures, estimates, 5), score(exposures, smoothed, 5)

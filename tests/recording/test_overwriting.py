@@ -45,11 +45,11 @@ class Writing:
     def write_on(self) -> None:
         """Write until the writer ends it with an error."""
 
-        def write_one() -> bool:
+        def written() -> bool:
             self.writer.write(topics.LOG, Log(), 0)
             return False
 
-        wait_until(write_one)
+        wait_until(written)
 
 
 def wait_until(condition: Callable[[], bool]) -> None:

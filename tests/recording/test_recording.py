@@ -203,7 +203,11 @@ def test_the_generated_classes_are_those_of_the_proto_files(schema: str, tmp_pat
 
 def test_one_flipped_bit_costs_its_chunk_and_is_said(recorded: Session, tmp_path: Path) -> None:
     data = bytearray(recorded.path.read_bytes())
-    data[len(data) // 2] ^= 0x10
+    with recorded.path.open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None
+    chunk = max(summary.chunk_indexes, key=lambda each: each.chunk_length)  # it has pictures
+    data[chunk.chunk_start_offset + chunk.chunk_length // 2] ^= 0x10
     (path := tmp_path / "flipped.mcap").write_bytes(data)
     recording = Recording(path)
     assert recording.complete, "its index is whole"

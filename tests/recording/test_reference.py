@@ -24,6 +24,8 @@ def test_estimates_are_what_they_were(path: Path) -> None:
     before = Recording(path, check=True)
     assert not before.damage
     assert before.estimators
-    for topic, found in compare(before, Reestimated(before), only=["/estimate/"], absolute=1e-9).items():
+    for topic, found in compare(
+        before, Reestimated(before, before.estimators), only=["/estimate/"], absolute=1e-9
+    ).items():
         assert found.same, (topic, found)
         assert found.compared > 0

@@ -21,7 +21,7 @@ Ports = Callable[[], AbstractContextManager[tuple[str, str]]]
 
 
 @contextlib.contextmanager
-def _served_by(program: Path) -> Iterator[tuple[str, str]]:
+def served_by(program: Path) -> Iterator[tuple[str, str]]:
     """The C program behind two pseudo terminals; it must end without a word from a sanitiser."""
     process = subprocess.Popen([program], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, bufsize=1)
     assert process.stdout is not None
@@ -56,4 +56,4 @@ def serve(request: pytest.FixtureRequest) -> Ports:
     if request.param == "simulated rig":
         return lambda: simulated_rig("section-vi", "--real-time")
     program = request.getfixturevalue("reference_device")
-    return lambda: _served_by(program)
+    return lambda: served_by(program)

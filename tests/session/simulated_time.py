@@ -9,18 +9,20 @@ import math
 import threading
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from google.protobuf.message import Message
 
 from aolink.control import ControllerRow
 from aolink.devices.gate import Gate
 from aolink.devices.host import Host
 from aolink.devices.identity import identify
 from aolink.devices.native import NativeCamera, NativeMirror
+from aolink.devices.no_mirror import NoMirror
 from aolink.errors import PortError
 from aolink.estimation import Driver
 from aolink.exposure import Exposure
@@ -30,13 +32,16 @@ from aolink.recording.writer import RecordingWriter
 from aolink.rig import Rig
 from aolink.session.commanding import Inputs
 from aolink.session.controlling import Controlling
+from aolink.session.estimating import BesideTheLoop
 from aolink.session.loop import SessionLoop
 from aolink.session.report import Report
+from aolink.signals import Interrupted
 from aolink.simulation.devices import LineName
 from aolink.simulation.server import RigServer
 from aolink.simulation.streams import Stream
 from aolink.wire import messages_pb2 as pb
 from aolink.wire.link import Link, Received
+from aolink.wire.packet import MESSAGE_OF_TYPE, PacketDecoder, encode_packet
 from tests.kinds import must_be
 
 _EPOCH_NS = 1_767_225_600_000_000_000
@@ -123,6 +128,8 @@ class SimulatedTimeHub(Host):
     def __init__(self, rig: Rig, seed: int | None = None, stop: Callable[[], bool] = lambda: False) -> None:
         super().__init__(stop)
         self.clock_ns = 0
+        self.loop: SessionLoop | None = None
+        """The session's, once it has begun."""
         self.at: list[tuple[int, Callable[[], object]]] = []
         """What is to happen when, on the clock."""
         self.held: dict[int, tuple[int, int]] = {}
@@ -139,6 +146,21 @@ class SimulatedTimeHub(Host):
 
     def now_ns(self) -> int:
         return _EPOCH_NS + self.clock_ns
+
+    def change(self, name: LineName, firmware: Callable[[Message], Message | None]) -> None:
+        """Give the device on a line another firmware: it sends what the function makes of its messages, packet by
+        packet; None for nothing."""
+        decoder, read = PacketDecoder(), self.ends[name].read
+
+        def changed() -> bytes:
+            sent = b""
+            for packet in decoder.feed(read()):
+                message = firmware(MESSAGE_OF_TYPE[packet.type].FromString(packet.payload))
+                if message is not None:
+                    sent += encode_packet(replace(packet, payload=message.SerializeToString()))
+            return sent
+
+        self.ends[name].read = changed
 
     def cut(self, *, to_device: bool = True, to_host: bool = True) -> None:
         """Cut or mend the mirror's line."""
@@ -161,6 +183,8 @@ class SimulatedTimeHub(Host):
         while True:
             self._serve()
             pending += [(link, received) for link in self.links for received in link.receive()]
+            for each in self.beside:
+                each.serve()
             if pending or self.clock_ns >= end_ns:
                 return pending
             self._move(end_ns)
@@ -212,7 +236,7 @@ class Run:
     path: Path
     exposures: list[Exposure]
     """As they were made live."""
-    error: Exception | None = None
+    error: Exception | Interrupted | None = None
 
     @property
     def first_step(self) -> int:
@@ -237,8 +261,13 @@ def run_session(
     stop: Callable[[], bool] = lambda: False,
     progress: Callable[[int], None] = lambda exposures: None,
     reconnect_s: float = 0.0,
+    alone: bool = False,
+    beside: BesideTheLoop | None = None,
 ) -> Run:
-    """A session from Identify to the end of its account, as `aolink.session.record` makes it; errors are kept."""
+    """A session from Identify to the end of its account, as `aolink.session.record` makes it; errors are kept.
+
+    With ``alone`` the camera is recorded without a mirror; ``beside`` estimates instead of the estimators' driver.
+    """
     live: list[Exposure] = []
     camera_link, mirror_link = hub.links
     asked_ns = hub.now_ns()
@@ -247,20 +276,23 @@ def run_session(
     camera = NativeCamera(hub, camera_link, camera_identity, gate)
     mirror = NativeMirror(hub, mirror_link, mirror_identity, gate)
     hub.native = [camera, mirror]
+    no_mirror = NoMirror(rig, hub.now_ns, camera.since_zero_ns)
+    if alone:
+        hub.native, hub.polled = [camera], [no_mirror]
     if reconnect_s:
         mirror.port.allow(hub.ends["mirror"].opened, reconnect_s)
     for link in hub.links:
         link.reset_counts()
     with RecordingWriter(path, rig, {}, hub.now_ns(), deterministic=True) as writer:
         loop = SessionLoop(
-            rig, hub, camera, mirror, writer, Driver(rig, estimators), inputs,
-            lambda exposure, _: live.append(exposure),
+            rig, hub, camera, no_mirror if alone else mirror, writer, Driver(rig, estimators), inputs,
+            lambda exposure, _: live.append(exposure), beside,
             controlling=Controlling(rig, controller, estimators) if controller else None,
         )  # fmt: skip
-        run = Run(hub, loop, mirror, path, live)
+        run, hub.loop, hub.beside = Run(hub, loop, mirror, path, live), loop, beside.processes if beside else ()
         try:
             loop.run(exposures, stop, progress)
-        except Exception as error:
+        except (Exception, Interrupted) as error:
             run.error = error
             try:
                 loop.make_safe()

@@ -346,6 +346,7 @@ def test_a_command_beyond_the_limits_is_refused_by_the_host_and_by_the_device() 
         ((_, refusal),) = hub.wait(1.0)
         (answered,) = mirror.handle(refusal)
         assert isinstance(answered, CommandAnswered)
+        assert answered.ack
         assert (answered.ack.code, answered.ack.text) == (pb.OUT_OF_RANGE, "an input is beyond the limits")
         assert mirror.in_flight == 0
 

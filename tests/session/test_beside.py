@@ -221,6 +221,35 @@ def test_the_recording_goes_on_without_an_estimator_that_was_killed(rig_file: Pa
     assert first_difference(list(recording.iter_estimates("o3")), again) is None
 
 
+@pytest.mark.slow
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="it reads /proc")
+@pytest.mark.parametrize("wakes", [False, True])
+def test_an_estimator_that_hangs_is_said_to_and_fails_unless_it_wakes(
+    rig_file: Path, tmp_path: Path, wakes: bool
+) -> None:
+    """It is stopped, while exposures go on for longer than it may take, and goes on just before the end."""
+    rig, path = parse_rig(FAST), tmp_path / "a.mcap"
+    heard = {1000: signal.SIGSTOP, 7500: signal.SIGCONT} if wakes else {1000: signal.SIGSTOP}
+
+    def inputs(first_step: int, n_steps: int) -> np.ndarray:
+        if first_step in heard:
+            (process,) = children(os.getpid(), "estimator_process")
+            os.kill(process, heard.pop(first_step))
+        return rig.drive.inputs(first_step, n_steps, rig.timing.fast_step_s)
+
+    with simulated_rig(rig_file, "--real-time") as ports:
+        report = record(rig, *ports, path, estimators=["o3"], exposures=160, inputs=inputs)
+    assert (report.ended, report.frames_lost, heard) == ("complete", 0, {})
+    (said,) = [each for each in report.warnings if "hangs" in each]
+    assert "the estimator o3 hangs, its exposures are skipped: it has not answered for 5 s, since it got frame" in said
+    counted = report.estimation["o3"]
+    assert counted.estimated + counted.skipped == 160
+    assert ("it has not answered for" in counted.failed) == (not wakes)
+    assert any("the estimator o3 failed" in each for each in report.warnings) == (not wakes)
+    again = reestimate(Recording(path), ["o3"], as_recorded=True)["o3"]
+    assert first_difference(list(Recording(path).iter_estimates("o3")), again) is None
+
+
 def children(parent: int, what: str) -> list[int]:
     """Children of a process with this in their command line."""
     found = []
@@ -475,13 +504,13 @@ def test_over_a_long_gap_the_first_inputs_are_forgotten() -> None:
 
 def test_the_next_command_knows_a_frame_that_is_estimated_whatever_the_order() -> None:
     recorded: list[pb.Latency] = []
-    book = LatencyBook(Report(), lambda latency, now: recorded.append(latency))
+    book = LatencyBook(Report(), lambda latency, now: recorded.append(latency), commanded=True)
     for frame in (1, 2, 3):
         book.frame(pb.Latency(frame_id=frame, complete_ns=10 * frame))
-    book.estimated(2, 25)
+    book.estimated(2, 25, 25)
     book.sent(wire.CommandBlock(block_id=1, cause_frame_id=2), 26)
-    book.estimated(1, 40)  # a slow estimator had it
-    book.estimated(3, 0)  # all skipped it
+    book.estimated(1, 40, 40)  # a slow estimator had it
+    book.estimated(3, 0, 40)  # all skipped it
     book.sent(wire.CommandBlock(block_id=2, cause_frame_id=3), 41)
     for block in (1, 2):
         book.acknowledged(block, 50)

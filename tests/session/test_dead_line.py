@@ -55,6 +55,10 @@ class Forwarder:
         os.close(self._master)
         os.close(self._slave)
 
+    def to_device(self, data: bytes) -> bytes:
+        """What the device gets of what the host has sent."""
+        return data
+
     def _run(self) -> None:
         while not self._end.is_set():
             ready, _, _ = select.select([self._master, self._device.fileno()], [], [], 0.1)
@@ -65,7 +69,7 @@ class Forwarder:
                     self._cut.clear()
                 continue
             if from_host:
-                self._device.write(from_host)
+                self._device.write(self.to_device(from_host))
             if from_device:
                 os.write(self._master, from_device)
 

@@ -432,7 +432,7 @@ def test_the_command_takes_a_recording_or_a_picture(wrong: list[str]) -> None:
 def test_a_method_that_does_not_exist(session: Path, tmp_path: Path) -> None:
     refused = CliRunner().invoke(app, ["deblur", str(session), "-o", str(tmp_path / "c.mcap"), "--method", "best"])
     assert isinstance(refused.exception, RestorationError)
-    assert "there is no restoration method 'best': use one of inverse, predictor" in str(refused.exception)
+    assert "there is no restoration method 'best': use one of tv, pnp" in str(refused.exception)
 
 
 @pytest.mark.slow
@@ -448,8 +448,7 @@ def test_the_demo_from_a_rig_file_with_a_picture_and_slopes_beside_it(aolink: Ru
     done = aolink("demo", "--rig", "mine/my.toml", "--exposures", "4", "--out", tmp_path / "out")
     assert done.returncode == 0, done.stderr
     (made,) = (tmp_path / "out").glob("demo-*")
-    assert "4 scenes of 4 exposures restored with the path of moments" in done.stdout
-    assert "PSNR of the scene:" in done.stdout
+    assert "; the scene goes from " in done.stdout
     assert (made / "rig.toml").read_text() == (folder / "my.toml").read_text()
     shutil.rmtree(folder)  # the recording needs nothing but itself
     recording = Recording(made / "deblurred.mcap")

@@ -342,5 +342,5 @@ def test_the_limit_is_below_o1_and_the_estimators_of_pixels_are_near_it(page: st
     path = dict(zip(head[1:], map(float, first[1:]), strict=True))
     assert path["sampled"] < path["o1"] < 2 * path["open-loop"]
     # With so few exposures a ratio has an error of some tenths; the section on o1 has the runs to tell.
-    assert path["mixture"] < path["o1"]
+    assert path["profile"] < path["o1"]
     assert path["profile"] < 1.3 * path["o1"]

@@ -194,11 +194,6 @@ def profile_of_many_axes(effort: Effort) -> Row:
     return _of_many_axes("profile", 100, effort)
 
 
-def mixture_of_many_axes(effort: Effort) -> Row:
-    """1800 mixtures."""
-    return _of_many_axes("mixture", 400, effort)
-
-
 def profile_of_tip_tilt(effort: Effort) -> Row:
     """An exposure of one spot on a plane, whose two slopes one mirror moves."""
     rig = load_rig("tip-tilt")

@@ -9,7 +9,7 @@ from bench_rows.row import Effort, Row
 
 
 def drawn_scenes(effort: Effort) -> list[Row]:
-    """Each goal over the first reporting scenes: of `moments` over 200, of `profile` and `mixture` over 12 of these,
+    """Each goal over the first reporting scenes: of `moments` over 200, of `profile` over 12 of these,
     beside `sampled` on 6."""
     from paper_report.judge import Plan, Size, judge_plan
     from paper_report.verdict import by_estimator, goals

@@ -302,7 +302,7 @@ def _annotate(ax: Axes, grid: Sequence[Sequence[IntervalEstimate]], decimals: in
                     color="white" if dark else "0.3")  # fmt: skip
 
 
-_MARKERS = {"open-loop": "|", "o1": "o", "o3": "s", "moments": "D", "profile": "^", "mixture": "P", "sampled": "*"}
+_MARKERS = {"open-loop": "|", "o1": "o", "o3": "s", "moments": "D", "profile": "^", "sampled": "*"}
 
 
 def figure_limit(path: Path, table: Sequence[LimitScene], dpi: int) -> None:

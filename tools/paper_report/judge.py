@@ -23,7 +23,7 @@ from paper_report.ensemble import SensorRows
 from paper_report.family import SEEDS, Scene, draw, exposures_of
 
 QUICK_NAMES = ("open-loop", "o1", "o3", "moments")
-PIXEL_NAMES = ("profile", "mixture")
+PIXEL_NAMES = ("profile",)
 LIMIT = "sampled"
 NAMES = (*QUICK_NAMES, *PIXEL_NAMES, LIMIT)
 RECORDED = Path(__file__).with_name("family.jsonl")
@@ -44,7 +44,7 @@ class Size:
     skip: int = 4
     """Exposures at the start that are not scored."""
     pixel_runs: int = 24
-    """Runs, the first ones, for `profile` and `mixture`."""
+    """Runs, the first ones, for `profile`."""
     limit_runs: int = 3
     """Runs, the first ones, for `sampled`."""
     particles: int | None = None
@@ -186,7 +186,7 @@ class Plan:
     scenes: int
     """Number of scenes that are judged by all but the slow estimators; the first of the reporting seeds."""
     pixel_scenes: int
-    """How many of these scenes are judged by `profile` and `mixture`, stratified."""
+    """How many of these scenes are judged by `profile`, stratified."""
     limit_scenes: int
     """How many of those scenes are judged by `sampled`."""
     size: Size

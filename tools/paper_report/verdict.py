@@ -20,10 +20,10 @@ from paper_report.judge import LIMIT, NAMES, Row
 Rows = Mapping[str, Mapping[int, Row]]
 """Rows by estimator and seed."""
 
-JUDGED = ("moments", "profile", "mixture")
+JUDGED = ("moments", "profile")
 REFERENCES = ("o1", "open-loop")
 NEAR_LIMIT = (1.05, 1.15)
-"""Largest ratio of mixture's path RMSE to sampled's, in the median and at the 95th percentile."""
+"""Largest ratio of profile's path RMSE to sampled's, in the median and at the 95th percentile."""
 MEDIAN_INSIDE = (0.93, 0.97)
 SCENE_INSIDE = (0.90, 0.99)
 SHARE_INSIDE = 0.95
@@ -146,10 +146,10 @@ class Goal:
 def goals(rows: Rows) -> list[Goal]:
     """All goals for which there are rows."""
     found: list[Goal] = []
-    to_limit = list(ratios(rows, "mixture", "sampled").values())
+    to_limit = list(ratios(rows, "profile", "sampled").values())
     if to_limit:
         median, high = np.quantile(to_limit, [0.5, 0.95])
-        text = f"mixture's path RMSE over sampled's at most {NEAR_LIMIT[0]:g} in the median and {NEAR_LIMIT[1]:g} at"
+        text = f"profile's path RMSE over sampled's at most {NEAR_LIMIT[0]:g} in the median and {NEAR_LIMIT[1]:g} at"
         within = bool(median <= NEAR_LIMIT[0] and high <= NEAR_LIMIT[1])
         found.append(Goal(f"{text} the 95th percentile", f"{median:.3f} and {high:.3f}", within, len(to_limit)))
     for name in (each for each in JUDGED if rows[each]):

@@ -13,6 +13,7 @@ from rich.table import Table
 
 from aolink.cli.tables.json import without_nan
 from aolink.estimation.score import Unused
+from aolink.recording.answers import Answers
 from aolink.units import duration, with_unit
 
 if TYPE_CHECKING:
@@ -30,7 +31,7 @@ def facts(values: Mapping[str, Any]) -> Table:
         "file": values["file"], "size": with_unit(values["bytes"], "B"), "recorded": f"{begun}{virtual}",
         "duration": duration(values["duration_s"]),
     }  # fmt: skip
-    left_out = {"bytes", "start_ns", "start_utc", "duration_s", "session", "estimators", "estimates"}
+    left_out = {"bytes", "start_ns", "start_utc", "duration_s", "session", "estimators", "estimates", "answers"}
     flat = readable | {name: value for name, value in values.items() if name not in left_out}
     flat["estimates"] = ", ".join(f"{name} {each['count']}" for name, each in values["estimates"].items()) or "none"
     for name, value in (flat | {k: v for k, v in values["session"].items() if k != "estimators"}).items():
@@ -43,6 +44,8 @@ def facts(values: Mapping[str, Any]) -> Table:
         table.add_row(*map(escape, _readable(name, value)))
         for line in _unused(values["estimates"]) if name == "estimates" else ():
             table.add_row("", escape(line))
+    for line in Answers.of(values["answers"]).lines():
+        table.add_row("answers", escape(line))
     return table
 
 

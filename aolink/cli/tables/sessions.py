@@ -77,6 +77,8 @@ def session(report: Report) -> Table:
     for name, parts in counts.items():
         if parts:
             table.add_row(name, ", ".join(parts))
+    for line in report.answers.lines():
+        table.add_row("answers", line)
     if report.ports_vanished:
         gone = f"vanished {report.ports_vanished} times, and {report.away_s:.2f} s until all had returned"
         table.add_row("ports", gone)

@@ -2,8 +2,8 @@
 plant.
 
 Whole-array calls for thousands of axes run through memory again and again; these loops keep one axis in the
-processor's cache (rows `moments_of_many_axes`, `profile_of_many_axes`, `mixture_of_many_axes` and
-`membrane_in_real_time` of tools/bench). Each loop for line sensors and for spots has a twin in NumPy that tests compare
+processor's cache (rows `moments_of_many_axes`, `profile_of_many_axes` and `membrane_in_real_time` of
+tools/bench). Each loop for line sensors and for spots has a twin in NumPy that tests compare
 it with: in `pixels.modes`, where spots on a plane use it, or in `plain.py` of `tests/estimation/pixels` and
 `tests/estimation/moments`. The loops for many spots of one plant are tested against
 the dense view of the same pixels. They hold no lock, so axes are shared among threads; the result for one axis does
@@ -22,8 +22,8 @@ GROUPS = {
     "o1 to o3 and moments": (("section-vi-lively", "o3"), ("section-vi-lively", "moments")),
     "larger plants": (("tip-tilt", "o3"),),
     "many spots": (("membrane-12x12", "moments"), ("membrane-12x12", "profile")),
-    "profile": (("section-vi-lively", "mixture"),),
-    "profile of spots": (("tip-tilt", "mixture"),),
+    "profile": (("section-vi-lively", "profile"),),
+    "profile of spots": (("tip-tilt", "profile"),),
 }
 """What is compiled together: the rigs and estimators that use all of a group's loops when they are made."""
 _COMPILE = """

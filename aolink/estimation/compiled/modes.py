@@ -110,8 +110,8 @@ def find_modes_of_lines(
     """Modes that the first ``of_row`` (rows,) of the whitened starts (rows, starts, n) lead to, then their reversals.
 
     As `pixels.modes.modes_of`; ``mean`` and ``covariance`` are the prior's. If ``reversed_precision`` is not zero,
-    results have room for three more modes than there are starts. Where there is no start, or it leads to the mode of
-    an earlier one, they are left alone.
+    results have room for three more modes than there are starts; rows of one start have no reversals. Where there is no
+    start, or it leads to the mode of an earlier one, they are left alone.
     """
     rows, n = mean.shape
     nodes, room = line.basis.shape[1], out_mean.shape[1]
@@ -212,7 +212,7 @@ def find_modes_of_lines(
                 if done == 0 or now < out_objective[row, best]:
                     best, best_end = done, found - 1
             done += 1
-            if done == of_row[row] and reversed_precision > 0.0:
+            if done == of_row[row] and done > 1 and reversed_precision > 0.0:
                 path_of(rest, B, ends[best_end], path)
                 _reversals(line.weights, rest, B, path, whole, reversed_precision, damped, lower, begins[done:])
                 count = done + 3

@@ -1,8 +1,8 @@
 """Matrices of a dozen rows, one at a time, in compiled code.
 
-The rows `moments_of_many_axes`, `profile_of_many_axes` and `mixture_of_many_axes` of tools/bench need it beside
-`aolink.numerics`, whose factorisations are LAPACK's: of one matrix of hundreds of rows (`single_thread`), or of a batch
-at once, from Python (`covariance`).
+The rows `moments_of_many_axes` and `profile_of_many_axes` of tools/bench need it beside `aolink.numerics`, whose
+factorisations are LAPACK's: of one matrix of hundreds of rows (`single_thread`), or of a batch at once, from Python
+(`covariance`).
 """
 
 from __future__ import annotations

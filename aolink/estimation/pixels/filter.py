@@ -7,7 +7,7 @@ leaves the prediction, and after several of them the filter starts again from th
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple, Protocol
 
@@ -66,21 +66,17 @@ class MixtureUpdate:
     several: BoolArray
     """Whether the posterior has several modes (more than one path explains the blur), (axes,)."""
     poor: BoolArray
-    """Whether importance sampling about the modes was not enough for it, or was not tried, (axes,)."""
+    """Whether too few points of importance sampling count for it, so that it is wider, (axes,)."""
 
 
 class MixtureUpdater(Protocol):
     """A way to update a mixture with the pixels of an exposure."""
 
-    def remarks(self, several: BoolArray, poor: BoolArray, reduced: Reduction) -> Iterable[tuple[BoolArray, str]]:
-        """Masks of axes, (axes,), each with what the estimate's reason says of them; ``several`` and ``poor`` are those
-        of `MixtureUpdate`."""
-
     def reduction(self, model: ExposureModel, sensor: BaseSensor) -> Reduction:
         """The coefficients that it works with."""
 
-    def update(self, view: PixelView, prior: GaussianMixture, unseen: Gaussian, number: int) -> MixtureUpdate:
-        """The posterior of axes with a prior of their start states, in the exposure of this number.
+    def update(self, view: PixelView, prior: GaussianMixture, unseen: Gaussian) -> MixtureUpdate:
+        """The posterior of axes with a prior of their start states.
 
         ``unseen`` is the prediction of the start states without any measurement.
         """
@@ -98,7 +94,6 @@ class MixtureFilter(Filter):
         # The prediction without any measurement.
         self._unseen = self.prior.gaussian
         self._missed = np.zeros(axes, dtype=np.int64)
-        self._number = 0
 
     def warm_up(self, updater: MixtureUpdater) -> None:
         """Update one axis with a dark exposure, so that what this compiles is compiled before the session."""
@@ -113,7 +108,7 @@ class MixtureFilter(Filter):
         dark = kind(density=np.zeros(shape), mask=np.ones(shape, dtype=bool))
         response = model.response(np.zeros((2, self.plant.n_inputs * self.plant.axes)))
         view = PixelView(self.sensor, model, response, dark, updater.reduction(model, self.sensor))
-        updater.update(view.part(one), self.prior.part(one), self._unseen.part(one), 0)
+        updater.update(view.part(one), self.prior.part(one), self._unseen.part(one))
         point = np.zeros((1, 1, view.reduced.size))
         view.log_likelihoods(point)
         view.rough().log_likelihoods_and_gradients(point)
@@ -167,7 +162,7 @@ class MixtureFilter(Filter):
 
             def updated(p: Indices) -> MixtureUpdate:
                 view = views[int(level[p[0]])].part(p)
-                u = self._updater.update(view, prior.part(p), self._unseen.part(p), self._number)
+                u = self._updater.update(view, prior.part(p), self._unseen.part(p))
                 return replace(u, coefficients=reduced.coefficients(u.coefficients))
 
             done = in_threads(updated, parts)
@@ -201,21 +196,17 @@ class MixtureFilter(Filter):
                 end = end.replaced(took, kicked)
         self.prior = end
         self._unseen = self._unwatched(model.transition, model.process_noise, response.end)
-        self._number += 1
         return Posterior(
             coefficients=coefficients, end=end.gaussian, status=status, innovation=new.value,
             innovation_covariance=new.covariance, nis=new.nis, several=several,
-            remark=self._remark(several, poor, reduced), log_evidence=log_evidence,
+            remark=_remark(poor), log_evidence=log_evidence,
             components=Components(components, reduced.expand, reduced.left_out, (unseen.mean, unseen.covariance)),
         )  # fmt: skip
 
-    def _remark(self, several: BoolArray, poor: BoolArray, reduced: Reduction) -> str:
-        axes = len(poor)
-        return "; ".join(
-            text if axes == 1 else f"{int(which.sum())} of {axes} axes: {text}"
-            for which, text in self._updater.remarks(several, poor, reduced)
-            if which.any()
-        )
+
+def _remark(poor: BoolArray) -> str:
+    of = "" if len(poor) == 1 else f"{int(poor.sum())} of {len(poor)} axes: "
+    return f"{of}too few of the paths tried fit the blur: the estimate is wider for it" if poor.any() else ""
 
 
 def _arrays(done: MixtureUpdate, components: int) -> tuple[NDArray[Any], ...]:

@@ -35,9 +35,10 @@ class GaussianMixture(NamedTuple):
         """A copy, each of whose arrays is contiguous in memory."""
         return GaussianMixture(*(np.array(each, order="C") for each in self))
 
-    def weighted(self, share: float) -> GaussianMixture:
-        """The mixture with its weights multiplied by a share."""
-        return self._replace(log_weight=self.log_weight + math.log(share))
+    def weighted(self, share: float | FloatArray) -> GaussianMixture:
+        """The mixture with its weights multiplied by a share, one for all axes or one each."""
+        with np.errstate(divide="ignore"):
+            return self._replace(log_weight=self.log_weight + np.log(share)[..., None])
 
     @property
     def gaussian(self) -> Gaussian:
@@ -138,26 +139,17 @@ def stacked_axes(mixtures: Sequence[GaussianMixture]) -> GaussianMixture:
     return GaussianMixture(*map(np.concatenate, zip(*mixtures, strict=True)))
 
 
-def with_noise(prior: GaussianMixture, t: FloatArray) -> FloatArray:
-    """Log-densities of t = (start state, standard normal noise coefficients), (axes, points, n) -> (axes, points)."""
-    states = prior.mean.shape[2]
-    return np.asarray(prior.log_density(t[..., :states]) + _of_noise(t[..., states:]))
-
-
 def with_noise_and_gradient(prior: GaussianMixture, t: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """The log-densities of `with_noise` and their gradients by t, (axes, points, n)."""
+    """Log-densities of t = (start state, standard normal noise coefficients), (axes, points, n) -> (axes, points), and
+    their gradients by t."""
     states, gradient = prior.mean.shape[2], -t
     density, pulled = np.empty(t.shape[:2]), np.empty((*t.shape[:2], states))
     compiled_mixtures.log_densities_and_gradients(
         *prior.contiguous, np.ascontiguousarray(t[..., :states]), density, pulled
     )
     gradient[..., :states] = pulled
-    return density + _of_noise(t[..., states:]), gradient
-
-
-def _of_noise(rest: FloatArray) -> FloatArray:
-    """Log-densities of standard normal numbers along the last axis."""
-    return np.asarray(-0.5 * np.add.reduce(rest * rest, axis=-1) - 0.5 * rest.shape[-1] * math.log(2 * math.pi))
+    rest = t[..., states:]
+    return density - 0.5 * np.add.reduce(rest * rest, axis=-1) - 0.5 * rest.shape[-1] * math.log(2 * math.pi), gradient
 
 
 def log_sum(values: FloatArray, axis: int) -> FloatArray:

@@ -24,32 +24,16 @@ from aolink.estimation.kalman.filter import GATE_PROBABILITY
 from aolink.estimation.kalman.gaussian import Gaussian
 from aolink.estimation.kalman.update import joseph_update
 from aolink.estimation.moments.lines import updated
+from aolink.estimation.pixels.constants import PROFILE
 from aolink.estimation.pixels.filter import Innovation
 from aolink.estimation.pixels.gaussian_mixture import log_sum
 from aolink.estimation.pixels.levenberg_marquardt import FIRST_DAMPING, FREE_DAMPING, LARGEST_DAMPING, Points, minimise
 from aolink.estimation.pixels.likelihood import PixelView
 from aolink.numerics import batched
-from aolink.numerics.arrays import FloatArray, Indices
+from aolink.numerics.arrays import BoolArray, FloatArray, Indices
 from aolink.numerics.covariance import cholesky, lower_inverse
 
-_PASSES = 16
-_BROAD_PASSES = 2
 _NO_NOISE = 1e-14
-# The objective changes by less than this at a mode, which is near enough to draw points about it.
-_CONVERGED = 0.03
-# Modes that are nearer to each other than this many standard deviations count as one.
-_APART = 0.7
-# Starts lie on both sides along the most uncertain direction of the path; along more directions where its variance is
-# larger than this many variances of the kernel.
-_WIDE_PATH = 0.5
-_DIRECTIONS = 3
-_START_REACH = 1.3
-# A start for a reversed path fits it to this many standard deviations of the kernel, if the prior allows.
-_REVERSED_TO = 0.2
-# Directions of the pixels, for each output, in which an innovation is given; the others hold hardly more than noise.
-_NEW_DIRECTIONS = 4
-# Information of a direction, as a share of the largest, that is rounding.
-_NO_INFORMATION = 1e-13
 
 
 class Modes(NamedTuple):
@@ -80,6 +64,11 @@ class Modes(NamedTuple):
         """Index of the mode of least objective, (axes,)."""
         return np.asarray(np.argmin(self.objective, axis=1))
 
+    @property
+    def best_mean(self) -> FloatArray:
+        """That mode, (axes, 1, n)."""
+        return np.asarray(self.mean[np.arange(len(self.mean)), self.best][:, None])
+
 
 def find_modes(view: PixelView, prior: Gaussian, starts: FloatArray) -> Modes:
     """The mode that each start, in whitened coordinates, (axes, starts, n), leads to, with this prior of each axis."""
@@ -92,7 +81,7 @@ def find_modes(view: PixelView, prior: Gaussian, starts: FloatArray) -> Modes:
     def at(s: FloatArray, which: Indices) -> Points:
         return _at(rows.part(which), m[which], L[which], s)
 
-    s, found = minimise(at, starts.reshape(-1, n), _PASSES, _CONVERGED)
+    s, found = minimise(at, starts.reshape(-1, n), PROFILE.passes, PROFILE.converged)
     covariance = batched.congruence(L, batched.symmetric(np.asarray(np.linalg.inv(found.hessian), dtype=np.float64)))
     _, log_H = np.linalg.slogdet(found.hessian)
     evidence = -found.objective - 0.5 * log_H
@@ -113,32 +102,36 @@ def found_compiled(
     found = Modes.none(axes, count, n)
     compiled_modes.find_modes_of_lines(
         line, np.ascontiguousarray(prior.mean), np.ascontiguousarray(prior.covariance), np.ascontiguousarray(starts),
-        of_axis, whole, reversed_precision, _PASSES, FIRST_DAMPING, LARGEST_DAMPING, FREE_DAMPING, _CONVERGED,
-        *found,
+        of_axis, whole, reversed_precision, PROFILE.passes, FIRST_DAMPING, LARGEST_DAMPING, FREE_DAMPING,
+        PROFILE.converged, *found,
     )  # fmt: skip
     return found
 
 
-def modes_of(view: PixelView, prior: Gaussian, wide: Gaussian) -> Modes:
+def modes_of(view: PixelView, prior: Gaussian, wide: Gaussian, at_length: BoolArray) -> Modes:
     """The modes of a posterior; ``wide`` is the posterior of windowed moments, from which searches start.
 
-    Starts are its mean and points on both sides of it (`spread_starts`). After their modes come those that the best
-    mode's reversal and mirror images lead to.
+    A search starts at its mean and, where it is to be ``at_length``, (axes,), at points on both sides of it
+    (`spread_starts`). After their modes come those that the best mode's reversal and mirror images lead to.
     """
     starts, squares = spread_starts(view, prior, wide)
-    many = squares[:, 0] > _WIDE_PATH * view.kernel_variance
+    many = at_length & (squares[:, 0] > PROFILE.wide_path * view.kernel_variance)
     if (line := view.line) is not None:
-        of_axis = np.where(many, starts.shape[1], 3)
+        of_axis = np.where(many, starts.shape[1], np.where(at_length, 3, 1))
         return found_compiled(line, prior, starts, of_axis, view.whole_nodes, precision_of_reversal(view))
-    found = find_modes(view, prior, starts[:, :3])
-    if len(some := np.flatnonzero(many)):
-        found = with_more(found, some, find_modes(view.part(some), prior.part(some), starts[some, 3:]))
-    return with_reversals(view, prior, found)
+    found = find_modes(view, prior, starts[:, :1])
+    for which, some in ((at_length, starts[:, 1:3]), (many, starts[:, 3:])):
+        if len(rows := np.flatnonzero(which)):
+            found = with_more(found, rows, find_modes(view.part(rows), prior.part(rows), some[rows]))
+    if len(rows := np.flatnonzero(at_length)):
+        back = reversed_starts(view.part(rows), prior.part(rows), found.best_mean[rows])
+        found = with_more(found, rows, find_modes(view.part(rows), prior.part(rows), back))
+    return found
 
 
 def with_reversals(view: PixelView, prior: Gaussian, found: Modes) -> Modes:
     """Modes, and after them those that the best one's reversal and mirror images lead to."""
-    back = reversed_starts(view, prior, found.mean[np.arange(len(found.mean)), found.best][:, None])
+    back = reversed_starts(view, prior, found.best_mean)
     return with_more(found, slice(None), find_modes(view, prior, back))
 
 
@@ -155,25 +148,23 @@ def _at(rows: PixelView, m: FloatArray, L: FloatArray, s: FloatArray) -> Points:
 def without_repeats(modes: Modes) -> Modes:
     """The modes without those that an earlier start has led to; the remaining ones come first."""
     mean, covariance, *rest = kept = [each.copy() for each in modes]
-    most = compiled_modes.drop_repeats(mean, covariance, _APART, *rest)
+    most = compiled_modes.drop_repeats(mean, covariance, PROFILE.apart, *rest)
     return Modes(*(each[:, : max(most, 1)] for each in kept))
 
 
-def broad(view: PixelView, prior: Gaussian, memory: FloatArray | None = None) -> Gaussian:
-    """The prior of t updated with windowed moments: wide where the posterior has several modes.
-
-    ``memory`` multiplies the covariance of what their linearisation leaves out, (axes,); one where None.
-    """
-    memory = np.ones(len(prior.mean)) if memory is None else memory
+def broad(view: PixelView, prior: Gaussian) -> Gaussian:
+    """The prior of t updated with windowed moments: wide where the posterior has several modes."""
     if view.on_line:
         assert isinstance(view.measured, Profile)
-        return updated(view.optics.profile, view.nodes, prior, view.measured, memory, _BROAD_PASSES)
+        return updated(
+            view.optics.profile, view.nodes, prior, view.measured, np.ones(len(prior.mean)), PROFILE.broad_passes
+        )
     about = prior
-    for _ in range(_BROAD_PASSES):
+    for _ in range(PROFILE.broad_passes):
         y, noise, fit = view.moments(about)
         innovation = y - fit.expected - batched.matvec(fit.slope, prior.mean - about.mean)
         # A window without a pixel that can be used has neither moments nor noise.
-        spread = noise + memory[:, None, None] * fit.remainder + _NO_NOISE * np.eye(y.shape[1])
+        spread = noise + fit.remainder + _NO_NOISE * np.eye(y.shape[1])
         about = joseph_update(prior, innovation, fit.slope, spread).posterior
     return about
 
@@ -187,16 +178,16 @@ def spread_starts(view: PixelView, prior: Gaussian, wide: Gaussian) -> tuple[Flo
     """
     axes, n = wide.mean.shape
     if view.on_line:
-        starts, squares = np.empty((axes, 1 + 2 * min(_DIRECTIONS, n), n)), np.empty((axes, n))
+        starts, squares = np.empty((axes, 1 + 2 * min(PROFILE.directions, n), n)), np.empty((axes, n))
         compiled_modes.spread_starts_of_lines(
             *(np.ascontiguousarray(each) for each in (prior.mean, prior.covariance, wide.mean, wide.covariance)),
-            view.gram, _START_REACH, starts, squares,
+            view.gram, PROFILE.start_reach, starts, squares,
         )  # fmt: skip
         return starts, squares
     L = cholesky(wide.covariance)
     values, V = np.linalg.eigh(batched.symmetric(batched.matmul(batched.transpose(L), batched.matmul(view.gram, L))))
     V = batched.transpose(V[:, :, ::-1])
-    along = batched.matmul(V[:, :_DIRECTIONS], batched.transpose(L)) * _START_REACH
+    along = batched.matmul(V[:, : PROFILE.directions], batched.transpose(L)) * PROFILE.start_reach
     mean = wide.mean[:, None]
     pairs = np.stack([mean + along, mean - along], axis=2).reshape(axes, -1, n)
     return whitened(prior, np.concatenate([mean, pairs], axis=1)), values[:, ::-1]
@@ -204,7 +195,7 @@ def spread_starts(view: PixelView, prior: Gaussian, wide: Gaussian) -> tuple[Flo
 
 def precision_of_reversal(view: PixelView) -> float:
     """Precision with which a path is fitted to the reversal of another, one over slope units squared."""
-    return 1 / (_REVERSED_TO**2 * view.kernel_variance)
+    return 1 / (PROFILE.reversed_to**2 * view.kernel_variance)
 
 
 def reversed_starts(view: PixelView, prior: Gaussian, points: FloatArray) -> FloatArray:
@@ -252,12 +243,12 @@ def innovation(view: PixelView, prior: Gaussian, modes: Modes) -> Innovation:
     rows = np.arange(len(modes.mean)), modes.best
     t, distance = modes.mean[rows], modes.distance[rows]
     axes, n = t.shape
-    k = min(_NEW_DIRECTIONS * view.outputs, n)
+    k = min(PROFILE.new_directions * view.outputs, n)
     if (line := view.line) is not None:
         u, values, nis, square = np.empty((axes, k)), np.empty((axes, k)), np.empty(axes), np.empty(axes)
         compiled_modes.innovations_of_lines(
-            line, np.ascontiguousarray(prior.mean), np.ascontiguousarray(prior.covariance), t, _NO_INFORMATION, u,
-            values, nis, square,
+            line, np.ascontiguousarray(prior.mean), np.ascontiguousarray(prior.covariance), t,
+            PROFILE.no_information, u, values, nis, square,
         )  # fmt: skip
     else:
         u, values, nis, square = _innovations(view, prior, t, k)
@@ -283,7 +274,7 @@ def _innovations(
     values, V = np.maximum(values[:, ::-1][:, :k], 0.0), V[:, :, ::-1][:, :, :k]
     S = np.sqrt(values)
     # The innovation is zero in a direction about which the pixels have no information.
-    tells = values > _NO_INFORMATION * values[:, :1]
+    tells = values > PROFILE.no_information * values[:, :1]
     pull = batched.matvec(batched.transpose(batched.matmul(A, V)), e)
     u = np.where(tells, pull / np.where(tells, S, 1.0), 0.0) + S * batched.matvec(batched.transpose(V), s)
     return u, values, np.add.reduce(u * u / (1 + values), axis=1), batched.dot(e, e)

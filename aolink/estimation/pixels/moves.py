@@ -1,8 +1,8 @@
 """Markov chain moves that leave a tempered posterior unchanged: prior times a power of the pixels' likelihood.
 
-`Metropolis` needs likelihoods only; `Hamiltonian` needs their gradients, two to three times the work a point, and is
-worth it: where a bright spot swings, the posterior is a thin shell or several, of which the points' covariance says
-little. There random walks take steps of a twentieth of the posterior's width, and hardly leave where they began.
+They need gradients of the likelihood, two to three times the work a point, and are worth it: where a bright spot
+swings, the posterior is a thin shell or several, of which the points' covariance says little. There random walks would
+take steps of a twentieth of the posterior's width, and hardly leave where they began.
 """
 
 from __future__ import annotations
@@ -12,14 +12,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from aolink.estimation.pixels.gaussian_mixture import GaussianMixture, with_noise, with_noise_and_gradient
+from aolink.estimation.pixels.gaussian_mixture import GaussianMixture, with_noise_and_gradient
 from aolink.estimation.pixels.likelihood import PixelView
 from aolink.numerics.arrays import BoolArray, FloatArray, Indices
 from aolink.numerics.covariance import cholesky
 
-_MOVES = 16
-# Every fourth move takes the full difference of two particles, which leads from one mode to another.
-_WHOLE = 4
 # Trajectories after each step of the power; how long they are, in standard deviations of the points, as far as so many
 # steps lead there (on a plane, where a step takes several times as long, fewer); and which share is to be accepted.
 _TRAJECTORIES = 2
@@ -43,52 +40,6 @@ def affordable(view: PixelView) -> int:
 
 def _most_steps(view: PixelView) -> int:
     return _MOST_STEPS if view.on_line else _MOST_ON_A_PLANE
-
-
-class Metropolis:
-    """Points of one axis that are moved by Metropolis' rule: in turn with differences of two other points (differential
-    evolution MCMC: ter Braak, Stat. Comput. 16 (2006)), which go from mode to mode, and with random walks by the
-    points' own covariance."""
-
-    def __init__(
-        self, view: PixelView, prior: GaussianMixture, points: FloatArray, rng: np.random.Generator
-    ) -> None:  # fmt: skip
-        self._view, self._prior, self._rng, self.points = view, prior, rng, points
-        self._log_prior, self.log_likelihood = self._at(points)
-        self._walk = self._difference = 1.0
-
-    def _at(self, t: FloatArray) -> tuple[FloatArray, FloatArray]:
-        return with_noise(self._prior, t[None])[0], self._view.log_likelihoods(t[None])[0]
-
-    def resample(self, chosen: Indices) -> None:
-        """Take these points in place of all, (count,)."""
-        self.points = self.points[chosen]
-        self._log_prior, self.log_likelihood = self._log_prior[chosen], self.log_likelihood[chosen]
-
-    def move(self, power: float) -> None:
-        """Move the points so that their distribution, with the likelihood raised to a power, stays."""
-        rng, t, (count, n) = self._rng, self.points, self.points.shape
-        root = _root(t)
-        for move in range(_MOVES):
-            if move % 2:
-                step = 2.38 / math.sqrt(n) * self._walk * rng.standard_normal((count, n)) @ root.T
-            else:
-                first, second = rng.integers(0, count, (2, count))
-                length = 1.0 if move % _WHOLE == 0 else 2.38 / math.sqrt(2 * n) * self._difference
-                step = length * (t[first] - t[second]) + 0.01 * self._walk * rng.standard_normal((count, n)) @ root.T
-            there = t + step
-            its_prior, its_likelihood = self._at(there)
-            gain = its_prior - self._log_prior + power * (its_likelihood - self.log_likelihood)
-            taken = np.log(rng.random(count)) < gain
-            t[taken], self._log_prior[taken] = there[taken], its_prior[taken]
-            self.log_likelihood[taken] = its_likelihood[taken]
-            # Towards an acceptance rate of one quarter. The step sizes are kept: the next power needs hardly smaller
-            # ones.
-            change = math.exp(2 * (taken.mean() - 0.25))
-            if move % 2:
-                self._walk *= change
-            elif move % _WHOLE:
-                self._difference *= change
 
 
 class _Place(NamedTuple):
@@ -132,11 +83,11 @@ class Hamiltonian:
         return _Place(t, log_prior[0], log_likelihood[0], prior_slope[0], slope[0])
 
     def resample(self, chosen: Indices) -> None:
-        """As `Metropolis.resample`."""
+        """Take these points in place of all, (count,)."""
         self._now = _Place(*(each[chosen] for each in self._now))
 
     def move(self, power: float) -> None:
-        """As `Metropolis.move`."""
+        """Move the points so that their distribution, with the likelihood raised to a power, stays."""
         root, count = _root(self.points), len(self.points)
         for _ in range(_TRAJECTORIES):
             taken = self._follow(power, root)

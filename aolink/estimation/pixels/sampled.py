@@ -7,6 +7,7 @@ Less of the path is left out than for the others; the nodes in time are those of
 from __future__ import annotations
 
 from dataclasses import dataclass
+from zlib import crc32
 
 import numpy as np
 
@@ -16,11 +17,10 @@ from aolink.estimation.pixels.filter import MixtureUpdate
 from aolink.estimation.pixels.gaussian_mixture import GaussianMixture, stacked_axes
 from aolink.estimation.pixels.likelihood import PixelView, Reduction, reduction
 from aolink.estimation.pixels.modes import find_modes, innovation, whitened, with_reversals, without_repeats
-from aolink.estimation.pixels.moves import Hamiltonian, affordable
+from aolink.estimation.pixels.moves import affordable
+from aolink.estimation.pixels.profile import has_several
 from aolink.estimation.pixels.tempering import Particles, fitted, tempered_points
-from aolink.estimation.pixels.updates import has_several
 from aolink.numerics import batched
-from aolink.numerics.arrays import BoolArray
 from aolink.numerics.single_thread import by_one_thread
 from aolink.optics.sensor import BaseSensor
 
@@ -39,15 +39,11 @@ class TemperedUpdater:
     particles: int | None = None
     seed: int = 0
 
-    def remarks(self, several: BoolArray, poor: BoolArray, reduced: Reduction) -> tuple[()]:
-        """None: its updates are never poor."""
-        return ()
-
     def reduction(self, model: ExposureModel, sensor: BaseSensor) -> Reduction:
         return reduction(model, sensor, left_out=_LEFT_OUT)
 
-    def update(self, view: PixelView, prior: GaussianMixture, unseen: Gaussian, number: int) -> MixtureUpdate:
-        t, evidence = self.sample(view, prior, number)
+    def update(self, view: PixelView, prior: GaussianMixture, unseen: Gaussian) -> MixtureUpdate:
+        t, evidence = self.sample(view, prior)
         reduced, before = view.reduced, view.reduced.prior(prior.gaussian)
         mean = t.mean(axis=1)
         away = t - mean[:, None]
@@ -62,11 +58,12 @@ class TemperedUpdater:
         carried = GaussianMixture(fit.log_weight, end.mean, end.covariance)
         return MixtureUpdate(fit, after, carried, new, evidence, has_several(modes), np.zeros(len(mean), dtype=bool))
 
-    def sample(self, view: PixelView, prior: GaussianMixture, number: int) -> Particles:
+    def sample(self, view: PixelView, prior: GaussianMixture) -> Particles:
         """Particles of the posterior from the prior of the start state; the noise coefficients have N(0, I).
 
-        With the estimator's seed and the axis, the exposure's ``number`` seeds the random numbers.
+        The estimator's seed, the axis and its pixels seed the random numbers, so that they do not depend on how many
+        exposures came before.
         """
-        keys = [(self.seed, number, axis) for axis in view.axes.tolist()]
+        keys = [(self.seed, axis, crc32(y.tobytes())) for axis, y in zip(view.axes.tolist(), view.y, strict=True)]
         rough = view.rough()
-        return tempered_points(rough, prior, self.particles or affordable(rough), keys, Hamiltonian)
+        return tempered_points(rough, prior, self.particles or affordable(rough), keys)

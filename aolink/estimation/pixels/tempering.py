@@ -18,7 +18,7 @@ from scipy import optimize
 
 from aolink.estimation.pixels.gaussian_mixture import GaussianMixture, log_sum
 from aolink.estimation.pixels.likelihood import PixelView
-from aolink.estimation.pixels.moves import Hamiltonian, Metropolis
+from aolink.estimation.pixels.moves import Hamiltonian
 from aolink.numerics.arrays import FloatArray, Indices
 from aolink.numerics.covariance import cholesky
 from aolink.numerics.single_thread import by_one_thread
@@ -39,26 +39,20 @@ class Particles(NamedTuple):
     the sum over the steps of the power of the log of the points' mean weight."""
 
 
-def tempered_points(
-    view: PixelView, prior: GaussianMixture, count: int, keys: Sequence[tuple[int, ...]],
-    moves: type[Metropolis] | type[Hamiltonian],
-) -> Particles:  # fmt: skip
+def tempered_points(view: PixelView, prior: GaussianMixture, count: int, keys: Sequence[tuple[int, ...]]) -> Particles:
     """Points of the posterior; the same key, the seed of an axis, gives the same points.
 
     ``prior`` is that of the start state; the noise coefficients have N(0, I).
     """
     each = (np.array([axis]) for axis in range(len(keys)))
-    found = [_of_axis(view.part(a), prior.part(a), count, key, moves) for a, key in zip(each, keys, strict=True)]
+    found = [_of_axis(view.part(a), prior.part(a), count, key) for a, key in zip(each, keys, strict=True)]
     return Particles(np.stack([points for points, _ in found]), np.array([evidence for _, evidence in found]))
 
 
-def _of_axis(
-    view: PixelView, prior: GaussianMixture, count: int, key: tuple[int, ...],
-    moves: type[Metropolis] | type[Hamiltonian],
-) -> tuple[FloatArray, float]:  # fmt: skip
+def _of_axis(view: PixelView, prior: GaussianMixture, count: int, key: tuple[int, ...]) -> tuple[FloatArray, float]:
     """`tempered_points` of one axis: points (count, n) and the log-evidence."""
     rng = np.random.default_rng(key)
-    moved = moves(view, prior, _drawn(prior, rng, count, view.reduced.size), rng)
+    moved = Hamiltonian(view, prior, _drawn(prior, rng, count, view.reduced.size), rng)
     power, evidence = 0.0, 0.0
     while power < 1.0:
         power, before = _next_power(moved.log_likelihood, power), power

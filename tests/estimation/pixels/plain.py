@@ -6,7 +6,8 @@ import numpy as np
 
 from aolink.estimation import Profile
 from aolink.estimation.pixels import importance
-from aolink.estimation.pixels.gaussian_mixture import GaussianMixture, log_sum, with_noise
+from aolink.estimation.pixels.constants import PROFILE
+from aolink.estimation.pixels.gaussian_mixture import GaussianMixture, log_sum
 from aolink.estimation.pixels.likelihood import PixelView
 from aolink.estimation.pixels.modes import find_modes, whitened
 from aolink.numerics import batched
@@ -28,6 +29,13 @@ class PlainView(PixelView):
         twin = cls.__new__(cls)
         twin.__dict__.update(vars(view), on_line=False, sees_line=view.on_line)
         return twin
+
+    @property
+    def work(self):
+        """That of the view, which decides on the number of points."""
+        twin = PixelView.__new__(PixelView)
+        twin.__dict__.update(vars(self), on_line=self.sees_line)
+        return twin.work
 
     def moments(self, about):
         if not self.sees_line:
@@ -78,6 +86,14 @@ class PlainView(PixelView):
         return self.log_likelihood(self.predicted(t))
 
 
+def with_noise(prior, t):
+    """Log-densities of t = (start state, standard normal noise coefficients), (axes, points, n) -> (axes, points)."""
+    states = prior.mean.shape[2]
+    rest = t[..., states:]
+    constant = -0.5 * rest.shape[-1] * math.log(2 * math.pi)
+    return prior.log_density(t[..., :states]) - 0.5 * np.add.reduce(rest * rest, axis=-1) + constant
+
+
 def settled_modes(view, prior, starts):
     """`find_modes` again from where it has ended, until a search leads next to nowhere."""
     modes = find_modes(view, prior, starts)
@@ -89,12 +105,12 @@ def settled_modes(view, prior, starts):
 def importance_corrected(view, prior, proposal, share, enough):
     """The twin of `importance.importance_corrected`."""
     n = view.reduced.size
-    points = importance.points_of_round(n, share)
+    points = importance.points_of_round(view, share)
     proposals = list[GaussianMixture]()
     t = np.zeros((len(prior.mean), 0, n))
     target, effective = np.zeros(t.shape[:2]), np.zeros(len(t))
     fit, going_on = proposal, np.ones(len(t), dtype=bool)
-    for k in range(importance.ROUNDS):
+    for k in range(PROFILE.rounds):
         new = _drawn(proposal, points, k)
         proposals.append(proposal)
         t = np.concatenate([t, new], axis=1)
@@ -102,16 +118,16 @@ def importance_corrected(view, prior, proposal, share, enough):
         log_weight = target - log_sum(np.stack([q.log_density(t) for q in proposals], axis=1), axis=1)
         log_weight -= log_sum(log_weight, axis=1)[:, None]
         effective = np.where(going_on, np.exp(-log_sum(2 * log_weight, axis=1)), effective)
-        tempered = _tempered(log_weight, importance.LEAST_EFFECTIVE)
-        scale = importance.LOOSENED if k else importance.TIGHTENED
+        tempered = _tempered(log_weight, PROFILE.least_effective)
+        scale = PROFILE.loosened if k else PROFILE.tightened
         scaled = proposal._replace(covariance=proposal.covariance * scale)
-        last = _refitted(proposal, t, tempered, scaled, n * importance.LAST_PRIOR_POINTS)
+        last = _refitted(proposal, t, tempered, scaled, n * PROFILE.last_prior_points)
         some = np.flatnonzero(going_on)
         fit = fit.replaced(some, last.part(some))
         going_on &= effective < enough
         if not going_on.any():
             break
-        proposal = _refitted(proposal, t, tempered, proposal, n * importance.PRIOR_POINTS)
+        proposal = _refitted(proposal, t, tempered, proposal, n * PROFILE.prior_points)
     return fit, effective
 
 
@@ -120,7 +136,7 @@ def _tempered(log_weight, least):
     least = min(least, log_weight.shape[1] / 2)
     low, high = np.zeros(len(log_weight)), np.ones(len(log_weight))
     power = high
-    for _ in range(importance.HALVINGS):
+    for _ in range(PROFILE.halvings):
         w = power[:, None] * log_weight
         enough = -log_sum(2 * (w - log_sum(w, axis=1)[:, None]), axis=1) >= math.log(least)
         low, high = np.where(enough, power, low), np.where(enough, high, power)
@@ -154,6 +170,6 @@ def _refitted(mixture, points, log_weight, beside, prior_points):
     spread = batched.long_matmul(batched.transpose(away * share[..., None]), away) / safe[..., None]
     trust = (effective / (effective + prior_points))[..., None, None]
     covariance = batched.symmetric(trust * spread + (1 - trust) * beside.covariance)
-    mass = np.where(mass > importance.NEGLIGIBLE * np.add.reduce(mass, axis=1)[:, None], mass, 0.0)
+    mass = np.where(mass > PROFILE.negligible * np.add.reduce(mass, axis=1)[:, None], mass, 0.0)
     with np.errstate(divide="ignore"):
         return GaussianMixture(np.log(mass / np.add.reduce(mass, axis=1)[:, None]), mean, covariance)

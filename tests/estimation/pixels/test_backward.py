@@ -20,7 +20,7 @@ from aolink.estimation import (
 from aolink.estimation.estimate import Components
 from aolink.rig import load_rig
 from aolink.simulation.model import simulate
-from tests.estimation.pixels.test_hand_over import vibrating
+from tests.estimation.vibrating import vibrating
 from tests.kinds import truth_of
 
 LIVELY = load_rig("section-vi-lively")
@@ -128,7 +128,7 @@ def swinging():
     rig = dataclasses.replace(rig, sensor=dataclasses.replace(rig.sensor, bit_depth=16, black_level=20_000.0))
     still = np.zeros((12 * rig.timing.exposure_steps, 1))
     runs = [simulate(rig, 12, seed=seed, inputs=still) for seed in range(5, 11)]
-    return rig, [(exposures, run(rig, exposures, ["mixture"])["mixture"]) for exposures in runs]
+    return rig, [(exposures, run(rig, exposures, ["profile"])["profile"]) for exposures in runs]
 
 
 @pytest.mark.slow
@@ -163,19 +163,18 @@ def test_a_frame_that_is_lost_is_found_by_those_after_it():
     exposures = simulate(LIVELY, 12, seed=4)
     dark = dataclasses.replace(exposures[5], mask=np.zeros_like(exposures[5].mask))
     exposures = [*exposures[:5], dark, *exposures[6:]]
-    for name in ("profile", "mixture"):
-        estimates = run(LIVELY, exposures, [name])[name]
-        assert estimates[5].status == Status.INPUT_INVALID
-        smoothed = smooth(LIVELY.plant, exposures, estimates)
-        assert smoothed[5].path_sd.max() < 0.6 * estimates[5].path_sd.max()
-        assert np.mean(np.abs(smoothed[5].path - truth_of(dark).path) < 3 * smoothed[5].path_sd) > 0.9
+    estimates = run(LIVELY, exposures, ["profile"])["profile"]
+    assert estimates[5].status == Status.INPUT_INVALID
+    smoothed = smooth(LIVELY.plant, exposures, estimates)
+    assert smoothed[5].path_sd.max() < 0.6 * estimates[5].path_sd.max()
+    assert np.mean(np.abs(smoothed[5].path - truth_of(dark).path) < 3 * smoothed[5].path_sd) > 0.9
 
 
 def test_where_the_state_was_lost_the_past_stays():
     """After five exposures the spot is where another run of the plant has brought it, which no filter could know."""
     one, other = (simulate(LIVELY, 12, seed=seed) for seed in (1, 2))
     exposures = [*one[:5], *(dataclasses.replace(o, inputs=x.inputs) for o, x in zip(other[5:], one[5:], strict=True))]
-    rig, estimates = LIVELY, run(LIVELY, exposures, ["mixture"])["mixture"]
+    rig, estimates = LIVELY, run(LIVELY, exposures, ["profile"])["profile"]
     together, apart_ = smooth(rig.plant, exposures, estimates), smooth(rig.plant, exposures[:5], estimates[:5])
     for a, b in zip(together[:5], apart_, strict=True):
         assert np.abs((a.path - b.path) / b.path_sd).max() < 1

@@ -54,7 +54,7 @@ def test_it_is_the_kalman_filter_where_all_is_linear():
     truth = before.mean[0] + np.linalg.cholesky(before.covariance[0]) @ rng.standard_normal(reduced.size)
     view = LinearView(H, (H @ truth + 0.3 * rng.standard_normal(4))[None], 0.3, reduced)
     # It has all of a PixelView that is asked for.
-    (t,), (evidence,) = TemperedUpdater(particles=4000).sample(cast(likelihood.PixelView, view), single(PRIOR), 0)
+    (t,), (evidence,) = TemperedUpdater(particles=4000).sample(cast(likelihood.PixelView, view), single(PRIOR))
     kalman = joseph_update(before, view.y - before.mean @ H.T, H[None], 0.09 * np.eye(4)[None]).posterior
     sd = np.sqrt(np.diag(kalman.covariance[0]))
     np.testing.assert_allclose((t.mean(axis=0) - kalman.mean[0]) / sd, 0, atol=0.1)
@@ -79,15 +79,15 @@ def test_other_particles_and_twice_as_many_say_the_same():
     mean = truth_of(exposure).start_state + np.array([0.01, 0.1])
     prior = single(Gaussian(mean, RIG.plant.initial_covariance[None] / 9))
     one, other, more = (
-        TemperedUpdater(count, seed).sample(view, prior, 0).points[0] for count, seed in ((600, 0), (600, 1), (1200, 2))
+        TemperedUpdater(count, seed).sample(view, prior).points[0] for count, seed in ((600, 0), (600, 1), (1200, 2))
     )
     sd = more.std(axis=0)
     for each in (one, other):
         assert np.sqrt(np.mean(((each.mean(axis=0) - more.mean(axis=0)) / sd) ** 2)) < 0.2
         np.testing.assert_allclose(each.std(axis=0) / sd, 1, atol=0.15)
-    again = TemperedUpdater(600, 0).sample(view, prior, 0)
+    again = TemperedUpdater(600, 0).sample(view, prior)
     assert again.points[0].tobytes() == one.tobytes()
-    update = TemperedUpdater(600, 0).update(view, prior, prior.gaussian, 0)
+    update = TemperedUpdater(600, 0).update(view, prior, prior.gaussian)
     assert update.log_evidence.tobytes() == again.log_evidence.tobytes()
 
 
@@ -104,12 +104,12 @@ def ranks(count, particles, seed=5):
     before = reduced.prior(PRIOR)
     root = np.linalg.cholesky(before.covariance[0])
     found = []
-    for number in range(count):
+    for _ in range(count):
         t = (before.mean[0] + root @ rng.standard_normal(reduced.size))[None, None]
         dark = Profile(density=np.zeros((1, 40)), mask=np.ones((1, 40), bool))
         view = likelihood.PixelView(rig.sensor, MODEL, MODEL.response(np.zeros((200, 1))), dark, reduced)
         view.y = PlainView.of(view).predicted(t)[:, 0] + np.sqrt(view.read_noise) * rng.standard_normal((1, 40))
-        drawn = TemperedUpdater(particles).sample(view, single(PRIOR), number).points[0]
+        drawn = TemperedUpdater(particles).sample(view, single(PRIOR)).points[0]
 
         thin = drawn[rng.permutation(particles)[:99]]
         found.append((functions(view, thin) < functions(view, t[0])).sum(axis=1))
@@ -162,6 +162,6 @@ def test_no_bit_depends_on_how_many_threads_there_are():
     view, prior, found = seen(RIG, exposure), single(PRIOR), []
     for threads in (1, 2):
         with threadpool_limits(threads):
-            drawn = TemperedUpdater(10_001).sample(view, prior, 0).points
+            drawn = TemperedUpdater(10_001).sample(view, prior).points
             found.append([drawn.tobytes(), *(each.tobytes() for each in fitted(points, np.eye(2, 31), 8, 0))])
     assert found[0] == found[1]

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from scipy.linalg import expm, solve_discrete_lyapunov
 
-from aolink.estimation import Status, exposure_model, run, score
+from aolink.errors import EstimatorError
+from aolink.estimation import Status, exposure_model, make_estimator, run, score
 from aolink.estimation.estimate import Components
 from aolink.estimation.frames.frame_data import Profile
 from aolink.estimation.frames.measure import measure
@@ -17,18 +18,18 @@ from aolink.estimation.pixels.filter import MixtureFilter
 from aolink.estimation.pixels.gaussian_mixture import GaussianMixture, single
 from aolink.estimation.pixels.importance import importance_corrected
 from aolink.estimation.pixels.modes import broad, whitened
-from aolink.estimation.pixels.updates import MIXTURE, PROFILE, explored
+from aolink.estimation.pixels.profile import ProfileUpdater, explored
 from aolink.numerics.covariance import cholesky
 from aolink.optics.camera import to_counts
 from aolink.optics.kernel import exposure_density
 from aolink.rig import load_rig
 from aolink.simulation.model import simulate
 from tests.estimation.pixels.plain import PlainView, settled_modes
+from tests.estimation.vibrating import vibrating
 from tests.kinds import line_of, must_be, truth_of
 
 RIG = load_rig("section-vi-lively")
-UPDATES = {"profile": PROFILE, "mixture": MIXTURE}
-PIXEL_ESTIMATORS = list(UPDATES)
+PROFILE = ProfileUpdater()
 
 
 def quiet(rig, V):
@@ -100,7 +101,7 @@ def test_posterior_is_that_of_importance_sampling(photoelectrons):
     view, state = seen(rig)
     mean, covariance, effective = by_importance(view, state)
     assert effective > 300
-    update = PROFILE.update(view, single(state), state, 0)
+    update = PROFILE.update(view, single(state), state)
     assert_near(update.coefficients, mean, covariance, 0.25, 0.15)
 
 
@@ -123,7 +124,7 @@ def test_profile_is_the_mean_of_the_posterior_where_it_has_several_modes(seed):
     view, state = seen(quiet(RIG, 0.003), width=0.5, seed=seed)
     mean, covariance, effective = by_importance(view, state)
     assert effective > 200
-    update = PROFILE.update(view, single(state), state, 0)
+    update = PROFILE.update(view, single(state), state)
     assert update.several[0]
     assert_near(update.coefficients, mean, covariance, 0.45, 0.35)
 
@@ -131,30 +132,13 @@ def test_profile_is_the_mean_of_the_posterior_where_it_has_several_modes(seed):
 def test_profile_carries_as_many_gaussians_as_it_takes():
     """One of a posterior that is Gaussian; of one with two readings more, whose density is that of the points."""
     one, state = seen(quiet(load_rig("section-vi"), 0.005))
-    assert PROFILE.update(one, single(state), state, 0).end.mean.shape[1] == 1
+    assert PROFILE.update(one, single(state), state).end.mean.shape[1] == 1
     view, state = seen(quiet(RIG, 0.003), width=0.5, seed=10)
-    end = PROFILE.update(view, single(state), state, 0).end
+    end = PROFILE.update(view, single(state), state).end
     assert 1 < end.mean.shape[1] <= 3
     whole = single(end.gaussian)
     points = np.concatenate([end.mean[0], whole.mean[0]])[None]
     assert np.abs(end.log_density(points) - whole.log_density(points)).max() > 0.05
-
-
-def test_all_points_are_drawn_where_there_is_a_second_mode():
-    """With one mode `profile` draws a share of the points, and reaches it; `mixture` always draws all."""
-    one, state = seen(quiet(load_rig("section-vi"), 0.005))
-    two, other = seen(quiet(RIG, 0.003), width=0.5, seed=10)
-
-    def mean(updates, view, state, **changed):
-        updates = dataclasses.replace(updates, **changed)
-        return updates.update(view, single(state), state, 0).coefficients.mean.tobytes()
-
-    assert mean(PROFILE, two, other) == mean(PROFILE, two, other, share=1.0)
-    assert mean(PROFILE, one, state) == mean(PROFILE, one, state, share=0.25) != mean(PROFILE, one, state, share=1.0)
-    assert mean(MIXTURE, one, state) == mean(MIXTURE, one, state, share=1.0)
-    # The effective sample size to reach is less by the same share: here a single round has it, and does not have all.
-    assert mean(PROFILE, one, state) == mean(PROFILE, one, state, enough=0.0)
-    assert mean(PROFILE, one, state) != mean(PROFILE, one, state, enough=400.0)
 
 
 def test_evidence_of_a_mode_has_the_weight_of_its_prior():
@@ -193,7 +177,7 @@ def test_a_path_and_its_reversal_are_two_readings():
     view = likelihood.PixelView(rig.sensor, model, model.response(np.zeros((200, 1))), measured, reduced)
     P = np.diag([0.04, 25.0])
     state = Gaussian(np.zeros((1, 2)), P[None])
-    update = PROFILE.update(view, single(state), state, 0)
+    update = PROFILE.update(view, single(state), state)
     assert update.several[0]
     modes, _ = explored(view, single(state))
     there = np.isfinite(modes.log_evidence[0])
@@ -216,25 +200,22 @@ def squared(exposures, estimates, skip=5):
 def test_better_than_o1_and_right_about_it(V):
     rig = quiet(RIG, V)
     exposures = simulate(rig, 45, seed=8, inputs=np.zeros((9_000, 1)))
-    found = run(rig, exposures, ["o1", "moments", *PIXEL_ESTIMATORS])
+    found = run(rig, exposures, ["o1", "moments", "profile"])
     o1, moments = (squared(exposures, found[name]).mean() for name in ("o1", "moments"))
-    for name in PIXEL_ESTIMATORS:
-        ours = squared(exposures, found[name]).mean()
-        assert ours < 0.5 * o1
-        assert ours < 1.1 * moments
-        result = score(exposures, found[name], 5)
-        assert 1.0 < result.start_nees.mean < 3.2
-        assert 1.0 < result.end_nees.mean < 3.2
-        inside = [
-            np.abs(e.path - truth_of(x).path) < 1.96 * e.path_sd for x, e in zip(exposures, found[name], strict=True)
-        ]
-        assert 0.9 < np.mean(inside[5:]) < 0.995
-        assert {e.status for e in found[name]} == {Status.OK}
+    ours = squared(exposures, found["profile"]).mean()
+    assert ours < 0.5 * o1
+    assert ours < 1.1 * moments
+    result = score(exposures, found["profile"], 5)
+    assert 1.0 < result.start_nees.mean < 3.2
+    assert 1.0 < result.end_nees.mean < 3.2
+    each = zip(exposures, found["profile"], strict=True)
+    inside = [np.abs(e.path - truth_of(x).path) < 1.96 * e.path_sd for x, e in each]
+    assert 0.9 < np.mean(inside[5:]) < 0.995
+    assert {e.status for e in found["profile"]} == {Status.OK}
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", PIXEL_ESTIMATORS)
-def test_intervals_are_honest_about_a_phase_that_no_pixel_tells(name):
+def test_intervals_are_honest_about_a_phase_that_no_pixel_tells():
     """A whole swing in each exposure: the blur tells how far the spot swings, and nothing of when.
 
     The spot is so bright that a path which leaves out too little to be seen would make a phase of the rest.
@@ -254,26 +235,24 @@ def test_intervals_are_honest_about_a_phase_that_no_pixel_tells(name):
     inside = []
     for seed in range(30, 54):
         exposures = simulate(rig, 12, seed=seed, inputs=np.zeros((144, 1)))
-        found = list(zip(exposures, run(rig, exposures, [name])[name], strict=True))
+        found = list(zip(exposures, run(rig, exposures, ["profile"])["profile"], strict=True))
         inside += [np.abs(e.path - truth_of(x).path) < 1.96 * e.path_sd for x, e in found[4:]]
     assert 0.87 < np.mean(inside) < 0.99
 
 
-@pytest.mark.parametrize("name", PIXEL_ESTIMATORS)
-def test_frames_in_another_order_ruin_the_estimate(name):
+def test_frames_in_another_order_ruin_the_estimate():
     """Frames fed in another order must ruin the estimate: it is the frames that it lives by."""
     exposures = simulate(RIG, 24, seed=9)
     order = np.random.default_rng(1).permutation(24)
     shuffled = [dataclasses.replace(e, pixels=exposures[k].pixels) for e, k in zip(exposures, order, strict=True)]
-    right, wrong = (squared(exposures, run(RIG, each, [name])[name]).mean() for each in (exposures, shuffled))
+    right, wrong = (squared(exposures, run(RIG, each, ["profile"])["profile"]).mean() for each in (exposures, shuffled))
     assert wrong > 9 * right
 
 
 # Trust
 
 
-@pytest.mark.parametrize("name", PIXEL_ESTIMATORS)
-def test_missing_and_saturated_pixels_are_left_out(name):
+def test_missing_and_saturated_pixels_are_left_out():
     exposures = simulate(RIG, 24, seed=5)
     holed = []
     for e in exposures:
@@ -281,14 +260,13 @@ def test_missing_and_saturated_pixels_are_left_out(name):
         pixels_[0, 17], pixels_[0, 25] = 0, 65535
         mask[0, 17] = False
         holed.append(dataclasses.replace(e, pixels=pixels_, mask=mask))
-    whole, given = (run(RIG, series, [name])[name] for series in (exposures, holed))
+    whole, given = (run(RIG, series, ["profile"])["profile"] for series in (exposures, holed))
     assert {e.status for e in given} == {Status.OK}
     assert "left out" in given[0].reason
     assert squared(exposures, given).mean() < 1.5 * squared(exposures, whole).mean()
 
 
-@pytest.mark.parametrize("name", PIXEL_ESTIMATORS)
-def test_a_spot_that_is_not_where_it_should_be_is_lost_and_found(name):
+def test_a_spot_that_is_not_where_it_should_be_is_lost_and_found():
     exposures = simulate(RIG, 24, seed=6)
     moved = exposures[:10]
     for e in exposures[10:]:
@@ -299,7 +277,7 @@ def test_a_spot_that_is_not_where_it_should_be_is_lost_and_found(name):
                 e, pixels=to_counts(RIG.sensor, exposure_density(RIG.sensor.kernel, line_of(RIG).edges, path) + noise)
             )
         )
-    estimates = run(RIG, moved, [name])[name]
+    estimates = run(RIG, moved, ["profile"])["profile"]
     statuses = [e.status for e in estimates]
     assert set(statuses[:10]) == {Status.OK}
     assert statuses[10] == Status.GATED
@@ -309,16 +287,15 @@ def test_a_spot_that_is_not_where_it_should_be_is_lost_and_found(name):
         assert np.linalg.eigvalsh(estimate.coefficient_covariance[0]).min() > -1e-12
 
 
-@pytest.mark.parametrize("name", PIXEL_ESTIMATORS)
 @pytest.mark.parametrize("axes", [1, 7])
-def test_an_axis_does_not_depend_on_those_beside_it(name, axes):
+def test_an_axis_does_not_depend_on_those_beside_it(axes):
     rng = np.random.default_rng(4)
     paths = rng.uniform(-0.3, 0.3, (2, 40, 1)) + 0.1 * np.sin(np.linspace(0, 6, 200))
     density = exposure_density(RIG.sensor.kernel, line_of(RIG).edges, paths) + 0.3 * rng.standard_normal((2, 40, 40))
 
     def estimates(rows):
         plant = dataclasses.replace(RIG.plant, axes=len(range(*rows.indices(40))))
-        own = MixtureFilter(plant, RIG.sensor, UPDATES[name])
+        own = MixtureFilter(plant, RIG.sensor, PROFILE)
         model = exposure_model(plant, 200)
         response = model.response(np.zeros((200, plant.axes)))
         return [own.step(model, response, Profile(density=d[rows], mask=np.ones(d[rows].shape, bool))) for d in density]
@@ -331,8 +308,7 @@ def test_an_axis_does_not_depend_on_those_beside_it(name, axes):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", PIXEL_ESTIMATORS)
-def test_the_quadrature_of_an_axis_does_not_depend_on_those_beside_it(name):
+def test_the_quadrature_of_an_axis_does_not_depend_on_those_beside_it():
     """One axis of three is commanded; the others are looked at as coarsely as alone."""
     density = np.random.default_rng(3).standard_normal((3, 40)) * 0.3 + exposure_density(
         RIG.sensor.kernel, line_of(RIG).edges, np.zeros(2)
@@ -342,7 +318,7 @@ def test_the_quadrature_of_an_axis_does_not_depend_on_those_beside_it(name):
 
     def estimates(rows):
         plant = dataclasses.replace(RIG.plant, axes=len(range(*rows.indices(3))))
-        own, model = MixtureFilter(plant, RIG.sensor, UPDATES[name]), exposure_model(plant, 200)
+        own, model = MixtureFilter(plant, RIG.sensor, PROFILE), exposure_model(plant, 200)
         measured = Profile(density=density[rows], mask=np.ones(density[rows].shape, bool))
         return own.step(model, model.response(jump[:, rows]), measured)
 
@@ -357,8 +333,7 @@ def test_the_quadrature_of_an_axis_does_not_depend_on_those_beside_it(name):
         assert alone.end.covariance.tobytes() == together.end.covariance[k : k + 1].tobytes()
 
 
-@pytest.mark.parametrize("name", PIXEL_ESTIMATORS)
-def test_what_commands_left_in_the_state_is_foreseen(name):
+def test_what_commands_left_in_the_state_is_foreseen():
     """A quiet mirror that was kicked rings on by many widths of the kernel, with no input any more."""
     w = 2 * np.pi * 3.0
     A = expm(np.array([[0.0, 1.0], [-(w**2), -0.01 * w]]) * 1e-3)
@@ -372,18 +347,17 @@ def test_what_commands_left_in_the_state_is_foreseen(name):
     inputs[450] = 5.0
     exposures = simulate(rig, 12, seed=3, inputs=inputs)
     assert np.mean([np.ptp(truth_of(e).path) for e in exposures[3:]]) > 6 * np.sqrt(rig.sensor.kernel.variance)
-    error = np.sqrt(squared(exposures, run(rig, exposures, [name])[name], 3).mean())
+    error = np.sqrt(squared(exposures, run(rig, exposures, ["profile"])["profile"], 3).mean())
     assert error < 0.01
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", PIXEL_ESTIMATORS)
-def test_a_lost_mode_is_found_again(name):
+def test_a_lost_mode_is_found_again():
     """Two exposures after a filter was made sure of the opposite; without doubt it takes four."""
     rig = load_rig("jitter")
     how, found = WindowedMoments(line_of(rig)).needs, []
     for seed in range(1, 13):
-        filter_, errors = MixtureFilter(rig.plant, rig.sensor, UPDATES[name]), []
+        filter_, errors = MixtureFilter(rig.plant, rig.sensor, PROFILE), []
         for k, exposure in enumerate(simulate(rig, 9, seed=seed)):
             if k == 5:
                 h = filter_.prior
@@ -398,23 +372,7 @@ def test_a_lost_mode_is_found_again(name):
     assert sum(found) >= 9
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("updates", [PROFILE, MIXTURE])
-def test_where_few_points_count_others_are_tempered(updates):
-    view, state = seen(quiet(RIG, 0.003), width=0.5, seed=11)
-    mean, covariance, effective = by_importance(view, state)
-    assert effective > 200
-    updates = dataclasses.replace(updates, enough=np.inf)
-    done, again = (updates.update(view, single(state), state, 7) for _ in range(2))
-    assert done.coefficients.mean.tobytes() == again.coefficients.mean.tobytes()
-    assert_near(done.coefficients, mean, covariance, 0.25, 0.2)
-    end = Gaussian(mean[None], covariance[None]).mapped(view.reduced.end_rows, view.reduced.end_remainder)
-    np.testing.assert_allclose(done.end.gaussian.mean, end.mean, atol=0.25 * np.sqrt(end.covariance[0].max()))
-
-
-@pytest.mark.parametrize("updates", [PROFILE, MIXTURE])
-@pytest.mark.parametrize("temper", [False, True])
-def test_the_posterior_of_a_single_coefficient_is_an_integral_over_a_line(updates, temper):
+def test_the_posterior_of_a_single_coefficient_is_an_integral_over_a_line():
     """For one state without process noise, the posterior is an integral over a line."""
     noise = 0.0 * RIG.plant.process_noise
     one = np.ones((1, 1))
@@ -424,23 +382,20 @@ def test_the_posterior_of_a_single_coefficient_is_an_integral_over_a_line(update
     )  # fmt: skip
     view, state = seen(dataclasses.replace(RIG, plant=plant), width=0.5)
     assert view.reduced.size == 1
-    if temper:
-        updates = dataclasses.replace(updates, enough=np.inf)
     t = np.linspace(-3, 3, 60_001)
     log = view.log_likelihoods(t[None, :, None])[0] - 0.5 * t**2 / state.covariance[0, 0, 0]
     w = np.exp(log - log.max())
     w /= w.sum()
     mean = w @ t
     sd = np.sqrt(w @ (t - mean) ** 2)
-    update = updates.update(view, single(state), state, 0)
-    assert update.poor[0] == temper
+    update = PROFILE.update(view, single(state), state)
+    assert not update.poor[0]
     assert abs(update.coefficients.mean[0, 0] - mean) < 0.2 * sd
     assert np.sqrt(update.coefficients.covariance[0, 0, 0]) == pytest.approx(sd, rel=0.25)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", PIXEL_ESTIMATORS)
-def test_an_unstable_plant_does_not_end_in_infinity(name):
+def test_an_unstable_plant_does_not_end_in_infinity():
     """What it would be without a camera grows without end; what the camera says of it does not."""
     plant = dataclasses.replace(
         RIG.plant, A=np.array([[1.02, 0.001], [0.0, 0.99]]), process_noise=np.array([[0.1]]),
@@ -450,7 +405,7 @@ def test_an_unstable_plant_does_not_end_in_infinity(name):
     model = exposure_model(plant, 200)
     density = exposure_density(rig.sensor.kernel, line_of(rig).edges, np.zeros((1, 200)))
     centred = Profile(density=density, mask=np.ones_like(density, dtype=bool))
-    filter_ = MixtureFilter(plant, rig.sensor, UPDATES[name])
+    filter_ = MixtureFilter(plant, rig.sensor, PROFILE)
     # A posterior mean is trusted however unstable the plant is, and what would be without a camera is a number.
     for _ in range(150):
         last = filter_.step(model, model.response(np.zeros((200, 1))), centred)
@@ -459,37 +414,49 @@ def test_an_unstable_plant_does_not_end_in_infinity(name):
     assert np.isfinite(must_be(Components, last.components).unseen[1]).all()
 
 
-@pytest.mark.parametrize("updates", [PROFILE, MIXTURE])
-def test_a_frame_that_cannot_be_believed_is_not_tempered(updates):
-    view, state = seen(quiet(RIG, 0.001), width=0.3)
+def test_few_points_are_reported_but_not_where_the_frame_cannot_be_believed():
+    rig = vibrating(1)
+    view, state = seen(rig, seed=1)
     lie = view.part(slice(None))
     lie.y = np.roll(np.abs(lie.y), 15, axis=1) + 3.0
-    updates = dataclasses.replace(updates, enough=np.inf)
-    of_a_lie = updates.update(lie, single(state), state, 0)
+    of_a_lie = PROFILE.update(lie, single(state), state)
     assert not of_a_lie.innovation.within_gate[0]
     assert not of_a_lie.poor[0]
-    assert updates.update(view, single(state), state, 0).poor[0]
+    assert PROFILE.update(view, single(state), state).poor[0]
+    (exposure,) = simulate(rig, 1, seed=1, inputs=np.zeros((rig.timing.exposure_steps, 1)))
+    reason = make_estimator(rig, "profile").step(exposure).reason
+    assert reason.endswith("too few of the paths tried fit the blur: the estimate is wider for it")
 
 
-def test_windowed_moments_are_as_sure_as_the_estimator_moments_where_nothing_else_is_done():
-    """Their errors are alike from exposure to exposure where the plant is a resonance: as independent ones they would
-    leave it much too sure."""
-    turn, decay, sd = 2 * np.pi * 2.4 / 200, np.exp(-1 / 4000), 0.2
-    A = decay * np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
-    plant = dataclasses.replace(
-        RIG.plant, A=A, B=np.zeros((2, 1)), B_w=np.eye(2), process_noise=sd**2 * (1 - decay**2) * np.eye(2),
-        initial_covariance=sd**2 * np.eye(2),
-    )  # fmt: skip
-    rig = quiet(dataclasses.replace(RIG, plant=plant), 1e-3)
-    (exposure,) = simulate(rig, 1, seed=3)
-    view, state = seen(rig)
-    observation = WindowedMoments(rig.sensor)
-    measured = must_be(Profile, measure(rig, exposure, observation.needs)[0])
-    model = exposure_model(plant, exposure.n_steps)
-    prior = state.with_noise(model.n_coefficients)
-    theirs = observation.update(model, model.response(exposure.inputs), prior, measured).posterior
-    update = dataclasses.replace(PROFILE, points=1, enough=np.inf).update(view, single(state), state, 0)
-    assert update.poor[0]
-    theirs_sd, ours_sd = (np.sqrt(np.diag(each.covariance[0])[:2]) for each in (theirs, update.coefficients))
-    np.testing.assert_allclose(ours_sd / theirs_sd, 1.0, atol=0.1)
-    np.testing.assert_allclose(update.coefficients.mean[0, :2] / theirs_sd, theirs.mean[0, :2] / theirs_sd, atol=0.4)
+def test_a_part_of_the_exposures_gets_the_random_numbers_of_the_whole():
+    """A filter that is given the state of another goes on as that one does, however many exposures came before."""
+    exposures = simulate(RIG, 4, seed=2)
+    for name in ("profile", "sampled:particles=100"):
+        whole, part = (make_estimator(RIG, name) for _ in range(2))
+        whole.step(exposures[0])
+        ours, theirs = (must_be(MixtureFilter, each.filter) for each in (part, whole))
+        ours.prior, ours._unseen = theirs.prior, theirs._unseen
+        for exposure in exposures[1:3]:
+            assert whole.step(exposure).path.tobytes() == part.step(exposure).path.tobytes()
+
+
+def log_evidence(estimator):
+    return float(must_be(np.ndarray, estimator.posterior.log_evidence).sum())
+
+
+def test_few_draws_find_the_same_motion_and_nearly_the_same_evidence():
+    rig = load_rig("jitter")
+    usual, few = make_estimator(rig, "profile"), make_estimator(rig, "profile:draws=5")
+    apart, evidence = [], []
+    for exposure in list(simulate(rig, 8, seed=4))[2:]:
+        one, other = usual.step(exposure), few.step(exposure)
+        apart.append(np.sqrt(np.mean((one.path - other.path) ** 2) / np.mean(one.path_sd**2)))
+        evidence.append([log_evidence(each) for each in (usual, few)])
+    assert 0 < np.median(apart) < 0.5
+    assert np.abs(np.diff(np.sum(evidence, axis=0))) < 10
+
+
+@pytest.mark.parametrize("draws", [0, 401])
+def test_a_share_of_the_draws_that_makes_no_sense_is_refused(draws):
+    with pytest.raises(EstimatorError, match=f"draws = {draws}: use 1 to 400 per cent of the usual points"):
+        make_estimator(RIG, "profile", draws=draws)
