@@ -212,8 +212,13 @@ def create(target: Path, *, overwrite: bool = False, error: type[AolinkError] = 
     flags = os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
     try:
         if target.exists():
-            partial, descriptor = _begun(target, error)
-            return NewFile(partial, target, descriptor, error)
+            held = list[Path]()
+            try:
+                partial, descriptor = _begun(target, error, held)
+                return NewFile(partial, target, descriptor, error)
+            except BaseException:
+                _remove(held)
+                raise
         descriptor = os.open(target, flags, 0o666)
         try:
             if not _lock(descriptor) or _others_write(target):
@@ -286,36 +291,42 @@ def _in_use(target: Path) -> str:
 @contextmanager
 def _unfinished(target: Path, error: type[AolinkError]) -> Iterator[tuple[Path, int]]:
     """A temporary file beside ``target``, open and locked, which is removed after the block unless it was renamed."""
-    partial, descriptor = _begun(target, error)
+    held, descriptor = list[Path](), -1
     try:
+        partial, descriptor = _begun(target, error, held)
         yield partial, descriptor
     finally:
+        _remove(held)
+        if descriptor >= 0:
+            os.close(descriptor)
+
+
+def _remove(held: Iterable[Path]) -> None:
+    for each in held:
         with suppress(OSError):
-            partial.unlink()
-        os.close(descriptor)
+            each.unlink()
 
 
-def _begun(target: Path, error: type[AolinkError]) -> tuple[Path, int]:
-    """A new file beside ``target``, open and locked, with its descriptor."""
+def _begun(target: Path, error: type[AolinkError], held: list[Path]) -> tuple[Path, int]:
+    """A new file beside ``target``, open and locked, with its descriptor.
+
+    ``held`` gets its name before there is such a file: a signal may end the command in the next instant.
+    """
     for attempt in range(_ATTEMPTS):
         if attempt:
             time.sleep(random.uniform(0, _STEP_BACK_S))
         partial = target.with_name(f"{_prefix_of(target)}{secrets.token_hex(8)}.partial")
         if os.path.lexists(partial):
             continue
-        descriptor, good = _open_new(partial, target), False
-        try:
-            # Another command that looks for dead files may take ours for one before it is locked.
-            good = _lock(descriptor) and _is_open_as(partial, descriptor)
-            good = good and not _others_write(target, but=partial)
-            good = good and not (target.exists() and _locked_by_another(target))
-            if good:
-                return partial, descriptor
-        finally:
-            if not good:
-                with suppress(OSError):
-                    partial.unlink()
-                os.close(descriptor)
+        held[:] = [partial]
+        descriptor = _open_new(partial, target)
+        # Another command that looks for dead files may take ours for one before it is locked.
+        good = _lock(descriptor) and _is_open_as(partial, descriptor)
+        good = good and not _others_write(target, but=partial)
+        if good and not (target.exists() and _locked_by_another(target)):
+            return partial, descriptor
+        _remove(held)
+        os.close(descriptor)
     raise error(_in_use(target))
 
 

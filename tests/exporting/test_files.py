@@ -187,7 +187,7 @@ def test_what_would_fill_the_memory_is_refused_before_it_is_read(tmp_path: Path)
         match=r"would take \d+ GiB of memory, at most [\d.]+ are allowed here.* \(`aolink cut`\), or a table",
     ):
         export(recording, tmp_path / "out.npz")
-    with pytest.raises(ExportError, match=r"\(1, 1\) pixels, the sensor .*: it was recorded with another rig file"):
+    with pytest.raises(ExportError, match="holds no exposure to export"):
         export(recording[:2], tmp_path / "out.fits")
 
 

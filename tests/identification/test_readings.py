@@ -105,7 +105,7 @@ def test_an_exposure_of_one_step_is_an_integral():
     assert tried[np.argmax([likelihood(model) for model in models])] == 1.0
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 def test_copies_of_a_plant_may_have_kernels_of_their_own(tmp_path):
     """One of two spots is narrower and one wider than the rig file's kernel: both are read alike only where the kernel
     is not taken as known."""

@@ -39,7 +39,7 @@ def shaken():
     return exposures.rig, [readings(exposures.rig, list(exposures))]
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 def test_the_sets_hold_the_truth_and_the_aliases_that_remain(shaken):
     """The spot swings at 12 Hz; to centroids at 5 Hz, 2, 3, 7, 8 and 13 Hz look the same."""
     rig, seen = shaken

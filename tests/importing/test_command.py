@@ -182,7 +182,7 @@ def test_bad_input_gets_one_line_and_leaves_nothing(source, options, code, says,
     assert not list(tmp_path.rglob("*.mcap")) + list(tmp_path.rglob("*.partial"))
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 def test_a_first_rig_file_has_the_films_name_where_none_is_given(aolink, tmp_path):
     at = np.stack([np.full(60, 20.0), 20 + np.cumsum(np.random.default_rng(3).normal(0, 0.4, 60))], axis=1)
     along_x, along_y = np.exp(-(((np.arange(40) - at[..., None]) / 1.6) ** 2) / 2).swapaxes(0, 1)

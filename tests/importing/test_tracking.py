@@ -398,7 +398,7 @@ def test_the_path_in_an_exposure_has_the_covariances_of_means_over_frames(forget
     assert next_ == pytest.approx(((1 - a) / rate) ** 2, abs=0.02)
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 def test_a_lost_frame_is_no_step_of_the_motion() -> None:
     """Every fifth frame of a vibration is lost: the other frames are fitted with their own times."""
     rng = np.random.default_rng(14)

@@ -18,7 +18,7 @@ LOOPS = {"open": "open", "integrator": "integrator", "lqg": "session"}
 """The recording's name by what closed the loop."""
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 def test_the_demo_shows_what_each_loop_leaves(
     aolink: Callable[..., subprocess.CompletedProcess[str]], tmp_path: Path
 ) -> None:

@@ -86,7 +86,7 @@ def test_after_a_line_has_moved_its_new_frequency_is_offered_and_then_fits():
     assert "identified.toml does not fit" in missed.text
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 def test_what_does_not_foretell_better_is_not_offered():
     """The line moves while a new model is fitted, and is back where the rig file has it when that is judged."""
     rig = with_line(12.0)

@@ -12,7 +12,7 @@ RIG = load_rig("loop")
 DRIFT_SD, HZ = 0.16, 48.0  # 2.4 cycles an exposure
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 def test_the_set_of_a_vibration_beside_a_drift_is_without_the_frequencies_that_the_pixels_rule_out():
     """The drift moves the centroid so much more that centroid and width alone rule out few frequencies."""
     drift = Process("ornstein-uhlenbeck", (0.5, 2 * DRIFT_SD**2 / 0.5))

@@ -156,7 +156,7 @@ def test_a_row_of_inputs_may_be_longer_than_a_packet(tmp_path: Path, faults: str
     assert first_difference(recording.estimates("o3"), reestimate(recording, ["o3"])["o3"]) is None
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 def test_the_demo_works(aolink: Callable[..., subprocess.CompletedProcess[str]], tmp_path: Path) -> None:
     result = aolink("demo", "--rig", "single-lenslet", "--exposures", "8", "--out", tmp_path)
     assert result.returncode == 0, result.stderr
