@@ -128,7 +128,9 @@ def _of_picture(picture: RawImage, rig: Rig, topic: str) -> str:
     if len(picture.data) != width * picture.width * picture.height:
         return "its data are not as long as its size says"
     sensor = {topics.IMAGE: rig.sensor, topics.SCENE: rig.scene}.get(topic)
-    return "" if sensor is None or sensor.shape == (picture.height, picture.width) else "its size is not the sensor's"
+    if sensor is None or sensor.shape == (picture.height, picture.width):
+        return ""
+    return f"its size is not that of the rig's sensor, {' x '.join(map(str, sensor.shape))} pixels"
 
 
 _CHECKS: dict[type[Message], Callable[[Any, Rig], str]] = {

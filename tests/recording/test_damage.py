@@ -406,7 +406,7 @@ PICTURE: dict[str, Any] = {"width": 40, "height": 1, "step": 80, "encoding": "mo
         ({"step": 79}, "its step is not that of its width"),
         ({"encoding": "mono8"}, "its encoding is not mono16"),
         ({"data": bytes(10)}, "its data are not as long as its size says"),
-        ({"width": 20, "step": 40, "data": bytes(40)}, "its size is not the sensor's"),
+        ({"width": 20, "step": 40, "data": bytes(40)}, "its size is not that of the rig's sensor, 1 x 40 pixels"),
     ],
 )
 def test_a_picture_that_lies_is_one_loss_everywhere(tmp_path: Path, change: dict[str, Any], what: str) -> None:
