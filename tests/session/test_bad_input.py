@@ -527,11 +527,12 @@ def test_a_port_that_somebody_else_has_locked() -> None:
     is_root = os.geteuid() == 0
     try:
         os.fchmod(slave, 0o666)
+        name = os.ttyname(slave)
         fcntl.ioctl(slave, termios.TIOCEXCL)
         if is_root:  # root is let in all the same
             os.seteuid(65534)
         with pytest.raises(PortError, match="is in use by another program: close that one"):
-            SerialPort(os.ttyname(slave))
+            SerialPort(name)
     finally:
         if is_root:
             os.seteuid(0)

@@ -71,7 +71,7 @@ def test_scored_and_compared_one_by_one_is_as_all_at_once(recorded: Session) -> 
     for name in ESTIMATORS:
         listed = recording.estimates(name)
         assert first_difference(list(recording.iter_estimates(name)), listed) is None
-        assert scores[name] == score(list(recording.exposures()), listed)
+        assert str(scores[name]) == str(score(list(recording.exposures()), listed))  # some are NaN
     some = itertools.islice(reestimated(recording, ESTIMATORS), 3)
     _, differences = scored_and_compared(recording, some, ESTIMATORS)
     assert differences == dict.fromkeys(ESTIMATORS, f"{EXPOSURES} estimates against 3")

@@ -27,6 +27,10 @@ SHORT = Effort(0.02)
 """Every line of a row is run, but its figure means nothing."""
 
 
+class PeerMissing(Exception):
+    """A row compares with a package that is not installed here."""
+
+
 @dataclass(frozen=True)
 class Row:
     """One figure: ours, the peer's, and the ratio that is required."""

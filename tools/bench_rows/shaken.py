@@ -16,7 +16,7 @@ from aolink.numerics.arrays import FloatArray
 from aolink.restoration import Psf, restore
 from aolink.restoration.deblur import psnr
 from bench_rows.pictures import NOISE_SD, wide_scene
-from bench_rows.row import Effort, Row
+from bench_rows.row import Effort, PeerMissing, Row
 
 Solve = Callable[["Shaken", float], FloatArray]
 
@@ -104,7 +104,7 @@ def _ours(case: Shaken, method: str) -> FloatArray:
 
 
 def _scico() -> Any:
-    """SCICO on one thread. Raises ModuleNotFoundError with the command that installs it."""
+    """SCICO on one thread. Raises PeerMissing with the command that installs it."""
     os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1")
     try:
         import scico.functional
@@ -114,7 +114,7 @@ def _scico() -> Any:
         import scico.optimize.admm
     except ModuleNotFoundError:
         lock = "tools/locks/peers.txt"
-        raise ModuleNotFoundError(f"SCICO is missing: .venv/bin/python -m pip install -r {lock}") from None
+        raise PeerMissing(f"SCICO is missing: .venv/bin/uv pip install -r {lock}") from None
     return scico
 
 

@@ -178,6 +178,7 @@ def test_a_device_is_brought_from_what_it_was_left_in(behaviour: dict[str, Any])
         assert device.every_s is None
 
 
+@pytest.mark.slow  # in real time
 def test_a_command_for_steps_that_are_handed_over_is_late() -> None:
     with simulators.PlayzerX() as device:
         mirror = opened(device)
@@ -253,6 +254,7 @@ def test_a_whole_session(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
     bench.check_paths(recording.rig, zip(exposures, estimate(recording, "o1"), strict=True))
 
 
+@pytest.mark.slow  # in real time
 @pytest.mark.parametrize(
     ("behaviour", "what"),
     [

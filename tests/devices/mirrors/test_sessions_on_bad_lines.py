@@ -66,6 +66,7 @@ def test_an_optotune_driver_whose_power_failed_for_a_moment_goes_on_with_the_nex
     assert report.ended == "complete"
 
 
+@pytest.mark.slow  # in real time
 def test_a_unit_whose_power_failed_for_a_moment_is_seen_not_to_follow(session: Session) -> None:
     """It ignores the host then, and is read back: the recording has what it held."""
 
