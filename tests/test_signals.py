@@ -211,7 +211,7 @@ def test_a_signal_in_the_midst_leaves_nothing_half(tmp_path: Path, places: dict[
     pytest.fail("it was done before the signal each time")
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 def test_a_demo_that_ends_after_recording_says_where_the_recording_is(tmp_path: Path, places: dict[str, str]) -> None:
     with Started(tmp_path, COMMANDS["demo"]) as started:
         assert started.wait_until(lambda: MIDST["demo"](started))

@@ -18,7 +18,7 @@ from tests.control.rigs import DRIFT, small_rig
 Run = Callable[..., "subprocess.CompletedProcess[str]"]
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 def test_an_installed_package_adds_a_controller(aolink: Run, with_example: dict[str, str], tmp_path: Path) -> None:
     path = tmp_path / "rig.toml"
     path.write_text(small_rig(DRIFT).toml)

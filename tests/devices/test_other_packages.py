@@ -115,7 +115,7 @@ def test_a_camera_of_another_package_beside_a_native_mirror(
         assert "a native camera counts fast steps together with its own mirror" in refused.stderr
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 def test_a_camera_alone_is_recorded(aolink: Run, installed: dict[str, str], tmp_path: Path) -> None:
     """Nothing is commanded; every exposure has the safe input, and is estimated as any other."""
     rig = rig_file(tmp_path, mirror="")

@@ -18,7 +18,7 @@ from tests.devices.simulators.optotune import OptotuneSimulator
 ESTIMATORS = ("o1", "moments")
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 def test_exposures_that_have_a_step_less_are_recorded_and_estimated(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -75,7 +75,7 @@ def test_an_option_that_makes_no_sense_is_named(text, message):
         make_estimator(load_rig("section-vi-lively"), text)
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 def test_options_of_a_session_go_with_the_recording(aolink, tmp_path):
     """Beside the loop in real time; and all that reads the recording has the same estimator."""
     names = ("-e", "o3:second_order", "-e", "o3")

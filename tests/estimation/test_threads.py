@@ -56,6 +56,6 @@ def digest(threads: int) -> str:
     return done.stdout
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 def test_one_thread_and_two_give_the_same_bits():
     assert digest(1) == digest(2) != ""

@@ -102,7 +102,7 @@ def test_a_film_of_the_rigs_own_camera_that_fades_is_scaled_to_its_light(
     assert errors[2] > 1.1 * errors[1]
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 @pytest.mark.parametrize("name", ["sh-4x4", "section-vi-lively", "single-lenslet", "jitter"])
 @pytest.mark.parametrize("seed", range(3))
 def test_a_film_whose_light_is_constant_is_left_as_it_is(tmp_path: Path, name: str, seed: int) -> None:
@@ -119,7 +119,7 @@ def test_a_film_whose_light_is_constant_is_left_as_it_is(tmp_path: Path, name: s
             assert (each.pixels == frame)[each.mask].all()
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 @pytest.mark.parametrize("slope", [0.0, 3.0])
 def test_the_ground_does_not_hide_that_light_fades(slope: float) -> None:
     """A ground of the same light under the tracker's weight as an object's, or one that is brighter to one side."""

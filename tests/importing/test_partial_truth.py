@@ -65,7 +65,7 @@ def test_the_truth_of_an_object_does_not_need_the_other_one(exposures: list[Expo
         assert np.isnan(truth_of(exposure).path[2:]).all() == gone
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 def test_errors_are_those_of_the_objects_whose_path_is_known(
     recorded: tuple[Rig, Path], exposures: list[Exposure]
 ) -> None:

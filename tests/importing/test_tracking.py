@@ -89,7 +89,7 @@ def passing(frames: int, least: float) -> np.ndarray:
     return walk
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 def test_objects_beside_each_other_are_measured_apart() -> None:
     """Down to three standard deviations, where a centroid of one moves with the light of the other."""
     film = spot_film(np.random.default_rng(0), passing(160, 4.0), MIDDLES)
@@ -134,7 +134,7 @@ def test_objects_that_meet_are_left_out_until_they_part(tmp_path: Path) -> None:
     assert np.mean(inside) > 0.85
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 def test_objects_that_stay_together_on_a_long_way_are_found_again() -> None:
     """They go together for forty of their standard deviations, a third of the film."""
     rng = np.random.default_rng(4)
@@ -166,7 +166,7 @@ def test_an_object_that_moves_by_more_than_its_width_is_followed() -> None:
     assert np.abs(places - film.places).max() < 0.3
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 def test_an_object_that_passes_a_faded_one_is_followed_on() -> None:
     """The track of an object that has faded ends on the light of the other one: only the other one is seen."""
     rng = np.random.default_rng(4)
@@ -198,7 +198,7 @@ def test_an_object_that_leaves_is_said_and_its_window_left_out(walkers: SpotFilm
     assert all(each.mask[:, columns:].any() == (k < 20) for k, each in enumerate(exposures))
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 def test_a_drift_of_all_objects_is_said() -> None:
     rng = np.random.default_rng(2)
     motion = random_walk(rng, 160, 2, 0.1)
@@ -256,7 +256,7 @@ def leaving() -> tuple[NDArray[np.uint16], FloatArray]:
     return film.frames[:, :, :80], film.places
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 def test_an_object_that_goes_out_of_the_picture_is_not_seen_at_its_edge() -> None:
     """Light beyond the edge is missing, and a centroid of the rest is off."""
     frames, places = leaving()
@@ -498,7 +498,7 @@ def test_a_rig_whose_inputs_do_not_shift_its_spots_keeps_its_windows(walkers: Sp
     assert not any(each.inputs.any() for each in Recording(tmp_path / "a.mcap").exposures())
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 @pytest.mark.parametrize(("length", "turns", "said"), [(1.0, 0.0, 0), (1.5, 0.05, 2)])
 def test_an_object_that_is_longer_than_wide_is_said(length: float, turns: float, said: int) -> None:
     """Gaussians 1.5 times as long as wide, as sums of round ones along a line; some of them turn."""

@@ -90,7 +90,7 @@ def test_the_demo_ends_with_what_its_recording_says(
         assert never not in done.stdout
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 @pytest.mark.usefixtures("without_vulkan")
 def test_the_demo_runs_the_estimators_that_are_named(
     aolink: Callable[..., subprocess.CompletedProcess[str]], tmp_path: Path

@@ -54,7 +54,7 @@ def test_a_model_that_fits_is_said_to_fit_at_intervals():
     assert not job.offers
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 def test_after_a_line_has_moved_its_new_frequency_is_offered_and_then_fits():
     rig, moved = with_line(12.0), with_line(14.0)
     change, count = 70, 40 + FITTED + HELD_OUT + 2

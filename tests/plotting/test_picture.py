@@ -86,7 +86,7 @@ def test_what_cannot_be_drawn_or_written_is_one_clear_error(tmp_path: Path) -> N
         draw_session(Recording(LIVELY), tmp_path / "absent" / "a.png")
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 @pytest.mark.usefixtures("without_vulkan")
 def test_the_demo_draws_it_and_names_the_package(
     aolink: Callable[..., subprocess.CompletedProcess[str]], tmp_path: Path

@@ -288,7 +288,7 @@ def test_records_inside_each_other_cost_a_few_readings_of_the_file(kind: str) ->
     assert file.count < 8 * size + (len(losses) + 100) * 64
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 def test_small_messages_in_a_large_chunk_cost_no_memory() -> None:
     message = struct.pack("<BQHIQQ", 5, 22, 1, 1, 1, 1)
     data = message * ((8 << 20) // len(message))

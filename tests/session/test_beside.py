@@ -113,7 +113,7 @@ def test_what_was_estimated_online_is_the_same_offline_with_the_same_exposures_s
         assert first_difference(recording.estimates(name), again[name]) is None
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 def test_compare_replay_and_estimate_know_of_the_skipped(
     loaded: Session, aolink: Callable[..., subprocess.CompletedProcess[str]], tmp_path: Path
 ) -> None:
@@ -162,7 +162,7 @@ def outcome_of(beside: BesideTheLoop, name: str, frame_id: int) -> Outcome:
     return pytest.fail(f"{name} is not through with frame {frame_id} within a minute")
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 def test_a_slow_estimator_makes_no_fast_one_skip(recorded: Session) -> None:
     rig, exposures = load_rig("section-vi-lively"), exposures_of(recorded)
     with BesideTheLoop(rig, [slow(), "o3"]) as beside:

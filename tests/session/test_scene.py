@@ -435,7 +435,7 @@ def test_a_method_that_does_not_exist(session: Path, tmp_path: Path) -> None:
     assert "there is no restoration method 'best': use one of tv, pnp" in str(refused.exception)
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 def test_the_demo_from_a_rig_file_with_a_picture_and_slopes_beside_it(aolink: Run, tmp_path: Path) -> None:
     """What a rig file names is relative to it, wherever the demo's folder is."""
     folder = tmp_path / "mine"

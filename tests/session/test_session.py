@@ -230,7 +230,7 @@ def test_a_rig_file_with_other_numbers_is_a_warning(tmp_path: Path) -> None:
     assert Recording(tmp_path / "a.mcap").metadata["warnings"] == warning
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 @pytest.mark.parametrize("arguments", [["--exposures", "3"], ["--duration", "0.5"]])
 def test_the_commands_of_a_session_by_hand_work_one_after_the_other(
     aolink: Callable[..., subprocess.CompletedProcess[str]], arguments: list[str]

@@ -42,7 +42,7 @@ def test_vibrations_are_lines_of_their_frequency_and_height():
     np.testing.assert_allclose(spectrum, expected, atol=1e-9)
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 def test_turbulence_has_the_slopes_of_its_structure_function():
     layer = Layer(r0_m=1e-3, wind_m_s=(0.01, 0.0), outer_scale_m=0.02, wavelength_m=633e-9)
     rig = disturbed(SH, layers=(layer,), pupil_m=2.4e-3)

@@ -109,7 +109,7 @@ def test_a_curve_knows_its_power_and_is_drawn(tmp_path: Path, monkeypatch: pytes
     assert drawn.read_bytes().count(b'id="axes_') == 4
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 def test_costs_are_measured_and_drawn(tmp_path: Path) -> None:
     done = bench("--plots", tmp_path, "--short")
     assert done.returncode == 0, done.stderr

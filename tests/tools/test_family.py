@@ -93,7 +93,7 @@ def test_the_first_runs_of_a_scene_are_those_of_all(seed: int) -> None:
         assert part.truth.path.shape == first.path.shape
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 def test_it_is_stopped_and_continued(tmp_path: Path) -> None:
     rows = tmp_path / "rows.jsonl"
     command = [TOOLS / "family", "--rows", rows, "--runs", "2", "--exposures", "6"]

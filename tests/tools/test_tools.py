@@ -47,7 +47,7 @@ def test_the_scene_is_the_one_that_is_drawn(tmp_path: Path) -> None:
     assert np.abs(made - there).mean() < 0.5
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 def test_the_reference_recordings_can_be_made_anew(tmp_path: Path) -> None:
     done = run(TOOLS / "recordings", "--out", tmp_path, "--exposures", "2")
     assert done.returncode == 0, done.stderr
@@ -103,7 +103,7 @@ def test_a_word_that_no_row_has_is_an_error() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["demo", "method", "scene", "pupil", pytest.param("loop", marks=pytest.mark.rare)])
+@pytest.mark.parametrize("name", ["method", *(pytest.param(each, marks=pytest.mark.rare) for each in ("demo", "scene", "pupil", "loop"))])
 def test_pictures_are_made_and_are_those_of_the_pages(name: str, tmp_path: Path) -> None:
     """Short ones; README and the gallery show the repository's own, which are small."""
     done = run(TOOLS / "pictures", name, "--short", "--out", tmp_path)

@@ -121,7 +121,7 @@ def test_a_screenshot_shows_the_layout(rrd: Path, tmp_path: Path) -> None:
     assert coloured_columns(picture) > 0.8
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 def test_a_screenshot_is_of_the_time_that_is_asked_for(rrd: Path, tmp_path: Path) -> None:
     """The camera's view, in the corner, has another exposure's row framed."""
     try:

@@ -86,7 +86,7 @@ def test_every_view_shows_its_colours_in_a_browser_and_nothing_is_wrong(full: Se
     assert [error for error in ours if "Failed to fetch" not in error] == []
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 def test_what_a_recording_lacks_has_no_colour_in_a_browser(tmp_path: Path) -> None:
     bare = StandIn(n=12, names=(), with_truth=False)
     with serving([str(save_rrd(as_recording(bare), tmp_path / "bare.rrd"))]) as server:

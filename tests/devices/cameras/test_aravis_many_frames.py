@@ -26,7 +26,7 @@ need_aravis()
 FRAMES = 10_000
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 def test_every_pixel_arrives_and_ids_go_on_where_16_bits_end(tmp_path: Path) -> None:
     """Straight from Aravis's fake camera, without a relay; it tells no time, and its ids end after 135 frames.
 

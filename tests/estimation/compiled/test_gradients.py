@@ -65,7 +65,7 @@ def test_the_gradient_of_several_spots_is_the_sum_of_theirs():
     np.testing.assert_allclose(together, apart, rtol=1e-9, atol=1e-9 * np.abs(apart).max())
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 @ALL
 def test_rough_log_likelihoods_and_gradients_are_near_the_exact_ones(kind):
     view, _, state = looked(kind)

@@ -81,7 +81,7 @@ def estimates(exposures: list[Exposure]) -> dict[str, list[Estimate]]:
     return run(SH, exposures, ["o1", "moments", "profile"])
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 def test_on_a_membrane_under_turbulence_frames_are_believed(
     exposures: list[Exposure], estimates: dict[str, list[Estimate]]
 ) -> None:

@@ -284,7 +284,7 @@ def test_both_ends_of_an_exposure_are_as_sure_as_they_are_right_where_a_slow_pro
     assert 0.85 < np.mean(end) < 1.15
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 def test_the_end_of_an_exposure_is_as_sure_as_it_is_right_where_one_direction_hardly_moves():
     rig, nees = two_drifts(), list[float]()
     for seed in range(16):
