@@ -103,7 +103,9 @@ def test_a_word_that_no_row_has_is_an_error() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["method", *(pytest.param(each, marks=pytest.mark.rare) for each in ("demo", "scene", "pupil", "loop"))])
+@pytest.mark.parametrize(
+    "name", ["method", *(pytest.param(each, marks=pytest.mark.rare) for each in ("demo", "scene", "pupil", "loop"))]
+)
 def test_pictures_are_made_and_are_those_of_the_pages(name: str, tmp_path: Path) -> None:
     """Short ones; README and the gallery show the repository's own, which are small."""
     done = run(TOOLS / "pictures", name, "--short", "--out", tmp_path)
