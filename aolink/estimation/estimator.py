@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator
-from typing import Any
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +13,7 @@ from aolink.estimation.alignment import Shifted, considered, matters, share_of_s
 from aolink.estimation.batch import Batch
 from aolink.estimation.estimate import Estimate, Status, as_recorded
 from aolink.estimation.frames.measure import MeasuredFrame, Measurements
-from aolink.estimation.kalman.filter import Filter, Posterior, Run
+from aolink.estimation.kalman.filter import Filter, Posterior
 from aolink.estimation.model.base import ExposureModel
 from aolink.exposure import Exposure
 from aolink.rig import Rig
@@ -92,13 +91,13 @@ class Estimator:
                 yield self._stepped(batch, k, measured[k])
                 k += 1
                 continue
-            count = len(done.nis)
-            last = batch.exposures[k + count - 1]
-            self._next_step, self._last_input = last.first_step + last.n_steps, last.inputs[-1]
-            yield from self._run_estimates(batch, k, done)
-            k += count
+            for posterior in done:
+                exposure = batch.exposures[k]
+                self._next_step, self._last_input = exposure.first_step + exposure.n_steps, exposure.inputs[-1]
+                yield self._estimate(exposure, batch.model_of(k), posterior, [])
+                k += 1
 
-    def _run(self, batch: Batch, measured: Measurements, first: int) -> Run | None:
+    def _run(self, batch: Batch, measured: Measurements, first: int) -> list[Posterior] | None:
         """Run the filter at once over the exposures from ``first`` to the next gap or flaw; None where it cannot."""
         row, moments = measured.rows[first], measured.moments
         if batch.model is None or moments is None or row < 0:
@@ -115,36 +114,25 @@ class Estimator:
         responses = batch.responses.of(slice(first * axes, end * axes))
         return self.filter.run(batch.model, responses, measured.some(row, row + end - first))
 
-    def _run_estimates(self, batch: Batch, first: int, done: Run) -> Iterator[Estimate]:
-        """The estimates of exposures that the filter took at once."""
-        assert batch.model is not None
-        for exposure, *arrays in zip(batch.exposures[first : first + len(done.nis)], *done, strict=True):
-            own = Run(*arrays)
-            yield self._estimate(
-                exposure, batch.model, status=Status.OK, reason="", coefficients=own.start_state,
-                coefficient_covariance=own.start_covariance, **own._asdict(),
-            )  # fmt: skip
-
-    def _estimate(self, exposure: Exposure, model: ExposureModel, **results: Any) -> Estimate:
-        return Estimate(
-            estimator=self.name, frame_id=exposure.frame_id, first_step=exposure.first_step, n_steps=exposure.n_steps,
-            inputs=exposure.inputs, model=model, **results,
-        )  # fmt: skip
-
     def _stepped(self, batch: Batch, k: int, measured: MeasuredFrame) -> Estimate:
         """The estimate of exposure k, which may have gaps and flaws."""
         exposure, model = batch.exposures[k], batch.model_of(k)
         reasons = self._bridge(exposure, batch.finite[k])
         taken, remark = measured
         posterior = self.filter.step(model, batch.response_to(k), taken)
+        return self._estimate(exposure, model, posterior, [*([remark] if remark else []), *reasons])
+
+    def _estimate(
+        self, exposure: Exposure, model: ExposureModel, posterior: Posterior, reasons: Sequence[str]
+    ) -> Estimate:
         self.several, self.posterior = posterior.several, posterior
-        reasons = [*([remark] if remark else []), *reasons, *_status_reasons(posterior)]
-        coefficients, n = posterior.coefficients.mean, self.rig.plant.n_states
-        covariance = as_recorded(posterior.coefficients.covariance)
-        return self._estimate(
-            exposure, model, status=_worst(posterior.status), reason="; ".join(reasons),
+        n, covariance = self.rig.plant.n_states, as_recorded(posterior.coefficients.covariance)
+        return Estimate(
+            estimator=self.name, frame_id=exposure.frame_id, first_step=exposure.first_step, n_steps=exposure.n_steps,
+            inputs=exposure.inputs, model=model, status=_worst(posterior.status),
+            reason="; ".join([*reasons, *_status_reasons(posterior)]),
             start_state=posterior.start.mean, start_covariance=covariance[:, :n, :n], end_state=posterior.end.mean,
-            end_covariance=as_recorded(posterior.end.covariance), coefficients=coefficients,
+            end_covariance=as_recorded(posterior.end.covariance), coefficients=posterior.coefficients.mean,
             coefficient_covariance=covariance, innovation=posterior.innovation,
             innovation_covariance=posterior.innovation_covariance, nis=posterior.nis, components=posterior.components,
         )  # fmt: skip

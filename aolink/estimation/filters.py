@@ -11,9 +11,9 @@ import numpy as np
 from aolink.errors import EstimatorError
 from aolink.estimation.frames.centroid_noise import centroid_covariance
 from aolink.estimation.frames.frame_data import Profile, SpotWindows
-from aolink.estimation.kalman.filter import BlurFilter, Filter, TwoStateFilter
+from aolink.estimation.kalman.filter import BlurFilter, Filter, PathFilter
 from aolink.estimation.kalman.filterpy_engine import FilterpyMoments
-from aolink.estimation.kalman.path_moments import Observation, PathMoments, SecondOrderMoments
+from aolink.estimation.kalman.path_moments import Observation, PathMoments
 from aolink.estimation.kalman.predict import added_noise
 from aolink.estimation.kalman.steady_gain import steady_gain
 from aolink.estimation.model.exposure_model import exposure_model
@@ -41,17 +41,15 @@ def paper(rig: Rig, options: Options, *orders: int) -> Filter:
     if options.engine == "filterpy":
         theirs = FilterpyMoments(rig.plant, orders, gain, flux=options.flux)
         return _blur_filter(rig, options, theirs, predictor=theirs.predict)
-    if options.second_order and 2 in orders:
-        if rig.plant.n_outputs > 2:
-            raise EstimatorError(
-                f"second_order is for plants of one spot, {rig.name} has {rig.plant.n_outputs // 2}: use moments"
-            )
-        return _blur_filter(rig, options, SecondOrderMoments(rig.plant, orders, flux=options.flux))
-    observation = PathMoments(rig.plant, orders, gain, flux=options.flux)
-    if orders == (1, 2) and TwoStateFilter.suits(rig.plant):
-        two = TwoStateFilter(rig.plant, observation, process_noise=options.process_noise, gate=options.gate)
-        two.warm_up(exposure_model(rig.plant, rig.timing.exposure_steps, rig.timing.exposure_offset))
-        return two
+    second_order = options.second_order and 2 in orders
+    observation = PathMoments(rig.plant, orders, gain, flux=options.flux, second_order=second_order)
+    if PathFilter.suits(rig.plant):
+        few = PathFilter(rig.plant, observation, process_noise=options.process_noise, gate=options.gate)
+        few.warm_up(exposure_model(rig.plant, rig.timing.exposure_steps, rig.timing.exposure_offset))
+        return few
+    if second_order:
+        spots = rig.plant.n_outputs // 2
+        raise EstimatorError(f"second_order is for plants of one spot, {rig.name} has {spots}: use moments")
     return _blur_filter(rig, options, observation)
 
 

@@ -33,7 +33,7 @@ class Options:
     engine: Engine = "aolink"
     """The engine of o1 to o3: "aolink", or "filterpy", for one axis."""
     second_order: bool = False
-    """Whether o2 and o3 include the second-order terms that their linearisation leaves out (`SecondOrderMoments`):
+    """Whether o2 and o3 include the second-order terms that their linearisation leaves out (`PathMoments`):
     their covariance is then right where the prior is as wide as the spot's motion, at the price of a weaker
     correction."""
     orders: tuple[int, ...] = (0, 1, 2, 3)

@@ -17,7 +17,7 @@ import numpy as np
 from scipy import optimize
 
 from aolink.errors import ImportingError
-from aolink.estimation.compiled.small import compiled_exactly
+from aolink.estimation.compiled.small import compiled
 from aolink.numerics.arrays import FloatArray
 
 _LAGS = range(2, 11)
@@ -261,7 +261,7 @@ def _correlation(left: FloatArray) -> float:
     return found if abs(found) > max(_CORRELATED, 4 / math.sqrt(count)) else 0.0
 
 
-@compiled_exactly
+@compiled
 def _filter(
     places: FloatArray, a: float, turn: float, q: float, walk: float, drift: float, error: float, cross: float,
     left: FloatArray,

@@ -25,7 +25,7 @@ from aolink.limits import check_room
 
 HERE = Path(__file__).parent
 _PACKAGE = HERE.parents[1]
-SOURCES = (*sorted(HERE.glob("*.py")), _PACKAGE / "numerics" / "covariance.py", _PACKAGE / "numerics" / "entrywise.py")
+SOURCES = (*sorted(HERE.glob("*.py")), _PACKAGE / "numerics" / "covariance.py")
 """All that is compiled: the loops, and what they take from `aolink.numerics`."""
 _NEEDED_BYTES = 50_000_000
 _COMPILE_BYTES = 768 << 20

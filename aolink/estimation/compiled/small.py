@@ -33,12 +33,6 @@ def compiled_sums(function: Callable[..., Any]) -> Any:
     return _compiled(function, {"contract", "arcp", "reassoc", "nsz"})
 
 
-def compiled_exactly(function: Callable[..., Any]) -> Any:
-    """Decorator as `compiled`, for a function with the same bits as in the interpreter: no product is fused with a
-    sum."""
-    return _compiled(function, set())
-
-
 def _compiled(function: Callable[..., Any], freedom: set[str]) -> Any:
     options: Any = {"nogil": True, "error_model": "numpy", "fastmath": freedom}
     if (kept := folder()) is None:

@@ -5,22 +5,26 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
-from typing import Any, NamedTuple
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import special
 
-from aolink.estimation.compiled import two_states
 from aolink.estimation.estimate import Components, Status
 from aolink.estimation.frames.frame_data import Measurement, Needs
 from aolink.estimation.kalman.gaussian import MOST_COVARIANCES, Gaussian, Update
-from aolink.estimation.kalman.path_moments import Observation
+from aolink.estimation.kalman.path_moments import MOST_OUTPUTS, Observation, PathMoments
 from aolink.estimation.kalman.predict import Noise, Predict, added_noise, predict, predicted_mean
 from aolink.estimation.model.base import ExposureModel, InputResponse, over_steps
 from aolink.numerics import batched
 from aolink.numerics.arrays import BoolArray, FloatArray, IntArray
+from aolink.plant.alike import MANY_STATES
 from aolink.rig import Plant
+
+if TYPE_CHECKING:
+    from aolink.estimation.compiled.kalman import Step
 
 # A measurement with a smaller chi-square tail probability than this is not used. The gate is wide: the paper's filters
 # leave the process noise inside an exposure out, so their innovations may be larger than they expect.
@@ -64,18 +68,6 @@ class Posterior:
         return Gaussian(self.coefficients.mean[:, :n], self.coefficients.covariance[:, :n, :n])
 
 
-class Run(NamedTuple):
-    """Posteriors of consecutive exposures, as in `Estimate`; arrays are (exposures, axes, ...)."""
-
-    start_state: FloatArray
-    start_covariance: FloatArray
-    end_state: FloatArray
-    end_covariance: FloatArray
-    innovation: FloatArray
-    innovation_covariance: FloatArray
-    nis: FloatArray
-
-
 class Filter(ABC):
     """A recursive filter for one rig: it takes the measurements of each exposure and gives its posterior."""
 
@@ -92,8 +84,10 @@ class Filter(ABC):
     def step(self, model: ExposureModel, response: InputResponse, measured: Any | None) -> Posterior:
         """Predict over one exposure and update with its measurements; only predict where these are None."""
 
-    def run(self, model: ExposureModel, responses: InputResponse, measured: Measurement) -> Run | None:
-        """The posteriors of `step` for several exposures at once, where the filter can do so; otherwise None."""
+    def run(self, model: ExposureModel, responses: InputResponse, measured: Measurement) -> list[Posterior] | None:
+        """The posteriors of `step` for exposures without a gap between them, at once where the filter can do so;
+        otherwise None. ``responses`` and ``measured`` have a row for each axis of the first exposure, then of the
+        second."""
         return None
 
 
@@ -131,6 +125,7 @@ class BlurFilter(Filter):
         self._settled_under: FloatArray | None = None
         self._missed = np.zeros(plant.axes, dtype=np.int64)
         degrees = observation.n_measurements if observation else 0
+        self._of_model: tuple[ExposureModel, Step] | None = None
         self._gate = 2 * float(special.gammainccinv(degrees / 2, GATE_PROBABILITY)) if gate and degrees else np.inf
 
     @property
@@ -207,75 +202,95 @@ def gate_status(used: BoolArray, lost: BoolArray, missed: IntArray) -> tuple[Int
     filter to start again; ``missed`` counts the measurements in a row before it that were gated.
     """
     now = np.where(used, 0, np.where(lost, 1, missed + 1))
-    passed = np.where(lost, Status.REINITIALISED, Status.OK)
-    refused = np.where(now >= PATIENCE, Status.DIVERGED, Status.GATED)
-    return np.where(used, passed, refused).astype(np.int64), now
+    return _status(used, lost, now), now
 
 
-class TwoStateFilter(BlurFilter):
-    """The filter o3 for plants with two states and one output: a series of exposures is one compiled loop, with the
-    same bits."""
+def _status(used: BoolArray, again: BoolArray, missed: IntArray) -> IntArray:
+    if used.all() and not again.any():
+        return np.full(used.shape, int(Status.OK), dtype=np.int64)
+    passed = np.where(again, Status.REINITIALISED, Status.OK)
+    refused = np.where(missed >= PATIENCE, Status.DIVERGED, Status.GATED)
+    return np.where(used, passed, refused).astype(np.int64)
+
+
+class PathFilter(BlurFilter):
+    """The paper's filters for plants of few states and one or two outputs: a series of exposures is one compiled loop,
+    and one exposure a series of one."""
+
+    observation: PathMoments
 
     @staticmethod
     def suits(plant: Plant) -> bool:
         """Whether a plant is of this size."""
-        return (plant.n_states, plant.n_outputs) == (2, 1)
+        return plant.n_outputs <= MOST_OUTPUTS and plant.n_states <= MANY_STATES
 
     def warm_up(self, model: ExposureModel) -> None:
-        """Load what `run` needs, or compile it, before the session."""
-        nothing = Measurement(value=np.zeros((0, 2)), covariance=np.zeros((0, 2, 2)))
+        """Load the loop, or compile it, before the session."""
+        m = self.observation.n_measurements
+        nothing = Measurement(value=np.zeros((0, m)), covariance=np.zeros((0, m, m)))
         response = model.response(np.zeros((model.n_steps, self.plant.axes * self.plant.n_inputs)))
         self.run(model, response.of(slice(0)), nothing)
 
-    def run(self, model: ExposureModel, responses: InputResponse, measured: Measurement) -> Run | None:
-        """`step` for exposures without a gap between them, all at once and to the same bits, up to the first of which
-        an axis is gated or not finite; None if that is the first of all.
+    def step(self, model: ExposureModel, response: InputResponse, measured: Measurement | None) -> Posterior:
+        if measured is not None:
+            return self.run(model, response, measured)[0]
+        axes, m = self.plant.axes, self.observation.n_measurements
+        nothing = np.zeros(axes, dtype=bool)
+        blank = Measurement(value=np.zeros((axes, m)), covariance=np.zeros((axes, m, m)), usable=nothing)
+        (posterior,) = self.run(model, response, blank)
+        return replace(posterior, innovation=np.zeros((axes, 0)), innovation_covariance=np.zeros((axes, 0, 0)))
 
-        ``responses`` and ``measured`` have a row for each axis of the first exposure, then of the second.
-        """
-        if self._missed.any():
-            return None
-        from aolink.estimation.compiled import two_state_runs  # not before an estimator needs it
+    def run(self, model: ExposureModel, responses: InputResponse, measured: Measurement) -> list[Posterior]:
+        from aolink.estimation.compiled import kalman  # not before an estimator needs it
 
-        shape = (len(measured.value) // self.plant.axes, self.plant.axes)
+        axes, rows, m = self.plant.axes, *measured.value.shape
+        usable = np.ones(rows, dtype=bool) if measured.usable is None else measured.usable
+        noise = np.broadcast_to(measured.single_block, (rows, m, m))
+        series = (responses.mean, responses.slope, responses.square, responses.end, measured.value, noise, usable)
+        covariance = np.broadcast_to(self.prior.covariance, (axes, *self.prior.covariance.shape[1:]))
+        unseen = self._unseen
+        before = (self.prior.mean, covariance, unseen.mean, unseen.covariance[0], self._missed)
+        carried = kalman.Carried(*(np.array(each, order="C") for each in before))  # they are changed
+        n = carried.mean.shape[1]
+        shapes = ((n,), (n, n), (n,), (n, n), (m,), (m, m), ())
+        flags = (np.empty(rows, dtype=kind) for kind in (bool, bool, np.int64))
+        out = kalman.Filtered(*(np.empty((rows, *shape)) for shape in shapes), *flags)
+        kalman.filter_series(self._step_of(model), kalman.Series(*map(_own, series)), carried, out)
+        self.prior, self._missed = Gaussian(carried.mean, carried.covariance), carried.missed
+        self._unseen = Gaussian(carried.unseen_mean, carried.unseen_covariance[None])
+        status = np.where(usable, _status(out.used, out.again, out.missed), Status.INPUT_INVALID)
+        innovation, spread, nis = map(_numbers, (out.innovation, out.innovation_covariance, out.nis))
+        return [
+            Posterior(
+                coefficients=Gaussian(out.mean[some], out.covariance[some]),
+                end=Gaussian(out.end_mean[some], out.end_covariance[some]),
+                status=status[some],
+                innovation=innovation[some],
+                innovation_covariance=spread[some],
+                nis=nis[some],
+            )
+            for some in (slice(k, k + axes) for k in range(0, rows, axes))
+        ]
 
-        def series(values: FloatArray) -> FloatArray:
-            """(exposures * axes, ...) as (exposures, axes, ...)."""
-            return np.ascontiguousarray(values.reshape(*shape, *values.shape[1:]))
+    def _step_of(self, model: ExposureModel) -> Step:
+        if self._of_model is None or self._of_model[0] is not model:
+            from aolink.estimation.compiled.kalman import Step
 
-        P, R = np.broadcast_to(self.prior.covariance, (self.plant.axes, 2, 2)), measured.single_block
-        state, unseen = (np.array(each, order="C") for each in (self.prior.mean, self._unseen.mean))
-        covariance, table = np.ascontiguousarray(_upper(P)), np.empty((*shape, two_state_runs.NUMBERS))
-        count = two_state_runs.update_and_predict(
-            np.array(model.transition), np.array(two_states.weights_of(model.transition)), np.array(model.mean_row[0]),
-            np.array(model.quadratic[0]), _upper(added_noise(model, self._process_noise)),
-            series(responses.mean[:, 0]), series(responses.slope[:, 0]), series(responses.square[:, 0]),
-            series(responses.end), series(measured.value), series(_upper(R)), self._gate, state, covariance, unseen,
-            table,
-        )  # fmt: skip
-        if not count:
-            return None
-        table = table[:count]
-        self.prior = Gaussian(state, covariance[:, _SQUARE])
-        for _ in range(count):  # its covariance is one for all axes, and soon no longer changes
-            if model.transition is self._settled_under:
-                break
-            self._predict_unseen(model.transition, model.process_noise, np.zeros_like(unseen))
-        self._unseen = Gaussian(unseen, self._unseen.covariance)
-        return Run(
-            start_state=table[..., :2], start_covariance=table[..., _SQUARE + 2], end_state=table[..., 9:11],
-            end_covariance=table[..., _SQUARE + 11], innovation=table[..., 14:],
-            innovation_covariance=table[..., _SQUARE + 5], nis=table[..., 8],
-        )  # fmt: skip
+            looks, n, noise = self.observation, self.plant.n_states, added_noise(model, self._process_noise)
+            gains = np.zeros((0, n, looks.n_measurements)) if looks.gain is None else looks.gain
+            self._of_model = model, Step(
+                transition=_own(model.transition), noise=_own(noise), lifted_noise=_own(model.process_noise),
+                mean_row=_own(model.mean_row), quadratic=_own(model.quadratic), first=1 in looks.orders,
+                second=2 in looks.orders, second_order=looks.second_order,
+                gains=_own(gains.reshape(-1, n, looks.n_measurements)), gate=self._gate, patience=PATIENCE,
+            )  # fmt: skip
+        return self._of_model[1]
 
 
-_SQUARE = np.array([[0, 1], [1, 2]])
-"""Places of a symmetric matrix's entries in its upper half."""
-
-
-def _upper(matrices: FloatArray) -> FloatArray:
-    """Upper halves of symmetric matrices, (..., 2, 2) -> (..., 3)."""
-    return np.stack([matrices[..., 0, 0], matrices[..., 0, 1], matrices[..., 1, 1]], axis=-1)
+def _own(values: NDArray[Any]) -> NDArray[Any]:
+    """The array as compiled code takes it: contiguous and writeable, if need be a copy."""
+    own = values.flags.c_contiguous and values.flags.writeable
+    return values if own else np.array(values, order="C")
 
 
 def _without(done: Update, usable: BoolArray | None) -> Update:

@@ -9,7 +9,7 @@ import numpy as np
 
 from aolink.estimation.kalman.gaussian import Gaussian
 from aolink.estimation.model.base import ExposureModel
-from aolink.numerics import batched, entrywise
+from aolink.numerics import batched
 from aolink.numerics.arrays import FloatArray
 from aolink.numerics.single_thread import congruence_one_thread
 from aolink.plant.alike import MANY_STATES
@@ -34,16 +34,9 @@ def predict(state: Gaussian, transition: FloatArray, noise: FloatArray, kick: Fl
     if max(transition.shape) > MANY_STATES:
         each = [congruence_one_thread(transition, P) for P in state.covariance]
         return Gaussian(mean, batched.symmetric(np.stack(each) + noise))
-    if max(transition.shape) > entrywise.MOST_ROWS:
-        return Gaussian(mean, batched.symmetric(batched.congruence(transition, state.covariance) + noise))
-    P, Q = entrywise.unpack(state.covariance), entrywise.unpack(noise)
-    covariance = entrywise.congruence_by_numbers(transition.tolist(), P, Q)
-    return Gaussian(mean, entrywise.pack(covariance, len(state.covariance)))
+    return Gaussian(mean, batched.symmetric(batched.congruence(transition, state.covariance) + noise))
 
 
 def predicted_mean(mean: FloatArray, transition: FloatArray, kick: FloatArray) -> FloatArray:
     """x -> A x + d"""
-    if max(transition.shape) > entrywise.MOST_ROWS:
-        return batched.matvec(transition, mean) + kick
-    moved = entrywise.times_vector(entrywise.unpack(transition), entrywise.columns(mean))
-    return entrywise.pack_vector(entrywise.add(moved, entrywise.columns(kick)), len(mean))
+    return batched.matvec(transition, mean) + kick

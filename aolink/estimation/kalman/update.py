@@ -1,18 +1,16 @@
 """The update of a Kalman filter, in the forms in which it is computed. They agree to rounding.
 
-`aolink.estimation.kalman.path_moments` chooses between them by the sizes: entry by entry, in blocks, or in information
-form (`aolink.estimation.kalman.information_form`). The row `update_forms` of tools/bench times each beside Joseph's.
+`aolink.estimation.kalman.path_moments` chooses between them by the sizes: in blocks, or in information form
+(`aolink.estimation.kalman.information_form`). The row `update_forms` of tools/bench times each beside Joseph's.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from aolink.estimation.compiled import two_states
 from aolink.estimation.kalman.gaussian import MOST_COVARIANCES, Gaussian, Update
-from aolink.numerics import batched, entrywise
+from aolink.numerics import batched
 from aolink.numerics.arrays import FloatArray
-from aolink.numerics.entrywise import Entry
 
 
 def joseph_update(
@@ -74,37 +72,3 @@ def blocked_update(
             some = slice(k * size, (k + 1) * size)
             S[:, some, some] += R[:, k]
     return Update(Gaussian(prior.mean + moved, covariance), innovation, S, nis)
-
-
-def small_update(
-    prior: Gaussian, innovation: list[Entry], H: entrywise.Matrix, R: FloatArray, gain: FloatArray | None
-) -> Update:
-    """`joseph_update` for one or two states and measurements, entry by entry."""
-    axes, P, noise = len(prior.mean), entrywise.unpack(prior.covariance), entrywise.unpack(R)
-    HP = entrywise.times_transposed(H, P)
-    S = entrywise.symmetric_times_transposed(HP, H, noise)
-    S_inverse = entrywise.inverse_of_entries(S)
-    PH = entrywise.transpose_of_entries(HP)
-    K = entrywise.times_transposed(PH, S_inverse) if gain is None else entrywise.unpack(gain)
-    mean = entrywise.add(entrywise.columns(prior.mean), entrywise.times_vector(K, innovation))
-    keep = entrywise.one_minus(entrywise.times_transposed(K, entrywise.transpose_of_entries(H)))
-    from_noise = entrywise.symmetric_times_transposed(entrywise.times_transposed(K, noise), K)
-    covariance = entrywise.symmetric_times_transposed(entrywise.times_transposed(keep, P), keep, from_noise)
-    nis = entrywise.dot_of_entries(innovation, entrywise.times_vector(S_inverse, innovation))
-    after = Gaussian(entrywise.pack_vector(mean, axes), entrywise.pack(covariance, axes))
-    return Update(
-        after, entrywise.pack_vector(innovation, axes), entrywise.pack(S, axes), entrywise.pack_one(nis, axes)
-    )
-
-
-def two_state_update(prior: Gaussian, innovation: list[Entry], H: entrywise.Matrix, R: FloatArray) -> Update:
-    """`joseph_update` for two states and two measurements, with the optimal gain."""
-    axes = len(prior.mean)
-    (p, q), (_, r) = entrywise.unpack(prior.covariance)
-    (first, shared), (_, rest) = entrywise.unpack(R)
-    x, v, p, q, r, s, both, t, nis = two_states.update(
-        entrywise.columns(prior.mean), (p, q, r), innovation, H, (first, shared, rest), bool(np.any(shared))
-    )
-    after = Gaussian(entrywise.pack_vector([x, v], axes), entrywise.pack([[p, q], [q, r]], axes))
-    S = entrywise.pack([[s, both], [both, t]], axes)
-    return Update(after, entrywise.pack_vector(innovation, axes), S, entrywise.pack_one(nis, axes))

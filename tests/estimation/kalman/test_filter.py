@@ -9,12 +9,10 @@ from scipy import linalg, stats
 
 from aolink.estimation.estimate import Status
 from aolink.estimation.frames.frame_data import Measurement
-from aolink.estimation.kalman.filter import PATIENCE, BlurFilter
+from aolink.estimation.kalman.filter import PATIENCE, BlurFilter, PathFilter
 from aolink.estimation.kalman.gaussian import Gaussian
 from aolink.estimation.kalman.path_moments import (
     PathMoments,
-    SecondOrderMoments,
-    many_moments,
     predicted_moments,
 )
 from aolink.estimation.kalman.steady_gain import steady_gain
@@ -67,7 +65,7 @@ def selected(orders):
 
 
 def our_steps(plant, orders, u, moments, gain=None, **options):
-    filter_ = BlurFilter(plant, PathMoments(plant, orders, gain), **options)
+    filter_ = PathFilter(plant, PathMoments(plant, orders, gain), **options)
     model = exposure_model(plant, u.shape[1])
     pick = selected(orders)
     for inputs, y in zip(u, moments, strict=True):
@@ -242,7 +240,7 @@ def test_one_wild_moment_is_gated_and_many_start_the_filter_again():
 
 def test_a_filter_that_was_lost_starts_again_from_the_plant_and_finds_the_spot():
     u, moments, states = scenario(30)
-    lost = BlurFilter(PLANT, PathMoments(PLANT, (1, 2)))
+    lost = PathFilter(PLANT, PathMoments(PLANT, (1, 2)))
     lost.prior = dataclasses.replace(lost.prior, mean=np.array([[9.0, 0.0]]), covariance=np.eye(2)[None] * 1e-6)
     model = exposure_model(PLANT, N)
     statuses = []
@@ -284,7 +282,7 @@ def test_innovations_of_a_linear_world_are_consistent():
     root = np.linalg.cholesky(plant.initial_covariance)
     x = rng.standard_normal((axes, 2)) @ root.T
     y = x @ model.mean_row.T + np.sqrt(R[0, 0]) * rng.standard_normal((axes, 1))
-    step = BlurFilter(plant, PathMoments(plant, (1,))).step(
+    step = PathFilter(plant, PathMoments(plant, (1,))).step(
         model, model.response(np.zeros((N, axes))), Measurement(value=y, covariance=R[None, :1, :1])
     )
     assert stats.kstest(step.nis, stats.chi2(1).cdf).pvalue > 1e-3
@@ -305,7 +303,7 @@ def test_an_axis_does_not_depend_on_those_beside_it(orders, axes, which, mimo, w
     y[5, ::3] = 1e6  # some are gated
 
     def steps(n_axes):
-        filter_ = BlurFilter(with_axes(plant, n_axes), PathMoments(plant, orders))
+        filter_ = PathFilter(with_axes(plant, n_axes), PathMoments(plant, orders))
         model = exposure_model(filter_.plant, 50)
         filter_.bridge(u[0, :13, : n_axes * plant.n_inputs])
         for inputs, moments in zip(u, y, strict=True):
@@ -328,7 +326,7 @@ def test_an_axis_does_not_depend_on_those_beside_it(orders, axes, which, mimo, w
 def test_what_is_believed_without_a_camera_settles_and_moves_on_with_gaps():
     """The covariance is not computed again where it no longer changes; a gap, or another exposure, changes it."""
     cold = dataclasses.replace(PLANT, initial_covariance=np.zeros((2, 2)))
-    filter_, model = BlurFilter(cold, PathMoments(cold, (1,))), exposure_model(cold, N)
+    filter_, model = PathFilter(cold, PathMoments(cold, (1,))), exposure_model(cold, N)
     response = model.response(np.zeros((N, 1)))
     expected = np.zeros((2, 2))
 
@@ -346,22 +344,34 @@ def test_what_is_believed_without_a_camera_settles_and_moves_on_with_gaps():
     check_next(None)
 
 
+def updated(plant, observation, model, response, prior, measured):
+    """The filter's posterior of one exposure that begins with this prior."""
+    filter_ = PathFilter(dataclasses.replace(plant, axes=len(prior.mean)), observation, gate=False)
+    filter_.prior = prior
+    return filter_.step(model, response, measured)
+
+
+@pytest.mark.parametrize("rank", [0, 1, 2])
+@pytest.mark.parametrize("one_noise", [True, False])
 @pytest.mark.parametrize("gain", [None, np.array([[0.3, 0.1], [2.0, -1.0]])])
-def test_written_out_it_is_the_correction_in_matrices(gain):
-    rng = np.random.default_rng(3)
-    plant = dataclasses.replace(PLANT, axes=50)
-    model = exposure_model(plant, N)
-    roots = rng.standard_normal((2, 50, 2, 2))
-    P, noise = roots @ roots.swapaxes(-1, -2)
-    prior, y = Gaussian(rng.standard_normal((50, 2)), P), rng.standard_normal((50, 2))
-    response = model.response(0.01 * rng.standard_normal((N, 50)))
-    ours = PathMoments(plant, (1, 2), gain).update(model, response, prior, Measurement(value=y, covariance=noise))
+def test_compiled_it_is_the_correction_in_matrices(rank, one_noise, gain):
+    """Singular priors, correlated noise, one for all axes or one for each; the optimal gain or another."""
+    rng, axes = np.random.default_rng(3), 50
+    model = exposure_model(dataclasses.replace(PLANT, axes=axes), N)
+    response = model.response(rng.normal(0, 0.01, (N, axes)))
+    root = rng.standard_normal((axes, 2, rank))
+    prior, y = Gaussian(rng.standard_normal((axes, 2)), root @ root.swapaxes(1, 2)), rng.standard_normal((axes, 2))
+    noise = 1e-3 * np.array([[2.0, 0.9], [0.9, 1.0]])
+    noises = np.broadcast_to(noise, (axes, 2, 2)) if one_noise else noise * rng.uniform(0.5, 2, (axes, 1, 1))
+    measured = Measurement(value=y, covariance=noises)
+    ours = updated(PLANT, PathMoments(PLANT, (1, 2), gain), model, response, prior, measured)
     h, H = predicted_moments(model, response, prior.mean, (1, 2))
-    theirs = joseph_update(prior, y - h, H, noise, gain)
-    np.testing.assert_allclose(ours.posterior.mean, theirs.posterior.mean, rtol=1e-9, atol=1e-12)
-    np.testing.assert_allclose(ours.posterior.covariance, theirs.posterior.covariance, rtol=1e-7, atol=1e-11)
-    np.testing.assert_allclose(ours.innovation_covariance, theirs.innovation_covariance, rtol=1e-9)
+    theirs = joseph_update(prior, y - h, H, noises, gain)
+    np.testing.assert_allclose(ours.start.mean, theirs.posterior.mean, rtol=1e-7, atol=1e-9)
+    np.testing.assert_allclose(ours.start.covariance, theirs.posterior.covariance, rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(ours.innovation_covariance, theirs.innovation_covariance, rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(ours.nis, theirs.nis, rtol=1e-7)
+    assert np.linalg.eigvalsh(ours.start.covariance).min() > -1e-12
 
 
 @pytest.mark.parametrize("orders", [(2,), (1, 2)])
@@ -377,37 +387,12 @@ def test_of_second_order_the_predicted_moments_have_the_mean_and_covariance_of_s
     samples = np.concatenate([predicted_moments(model, response, each, orders)[0] for each in np.split(x, 200)])
     noise = 1e-9 * np.eye(m)[None]
     zero = Measurement(value=np.zeros((1, m)), covariance=noise)
-    update = SecondOrderMoments(plant, orders).update(model, response, prior, zero)
+    update = updated(plant, PathMoments(plant, orders, second_order=True), model, response, prior, zero)
     spread = np.cov(samples, rowvar=False).reshape(m, m)
     sd = np.sqrt(np.diag(spread))
     np.testing.assert_allclose(-update.innovation[0] / sd, samples.mean(0) / sd, atol=0.01)
     apart = (update.innovation_covariance[0] - noise[0] - spread) / np.outer(sd, sd)
     np.testing.assert_allclose(apart, np.zeros((m, m)), atol=0.03)
-
-
-@pytest.mark.parametrize(
-    ("rank", "first", "correlation"),
-    [*((rank, 2.0, correlation) for rank in (0, 1, 2) for correlation in (0.0, 0.9)), (1, 0.0, 0.0), (2, 0.0, 0.0)],
-)
-@pytest.mark.parametrize("one_noise", [True, False])
-def test_the_short_correction_is_josephs(rank, first, correlation, one_noise):
-    """Two states, two measurements: singular priors, correlated noise or none, one for all axes or one for each."""
-    rng, axes = np.random.default_rng(3), 500
-    model = exposure_model(dataclasses.replace(PLANT, axes=axes), N)
-    response = model.response(rng.normal(0, 0.01, (N, axes)))
-    root = rng.standard_normal((axes, 2, rank))
-    prior = Gaussian(rng.standard_normal((axes, 2)), root @ root.swapaxes(1, 2))
-    noise = 1e-3 * np.array([[first, correlation], [correlation, 1.0]])
-    noises = np.broadcast_to(noise, (axes, 2, 2)) if one_noise else noise * rng.uniform(0.5, 2, (axes, 1, 1))
-    moments = rng.standard_normal((axes, 2))
-    ours = PathMoments(PLANT, (1, 2)).update(model, response, prior, Measurement(value=moments, covariance=noises))
-    h, H = predicted_moments(model, response, prior.mean, (1, 2))
-    josephs = joseph_update(prior, moments - h, H, noises)
-    np.testing.assert_allclose(ours.posterior.mean, josephs.posterior.mean, rtol=1e-7, atol=1e-9)
-    np.testing.assert_allclose(ours.posterior.covariance, josephs.posterior.covariance, rtol=1e-6, atol=1e-9)
-    np.testing.assert_allclose(ours.innovation_covariance, josephs.innovation_covariance, rtol=1e-9, atol=1e-12)
-    np.testing.assert_allclose(ours.nis, josephs.nis, rtol=1e-7)
-    assert np.linalg.eigvalsh(ours.posterior.covariance).min() > -1e-12
 
 
 @pytest.mark.parametrize("blocks", [3, 40])
@@ -432,18 +417,6 @@ def test_by_blocks_it_is_the_same_correction(blocks, rank, fixed):
     np.testing.assert_allclose(
         ours.innovation_covariance, whole if m <= 32 else np.einsum("amm->am", whole), rtol=1e-9, atol=1e-12
     )
-
-
-@pytest.mark.parametrize("orders", [(1,), (2,), (1, 2)])
-def test_many_moments_at_once_are_the_same_moments(mimo, orders):
-    rng = np.random.default_rng(4)
-    model = exposure_model(dataclasses.replace(mimo, C=rng.standard_normal((7, 3))), 30)
-    response = model.response(rng.standard_normal((30, model.plant.axes * model.plant.n_inputs)))
-    state = rng.standard_normal((model.plant.axes, 3))
-    for ours, theirs in zip(
-        many_moments(model, response, state, orders), predicted_moments(model, response, state, orders), strict=True
-    ):
-        np.testing.assert_allclose(ours, theirs, rtol=1e-11, atol=1e-12)
 
 
 def test_the_gain_of_many_outputs_is_that_of_all_of_them(mimo):
