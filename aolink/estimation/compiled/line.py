@@ -12,7 +12,6 @@ from typing import NamedTuple
 import numpy as np
 
 from aolink.estimation.compiled.small import compiled, compiled_sums, inlined
-from aolink.estimation.compiled.vectors import add_cubic, add_product, lanes_of, put_sums, sum_cubic_slope, sums_of
 from aolink.numerics.arrays import BoolArray, FloatArray, IntArray
 
 AT_ONCE = 64
@@ -32,14 +31,13 @@ class Line(NamedTuple):
     usable: BoolArray
     """(rows, pixels)"""
     inputs: FloatArray
-    """Response of the path to the inputs at its nodes, (rows, nodes)."""
+    """Response of the path to the inputs at its nodes, (rows, 1, nodes)."""
     basis: FloatArray
-    """The exposure basis at the nodes, transposed since the inner loops are over nodes, (n, nodes)."""
+    """The exposure basis at the nodes, transposed since the inner loops are over nodes, (1, n, nodes)."""
     weights: FloatArray
     """Each node's share of the exposure, (nodes,)."""
     table: FloatArray
-    """Taylor coefficients of the light about points of a pixel, in pixels, (points, 4, reach); the reach is a multiple
-    of `vectors.lanes_of`."""
+    """Taylor coefficients of the light about points of a pixel, in pixels, (points, 4, reach)."""
     low: float
     """Edge at which the first pixel begins, slope units."""
     per_unit: float
@@ -89,21 +87,29 @@ def places_of(
 
 
 @inlined
+def add_cubic(f: FloatArray, first: int, weight: float, d: float, table: FloatArray, point: int) -> None:
+    """Add the light of a spot at a distance d from a point of the table to f, from its place ``first`` on."""
+    begin, row = np.uintp(first), np.uintp(point)  # without a sign: nothing asks whether they count from the end
+    for k in range(table.shape[2]):
+        p = np.uintp(k)
+        slope = table[row, 1, p] + d * (table[row, 2, p] + d * table[row, 3, p])
+        f[begin + p] += weight * (table[row, 0, p] + d * slope)
+
+
+@inlined
 def expected_light(
     firsts: IntArray, nearest: IntArray, away: FloatArray, point: int, count: int, weights: FloatArray,
     table: FloatArray, f: FloatArray, padded: int,
 ) -> None:  # fmt: skip
     """Densities without noise of ``count`` of the paths that `places_of` has placed, one behind the other in f: each
     takes ``padded`` places, with the table's reach on both sides."""
-    reach, lanes = table.shape[2], lanes_of(f)
     for p in range(count * padded):
         f[p] = 0.0
     for k in range(len(weights)):
         for j in range(count):
             if firsts[k, point + j] >= 0:
-                first, row = j * padded + firsts[k, point + j], 4 * reach * nearest[k, point + j]
-                for p in range(0, reach, lanes):
-                    add_cubic(f, first + p, weights[k], away[k, point + j], table, row + p, reach)
+                first = j * padded + firsts[k, point + j]
+                add_cubic(f, first, weights[k], away[k, point + j], table, nearest[k, point + j])
 
 
 @inlined
@@ -117,7 +123,6 @@ def linearised_light(
     ``slope`` is room for (reach,).
     """
     points, _, reach = table.shape
-    lanes = lanes_of(f)
     for p in range(len(f)):
         f[p] = 0.0
     for i in range(len(J)):
@@ -126,15 +131,15 @@ def linearised_light(
     for k in range(len(path)):
         first, nearest, d = place(path[k], low, per_unit, len(f) - 2 * reach, points, reach)
         if first >= 0:
-            row, w = 4 * reach * nearest, weights[k] * per_unit
-            for p in range(0, reach, lanes):
-                add_cubic(f, first + p, weights[k], d, table, row + p, reach)
+            w = weights[k] * per_unit
+            add_cubic(f, first, weights[k], d, table, nearest)
             for p in range(reach):
                 steeper = 2.0 * table[nearest, 2, p] + 3.0 * d * table[nearest, 3, p]
                 slope[p] = w * (table[nearest, 1, p] + d * steeper)
+            begin = np.uintp(first)
             for i in range(len(basis)):
-                for p in range(0, reach, lanes):
-                    add_product(J, i * len(f) + first + p, basis[i, k], slope, p)
+                for p in range(reach):
+                    J[i, begin + np.uintp(p)] += basis[i, k] * slope[p]
 
 
 @inlined
@@ -184,7 +189,7 @@ def log_likelihoods_of_lines(line: Line, row: int, t: FloatArray, begin: int, en
     In the loop over points no part of an array and no field of the `Line` is taken: each would be counted as another
     reference, and that would take as long as all the rest.
     """
-    y, usable, inputs, basis, weights = line.y[row], line.usable[row], line.inputs[row], line.basis, line.weights
+    y, usable, inputs, basis, weights = line.y[row], line.usable[row], line.inputs[row, 0], line.basis[0], line.weights
     table, low, per_unit, read_noise, gain = line.table, line.low, line.per_unit, line.read_noise, line.gain
     points, _, pad = table.shape
     number, nodes, padded = table.dtype, len(weights), len(y) + 2 * pad
@@ -208,10 +213,10 @@ def gradients_of_lines(
     line: Line, row: int, t: FloatArray, begin: int, end: int, out: FloatArray, gradients: FloatArray
 ) -> None:
     """As `log_likelihoods_of_lines`; the log-likelihoods' gradients by t are added to ``gradients``, (n, points)."""
-    y, usable, inputs, basis, weights = line.y[row], line.usable[row], line.inputs[row], line.basis, line.weights
+    y, usable, inputs, basis, weights = line.y[row], line.usable[row], line.inputs[row, 0], line.basis[0], line.weights
     table, low, per_unit, read_noise, gain = line.table, line.low, line.per_unit, line.read_noise, line.gain
     points, _, pad = table.shape
-    number, nodes, padded, lanes = table.dtype, len(weights), len(y) + 2 * pad, lanes_of(table)
+    number, nodes, padded = table.dtype, len(weights), len(y) + 2 * pad
     f, paths = np.empty(_IN_TURN * padded, number), np.empty((nodes, AT_ONCE), number)
     firsts, nearest = np.empty((nodes, AT_ONCE), np.int64), np.empty((nodes, AT_ONCE), np.int64)
     away, pulls = np.empty((nodes, AT_ONCE), number), np.empty((nodes, AT_ONCE), number)
@@ -226,13 +231,24 @@ def gradients_of_lines(
                 out[first + point + k] = _scores(y, usable, f, k * padded, pad, read_noise, gain)
             for node in range(nodes):
                 for k in range(together):
-                    pull = paths[node, point + k] * 0
+                    pulls[node, point + k] = 0.0
                     if firsts[node, point + k] >= 0:
-                        at, place = k * padded + firsts[node, point + k], 4 * pad * nearest[node, point + k]
-                        for p in range(0, pad, lanes):
-                            pull += sum_cubic_slope(f, at + p, away[node, point + k], table, place + p, pad)
-                    pulls[node, point + k] = pull * weights[node] * per_unit
+                        at, d = k * padded + firsts[node, point + k], away[node, point + k]
+                        pull = _cubic_slopes(f, at, d, table, nearest[node, point + k])
+                        pulls[node, point + k] = pull * weights[node] * per_unit
         add_gradients(basis, pulls, first, count, gradients)
+
+
+@compiled_sums
+def _cubic_slopes(scores: FloatArray, first: int, d: float, table: FloatArray, point: int) -> float:
+    """Sum of scores, from the place ``first`` on, times the slopes of the light of `add_cubic`."""
+    number, begin, row = scores.dtype.type, np.uintp(first), np.uintp(point)
+    total, two, three = number(0.0), number(2.0), number(3.0)
+    for k in range(table.shape[2]):
+        p = np.uintp(k)
+        slope = table[row, 1, p] + d * (two * table[row, 2, p] + three * d * table[row, 3, p])
+        total += scores[begin + p] * slope
+    return total
 
 
 @compiled_sums
@@ -273,31 +289,21 @@ def _scores(
 def add_gradients(basis: FloatArray, pulls: FloatArray, first: int, count: int, gradients: FloatArray) -> None:
     """Add gradients by t, (n, points), of ``count`` points from ``first`` on: derivatives by the path at the nodes,
     (nodes, points), times those of the path. The adjoint of `paths_of`."""
-    n, nodes, points, width, together = len(gradients), len(pulls), gradients.shape[1], pulls.shape[1], sums_of(pulls)
-    many, sums = count - count % together, np.empty(together, pulls.dtype)
-    for i in range(n):
-        for k in range(0, many, together):
-            put_sums(sums, 0, 0.0, basis, i * nodes, 1, pulls, k, width, nodes)
-            for p in range(0, together, lanes_of(pulls)):
-                add_product(gradients, i * points + first + k + p, 1.0, sums, p)
-        for k in range(many, count):
-            for node in range(nodes):
-                gradients[i, first + k] += basis[i, node] * pulls[node, k]
+    for i in range(len(gradients)):
+        for node in range(len(pulls)):
+            for k in range(count):
+                gradients[i, np.uintp(first) + np.uintp(k)] += basis[i, node] * pulls[node, k]
 
 
 @compiled
 def paths_of(offset: FloatArray, basis: FloatArray, t: FloatArray, first: int, count: int, paths: FloatArray) -> None:
     """Paths at the nodes, (nodes, points), of ``count`` points from ``first`` on of t (n, points)."""
-    n, nodes, points, width, together = len(t), len(offset), t.shape[1], paths.shape[1], sums_of(paths)
-    many = count - count % together
-    for node in range(nodes):
-        for k in range(0, many, together):
-            put_sums(paths, node * width + k, offset[node], basis, node, nodes, t, first + k, points, n)
-        for k in range(many, count):
-            value = offset[node]
-            for i in range(n):
-                value += basis[i, node] * t[i, first + k]
-            paths[node, k] = value
+    for node in range(len(offset)):
+        for k in range(count):
+            paths[node, k] = offset[node]
+        for i in range(len(t)):
+            for k in range(count):
+                paths[node, k] += basis[i, node] * t[i, np.uintp(first) + np.uintp(k)]
 
 
 @inlined
@@ -305,7 +311,8 @@ def fisher_information(
     y: FloatArray, usable: BoolArray, f: FloatArray, J: FloatArray, pad: int, read_noise: float, gain: float,
     scores: FloatArray, H: FloatArray, pull: FloatArray,
 ) -> tuple[float, float]:  # fmt: skip
-    """Lower half of H = J' I J, I each pixel's Fisher information; pull = J' score. f and J as `linearised_light`.
+    """Lower half of J' I J, I each pixel's Fisher information, added to H, and J' score to ``pull``. f and J are those
+    of `linearised_light`.
 
     Returns the log-likelihood and the sum of score^2 / I over the pixels.
 
@@ -338,10 +345,26 @@ def fisher_information(
         for p in range(pixels):
             summed += J[i, pad + p] * scores[0, p]
             scores[2, p] = J[i, pad + p] * scores[1, p]
-        pull[i] = summed
+        pull[i] += summed
         for j in range(i + 1):
             summed = 0.0
             for p in range(pixels):
                 summed += J[j, pad + p] * scores[2, p]
-            H[i, j] = summed
+            H[i, j] += summed
     return -0.5 * (total + math.log(product)), square
+
+
+@compiled
+def information_of_line(
+    line: Line, row: int, path: FloatArray, basis: FloatArray, H: FloatArray, pull: FloatArray
+) -> tuple[float, float]:
+    """`fisher_information` of the frame of one row about a path (1, nodes), by coefficients of a basis (1, n,
+    nodes)."""
+    pad, pixels = line.table.shape[2], line.y.shape[1]
+    f, J = np.empty(pixels + 2 * pad), np.empty((len(pull), pixels + 2 * pad))
+    slope, scores = np.empty(pad), np.empty((3, pixels))
+    linearised_light(path[0], line.weights, line.table, line.low, line.per_unit, basis[0], slope, f, J)
+    log_likelihood, square = fisher_information(
+        line.y[row], line.usable[row], f, J, pad, line.read_noise, line.gain, scores, H, pull
+    )
+    return log_likelihood, square

@@ -1,4 +1,4 @@
-"""Modes of the posterior of a line sensor's pixels by Levenberg and Marquardt's method, and which of them are one."""
+"""Modes of the posterior of an axis's pixels by Levenberg and Marquardt's method, and which of them are one."""
 
 from __future__ import annotations
 
@@ -6,7 +6,9 @@ import math
 
 import numpy as np
 
-from aolink.estimation.compiled.line import Line, fisher_information, linearised_light, path_of
+from aolink.estimation.compiled.likelihoods import information_of_row
+from aolink.estimation.compiled.line import Line, path_of
+from aolink.estimation.compiled.plane import Plane
 from aolink.estimation.compiled.small import (
     cholesky_into,
     cholesky_solve,
@@ -17,21 +19,18 @@ from aolink.estimation.compiled.small import (
     lower_solve,
     times,
 )
-from aolink.numerics.arrays import BoolArray, FloatArray, Indices
+from aolink.numerics.arrays import FloatArray, Indices
 
 # A search ends where its squared distance from a known mode, in that mode's standard deviations, is below this.
 _NEXT_TO = 0.25
 
 
 @compiled
-def spread_starts_of_lines(
+def spread_starts(
     mean: FloatArray, covariance: FloatArray, broad_mean: FloatArray, broad_covariance: FloatArray, gram: FloatArray,
     reach: float, starts: FloatArray, squares: FloatArray,
 ) -> None:  # fmt: skip
-    """Starts about broad Gaussians, (rows, 1 + 2 directions, n), in coordinates in which the priors are N(0, I).
-
-    As `aolink.estimation.pixels.modes.spread_starts`; ``squares`` are (rows, n).
-    """
+    """Fills in the results of `aolink.estimation.pixels.modes.spread_starts`."""
     rows, count, n = starts.shape
     root, wide, product, turned = np.empty((n, n)), np.empty((n, n)), np.empty((n, n)), np.empty((n, n))
     vectors, along = np.empty((n, n)), np.empty(n)
@@ -57,29 +56,25 @@ def spread_starts_of_lines(
 
 
 @compiled
-def innovations_of_lines(
-    line: Line, mean: FloatArray, covariance: FloatArray, t: FloatArray, tells_nothing: float, value: FloatArray,
-    information: FloatArray, nis: FloatArray, square: FloatArray,
+def innovations(
+    seen: Line | Plane, mean: FloatArray, covariance: FloatArray, t: FloatArray, tells_nothing: float,
+    value: FloatArray, information: FloatArray, nis: FloatArray, square: FloatArray,
 ) -> None:  # fmt: skip
     """Innovations at points t (rows, n) in k directions, as `pixels.modes.innovation`.
 
     ``value`` and ``information`` are (rows, k); ``square`` is the sum of score^2 / I.
     """
-    rows, k = value.shape
-    n, nodes = line.basis.shape
-    weights, table, low, per_unit = line.weights, line.table, line.low, line.per_unit
-    read_noise, gain, pad = line.read_noise, line.gain, line.table.shape[2]
-    width = line.y.shape[1] + 2 * pad
-    path, B, root, s, slope = np.empty(nodes), np.empty((n, nodes)), np.empty((n, n)), np.empty(n), np.empty(pad)
-    f, J, scores = np.empty(width), np.empty((n, width)), np.empty((3, line.y.shape[1]))
+    (rows, k), (outputs, n, nodes) = value.shape, seen.basis.shape
+    path, B, root, s = np.empty((outputs, nodes)), np.empty((outputs, n, nodes)), np.empty((n, n)), np.empty(n)
     H, pull, values, vectors = np.empty((n, n)), np.empty(n), np.empty(n), np.empty((n, n))
     for row in range(rows):
         cholesky_into(covariance[row], root)
-        times(root.T, line.basis, B)
-        path_of(line.inputs[row], line.basis, t[row], path)
-        linearised_light(path, weights, table, low, per_unit, B, slope, f, J)
-        y, usable = line.y[row], line.usable[row]
-        _, square[row] = fisher_information(y, usable, f, J, pad, read_noise, gain, scores, H, pull)
+        for o in range(outputs):
+            times(root.T, seen.basis[o], B[o])
+            path_of(seen.inputs[row, o], seen.basis[o], t[row], path[o])
+        H[:] = 0.0
+        pull[:] = 0.0
+        _, square[row] = information_of_row(seen, row, path, B, H, pull)
         for i in range(n):
             s[i] = t[row, i] - mean[row, i]
             for j in range(i):
@@ -101,8 +96,8 @@ def innovations_of_lines(
 
 
 @compiled
-def find_modes_of_lines(
-    line: Line, mean: FloatArray, covariance: FloatArray, starts: FloatArray, of_row: Indices, whole: int,
+def find_modes(
+    seen: Line | Plane, mean: FloatArray, covariance: FloatArray, starts: FloatArray, of_row: Indices, whole: int,
     reversed_precision: float, passes: int, first_damping: float, largest_damping: float, free_damping: float,
     converged: float, out_mean: FloatArray, out_covariance: FloatArray, out_evidence: FloatArray,
     out_distance: FloatArray, out_objective: FloatArray,
@@ -113,22 +108,17 @@ def find_modes_of_lines(
     results have room for three more modes than there are starts; rows of one start have no reversals. Where there is no
     start, or it leads to the mode of an earlier one, they are left alone.
     """
-    rows, n = mean.shape
-    nodes, room = line.basis.shape[1], out_mean.shape[1]
-    weights, table, low, per_unit = line.weights, line.table, line.low, line.per_unit
-    read_noise, gain, pad = line.read_noise, line.gain, line.table.shape[2]
-    width, slope = line.y.shape[1] + 2 * pad, np.empty(pad)
-    path, rest, B = np.empty(nodes), np.empty(nodes), np.empty((n, nodes))
-    f, J, scores = np.empty(width), np.empty((n, width)), np.empty((3, line.y.shape[1]))
+    (rows, n), (outputs, _, nodes), room = mean.shape, seen.basis.shape, out_mean.shape[1]
+    path, rest, B = np.empty((outputs, nodes)), np.empty((outputs, nodes)), np.empty((outputs, n, nodes))
     s, there, step = np.empty(n), np.empty(n), np.empty(n)
     H, pull, other, its_pull = np.empty((n, n)), np.empty(n), np.empty((n, n)), np.empty(n)
     root, damped, lower, inverse = np.empty((n, n)), np.empty((n, n)), np.empty((n, n)), np.empty((n, n))
     begins, ends, their_H = np.empty((room, n)), np.empty((room, n)), np.empty((room, n, n))
     for row in range(rows):
-        y, usable = line.y[row], line.usable[row]
         cholesky_into(covariance[row], root)
-        times(root.T, line.basis, B)
-        path_of(line.inputs[row], line.basis, mean[row], rest)
+        for o in range(outputs):
+            times(root.T, seen.basis[o], B[o])
+            path_of(seen.inputs[row, o], seen.basis[o], mean[row], rest[o])
         count = of_row[row]
         for k in range(count):
             for i in range(n):
@@ -139,10 +129,7 @@ def find_modes_of_lines(
             if twin < 0:
                 for i in range(n):
                     s[i] = begins[done, i]
-                now = _at(
-                    y, usable, weights, table, low, per_unit, read_noise, gain, rest, B, s, path, slope, f, J, scores,
-                    H, pull,
-                )  # fmt: skip
+                now = _at(seen, row, rest, B, s, path, H, pull)
                 damping = first_damping
                 for _ in range(passes):
                     for i in range(n):
@@ -156,10 +143,7 @@ def find_modes_of_lines(
                     for i in range(n):
                         there[i] = s[i] + step[i]
                         decrement += step[i] * pull[i]
-                    objective = _at(
-                        y, usable, weights, table, low, per_unit, read_noise, gain, rest, B, there, path, slope, f, J,
-                        scores, other, its_pull,
-                    )  # fmt: skip
+                    objective = _at(seen, row, rest, B, there, path, other, its_pull)
                     decrease, before = now - objective, damping
                     better = decrease > 0
                     if better:
@@ -213,8 +197,9 @@ def find_modes_of_lines(
                     best, best_end = done, found - 1
             done += 1
             if done == of_row[row] and done > 1 and reversed_precision > 0.0:
-                path_of(rest, B, ends[best_end], path)
-                _reversals(line.weights, rest, B, path, whole, reversed_precision, damped, lower, begins[done:])
+                for o in range(outputs):
+                    path_of(rest[o], B[o], ends[best_end], path[o])
+                _reversals(seen.weights, rest, B, path, whole, reversed_precision, damped, lower, begins[done:])
                 count = done + 3
 
 
@@ -223,27 +208,32 @@ def _reversals(
     weights: FloatArray, rest: FloatArray, B: FloatArray, path: FloatArray, whole: int, precision: float, H: FloatArray,
     root: FloatArray, out: FloatArray,
 ) -> None:  # fmt: skip
-    """Whitened coordinates (3, n) near a path's reversal, its mirror image and both, as `reversed_starts`."""
-    n, total, mean = len(B), 0.0, 0.0
+    """Whitened coordinates (3, n) of paths with nearly the same blur as a path's, (outputs, nodes): reversed in time,
+    which gives the same blur; mirrored about its mean, which does where the blur is symmetric, as that of a vibration
+    is; and both. ``precision`` is that with which a path is fitted to them."""
+    outputs, n, total = B.shape[0], B.shape[1], 0.0
     for k in range(whole):
         total += weights[k]
-        mean += weights[k] * path[k]
-    mean /= total
     for i in range(n):
         for j in range(i + 1):
             H[i, j] = 1.0 if i == j else 0.0
-            for k in range(whole):
-                H[i, j] += precision * weights[k] / total * B[i, k] * B[j, k]
+            for o in range(outputs):
+                for k in range(whole):
+                    H[i, j] += precision * weights[k] / total * B[o, i, k] * B[o, j, k]
     cholesky_into(H, root)
     for d in range(3):
         for i in range(n):
             out[d, i] = 0.0
-        for k in range(whole):
-            to = path[k] if d == 1 else path[whole - 1 - k]
-            to = to if d == 0 else 2.0 * mean - to
-            x = precision * weights[k] / total * (to - rest[k])
-            for i in range(n):
-                out[d, i] += B[i, k] * x
+        for o in range(outputs):
+            mean = 0.0
+            for k in range(whole):
+                mean += weights[k] / total * path[o, k]
+            for k in range(whole):
+                to = path[o, k] if d == 1 else path[o, whole - 1 - k]
+                to = to if d == 0 else 2.0 * mean - to
+                x = precision * weights[k] / total * (to - rest[o, k])
+                for i in range(n):
+                    out[d, i] += B[o, i, k] * x
         cholesky_solve(root, out[d])
 
 
@@ -265,23 +255,19 @@ def _near(s: FloatArray, ends: FloatArray, H: FloatArray, count: int) -> int:
 
 @inlined
 def _at(
-    y: FloatArray, usable: BoolArray, weights: FloatArray, table: FloatArray, low: float, per_unit: float,
-    read_noise: float, gain: float, rest: FloatArray, B: FloatArray, s: FloatArray, path: FloatArray,
-    slope: FloatArray, f: FloatArray, J: FloatArray, scores: FloatArray, H: FloatArray, pull: FloatArray,
+    seen: Line | Plane, row: int, rest: FloatArray, B: FloatArray, s: FloatArray, path: FloatArray, H: FloatArray,
+    pull: FloatArray,
 ) -> float:  # fmt: skip
-    """Information H, negative gradient ``pull`` and objective (returned) at whitened coordinates s.
-
-    The fields of the `Line` and its row are arguments, as `log_likelihoods_of_lines` says.
-    """
-    n = len(s)
-    path_of(rest, B, s, path)
-    linearised_light(path, weights, table, low, per_unit, B, slope, f, J)
-    log_likelihood, _ = fisher_information(y, usable, f, J, table.shape[2], read_noise, gain, scores, H, pull)
-    square = 0.0
+    """Information H, negative gradient ``pull`` and objective (returned) at whitened coordinates s."""
+    n, square = len(s), 0.0
+    for o in range(len(path)):
+        path_of(rest[o], B[o], s, path[o])
     for i in range(n):
-        H[i, i] += 1.0
-        pull[i] -= s[i]
+        pull[i] = -s[i]
         square += s[i] * s[i]
+        for j in range(i + 1):
+            H[i, j] = 1.0 if i == j else 0.0
+    log_likelihood, _ = information_of_row(seen, row, path, B, H, pull)
     return float(0.5 * square - log_likelihood)
 
 

@@ -15,13 +15,13 @@ from aolink.estimation.compiled.line import (
     AT_ONCE,
     LARGE,
     add_gradients,
+    fisher_information,
     log_likelihood_of,
     paths_of,
     place,
     places_of,
 )
 from aolink.estimation.compiled.small import compiled, compiled_sums, inlined
-from aolink.estimation.compiled.vectors import add_outer, add_slopes, lanes_of, put_cubic, put_cubic_slope
 from aolink.numerics.arrays import BoolArray, FloatArray, IntArray
 
 
@@ -39,8 +39,7 @@ class Plane(NamedTuple):
     weights: FloatArray
     """Each node's share of the exposure, (nodes,)."""
     across: FloatArray
-    """Taylor coefficients of the densities of columns of pixels about points of a pixel, (terms, points, 4, reach); the
-    reach is a multiple of `vectors.lanes_of`."""
+    """Taylor coefficients of the densities of columns of pixels about points of a pixel, (terms, points, 4, reach)."""
     down: FloatArray
     """The same coefficients for rows of pixels."""
     terms: FloatArray
@@ -215,75 +214,90 @@ def _put_pulls(
 ) -> None:  # fmt: skip
     """Derivatives of the log-likelihood by the path at the nodes, (nodes, points), of the point of `_add_light`, from
     those by the densities: its adjoint. ``pull`` is room for (2,)."""
-    wide, high, width, lanes = across.shape[3], down.shape[3], scores.shape[1], lanes_of(scores)
     for k in range(len(weights)):
         left, top = lefts[k, point], tops[k, point]
         pull[0] = pull[1] = 0.0
         if left >= 0 and top >= 0:
-            at, x, y = top * width + left, dx[k, point], dy[k, point]
             for j in range(len(terms)):
-                column = 4 * (j * across.shape[1] + of_columns[k, point]) * wide
-                row = 4 * (j * down.shape[1] + of_rows[k, point]) * high
                 weight = terms[j] * weights[k] * per_unit
-                for p in range(0, high, lanes):
-                    put_cubic(rows, p, 1.0, y, down, row + p, high)
-                    put_cubic_slope(row_slopes, p, 1.0, y, down, row + p, high)
-                for p in range(0, wide, lanes):
-                    put_cubic(columns, p, weight, x, across, column + p, wide)
-                    put_cubic_slope(column_slopes, p, weight, x, across, column + p, wide)
-                    add_slopes(pull, scores, at + p, width, rows, row_slopes, high, columns, column_slopes, p)
+                _taylor(down, j, of_rows[k, point], dy[k, point], 1.0, rows)
+                _taylor_slope(down, j, of_rows[k, point], dy[k, point], 1.0, row_slopes)
+                _taylor(across, j, of_columns[k, point], dx[k, point], weight, columns)
+                _taylor_slope(across, j, of_columns[k, point], dx[k, point], weight, column_slopes)
+                _add_slopes(scores, top, left, rows, row_slopes, columns, column_slopes, pull)
         pulls_x[k, point], pulls_y[k, point] = pull[0], pull[1]
 
 
+@compiled_sums
+def _add_slopes(
+    scores: FloatArray, top: int, left: int, rows: FloatArray, row_slopes: FloatArray, columns: FloatArray,
+    column_slopes: FloatArray, pull: FloatArray,
+) -> None:  # fmt: skip
+    """Add the sums of scores times the slopes of `_add_product` by x and by y, (2,)."""
+    for k in range(len(rows)):
+        r = np.uintp(top) + np.uintp(k)
+        by_x = by_y = scores.dtype.type(0.0)
+        for m in range(len(columns)):
+            score = scores[r, np.uintp(left) + np.uintp(m)]
+            by_x += score * column_slopes[m]
+            by_y += score * columns[m]
+        pull[0] += rows[k] * by_x
+        pull[1] += row_slopes[k] * by_y
+
+
 @compiled
-def linearised_light_of_spots(seen: Plane, t: FloatArray, light: FloatArray, slopes: FloatArray) -> None:
-    """Densities (rows, points, spots, side, side) of points t (rows, points, n); their derivatives by t, (..., n)."""
-    n, side, across, down = t.shape[2], seen.y.shape[2], seen.across.shape[3], seen.down.shape[3]
-    path = np.empty((2, len(seen.weights)))
-    f = np.empty((side + 2 * down, side + 2 * across))
-    J = np.empty((n, side + 2 * down, side + 2 * across))
-    columns, more_columns, rows, more_rows = np.empty(across), np.empty(across), np.empty(down), np.empty(down)
-    for row in range(t.shape[0]):
-        for k in range(t.shape[1]):
-            for spot in range(seen.y.shape[1]):
-                _path_of(seen, row, spot, t[row, k], path)
-                f[:] = 0.0
-                J[:] = 0.0
-                for node in range(len(seen.weights)):
-                    left, column, dx = place(path[0, node], seen.low, seen.per_unit, side, seen.across.shape[1], across)
-                    top, line, dy = place(path[1, node], seen.low, seen.per_unit, side, seen.down.shape[1], down)
-                    if left < 0 or top < 0:
-                        continue
-                    for j in range(len(seen.terms)):
-                        weight = seen.terms[j] * seen.weights[node]
-                        _taylor(seen.across[j, column], dx, weight, columns)
-                        _taylor(seen.down[j, line], dy, 1.0, rows)
-                        _taylor_slope(seen.across[j, column], dx, weight * seen.per_unit, more_columns)
-                        _taylor_slope(seen.down[j, line], dy, seen.per_unit, more_rows)
-                        _add_product(f, top, left, rows, columns)
-                        for i in range(n):
-                            along, aside = seen.basis[2 * spot, i, node], seen.basis[2 * spot + 1, i, node]
-                            for r in range(down):
-                                lit, a, b = J[i, top + r, left : left + across], along * rows[r], aside * more_rows[r]
-                                for c in range(across):
-                                    lit[c] += a * more_columns[c] + b * columns[c]
-                for r in range(side):
-                    for c in range(side):
-                        light[row, k, spot, r, c] = f[down + r, across + c]
-                        for i in range(n):
-                            slopes[row, k, spot, r, c, i] = J[i, down + r, across + c]
+def information_of_spots(
+    seen: Plane, row: int, path: FloatArray, basis: FloatArray, H: FloatArray, pull: FloatArray
+) -> tuple[float, float]:
+    """`fisher_information` of the spots of one row about their path (outputs, nodes), by coefficients of a basis
+    (outputs, n, nodes)."""
+    n, side, across, down = len(pull), seen.y.shape[2], seen.across.shape[3], seen.down.shape[3]
+    f, J = np.empty((side + 2 * down, side + 2 * across)), np.empty((n, side + 2 * down, side + 2 * across))
+    light, slopes, scores = np.empty(side * side), np.empty((n, side * side)), np.empty((3, side * side))
+    log_likelihood = square = 0.0
+    for spot in range(seen.y.shape[1]):
+        _linearised_spot(seen, spot, path, basis, f, J)
+        for r in range(side):
+            for c in range(side):
+                light[r * side + c] = f[down + r, across + c]
+                for i in range(n):
+                    slopes[i, r * side + c] = J[i, down + r, across + c]
+        own, squares = fisher_information(
+            seen.y[row, spot].ravel(), seen.usable[row, spot].ravel(), light, slopes, 0, seen.read_noise, seen.gain,
+            scores, H, pull,
+        )  # fmt: skip
+        log_likelihood += own
+        square += squares
+    return log_likelihood, square
 
 
 @inlined
-def _path_of(seen: Plane, row: int, spot: int, t: FloatArray, path: FloatArray) -> None:
-    """The path of one spot at the nodes, (2, nodes), of coefficients t (n,)."""
-    for d in range(2):
-        output = 2 * spot + d
-        path[d] = seen.inputs[row, output]
-        for i in range(len(t)):
-            value = t[i]
-            for node in range(path.shape[1]):
-                path[d, node] += value * seen.basis[output, i, node]
+def _linearised_spot(seen: Plane, spot: int, path: FloatArray, basis: FloatArray, f: FloatArray, J: FloatArray) -> None:
+    """Padded densities f of one spot, and their Jacobian J, (n, ...), by coefficients of a basis (outputs, n,
+    nodes)."""
+    side, points_across, points_down = seen.y.shape[2], seen.across.shape[1], seen.down.shape[1]
+    across, down = seen.across.shape[3], seen.down.shape[3]
+    columns, more_columns, rows, more_rows = np.empty(across), np.empty(across), np.empty(down), np.empty(down)
+    f[:] = 0.0
+    J[:] = 0.0
+    for node in range(path.shape[1]):
+        left, column, dx = place(path[2 * spot, node], seen.low, seen.per_unit, side, points_across, across)
+        top, line, dy = place(path[2 * spot + 1, node], seen.low, seen.per_unit, side, points_down, down)
+        if left < 0 or top < 0:
+            continue
+        for j in range(len(seen.terms)):
+            weight = seen.terms[j] * seen.weights[node]
+            _taylor(seen.across, j, column, dx, weight, columns)
+            _taylor(seen.down, j, line, dy, 1.0, rows)
+            _taylor_slope(seen.across, j, column, dx, weight * seen.per_unit, more_columns)
+            _taylor_slope(seen.down, j, line, dy, seen.per_unit, more_rows)
+            _add_product(f, top, left, rows, columns)
+            for i in range(len(J)):
+                along, aside = basis[2 * spot, i, node], basis[2 * spot + 1, i, node]
+                for k in range(down):
+                    a, b, r = along * rows[k], aside * more_rows[k], np.uintp(top) + np.uintp(k)
+                    for m in range(across):
+                        J[i, r, np.uintp(left) + np.uintp(m)] += a * more_columns[m] + b * columns[m]
 
 
 @compiled
@@ -296,45 +310,43 @@ def _add_light(
 
     The results are the first row and the one after the last that get light, and the same for columns.
     """
-    wide, high, width, lanes = across.shape[3], down.shape[3], f.shape[1], lanes_of(f)
-    begin, end, first, last = len(f), 0, width, 0
+    wide, high = across.shape[3], down.shape[3]
+    begin, end, first, last = len(f), 0, f.shape[1], 0
     for j in range(len(terms)):
         for k in range(len(weights)):
             left, top = lefts[k, point], tops[k, point]
             if left < 0 or top < 0:
                 continue
             begin, end, first, last = min(begin, top), max(end, top + high), min(first, left), max(last, left + wide)
-            column = 4 * (j * across.shape[1] + of_columns[k, point]) * wide
-            row = 4 * (j * down.shape[1] + of_rows[k, point]) * high
-            for p in range(0, wide, lanes):
-                put_cubic(columns, p, terms[j] * weights[k], dx[k, point], across, column + p, wide)
-            for p in range(0, high, lanes):
-                put_cubic(rows, p, 1.0, dy[k, point], down, row + p, high)
-            at = top * width + left
-            for p in range(0, wide, lanes):
-                add_outer(f, at + p, width, rows, high, columns, p)
+            _taylor(across, j, of_columns[k, point], dx[k, point], terms[j] * weights[k], columns)
+            _taylor(down, j, of_rows[k, point], dy[k, point], 1.0, rows)
+            _add_product(f, top, left, rows, columns)
     return begin, end, first, last
 
 
 @inlined
 def _add_product(f: FloatArray, top: int, left: int, rows: FloatArray, columns: FloatArray) -> None:
-    for r in range(len(rows)):
-        # A slice of one row, so that the compiler knows that its pixels are side by side: four times as fast.
-        lit, light = f[top + r, left : left + len(columns)], rows[r]
-        for c in range(len(columns)):
-            lit[c] += light * columns[c]
+    for k in range(len(rows)):
+        r, light = np.uintp(top) + np.uintp(k), rows[k]
+        for m in range(len(columns)):
+            f[r, np.uintp(left) + np.uintp(m)] += light * columns[m]
 
 
 @compiled
-def _taylor(series: FloatArray, d: float, factor: float, out: FloatArray) -> None:
+def _taylor(table: FloatArray, term: int, point: int, d: float, factor: float, out: FloatArray) -> None:
+    weight = out.dtype.type(factor)
     for p in range(len(out)):
-        out[p] = factor * (series[0, p] + d * (series[1, p] + d * (series[2, p] + d * series[3, p])))
+        slope = table[term, point, 1, p] + d * (table[term, point, 2, p] + d * table[term, point, 3, p])
+        out[p] = weight * (table[term, point, 0, p] + d * slope)
 
 
 @compiled
-def _taylor_slope(series: FloatArray, d: float, factor: float, out: FloatArray) -> None:
+def _taylor_slope(table: FloatArray, term: int, point: int, d: float, factor: float, out: FloatArray) -> None:
+    number = out.dtype.type
+    weight, two, three = number(factor), number(2.0), number(3.0)
     for p in range(len(out)):
-        out[p] = factor * (series[1, p] + d * (2.0 * series[2, p] + 3.0 * d * series[3, p]))
+        steeper = two * table[term, point, 2, p] + three * d * table[term, point, 3, p]
+        out[p] = weight * (table[term, point, 1, p] + d * steeper)
 
 
 @compiled_sums

@@ -110,7 +110,6 @@ class MixtureFilter(Filter):
         view = PixelView(self.sensor, model, response, dark, updater.reduction(model, self.sensor))
         updater.update(view.part(one), self.prior.part(one), self._unseen.part(one))
         point = np.zeros((1, 1, view.reduced.size))
-        view.log_likelihoods(point)
         view.rough().log_likelihoods_and_gradients(point)
         with_noise_and_gradient(twice, point)
 

@@ -30,10 +30,9 @@ from typing import Any
 import numpy as np
 
 from aolink.errors import EstimatorError
-from aolink.estimation.compiled.likelihoods import log_likelihoods, log_likelihoods_and_gradients
+from aolink.estimation.compiled.likelihoods import log_likelihoods_and_gradients
 from aolink.estimation.compiled.line import Line
-from aolink.estimation.compiled.plane import Plane, linearised_light_of_spots
-from aolink.estimation.compiled.vectors import BYTES
+from aolink.estimation.compiled.plane import Plane
 from aolink.estimation.frames.frame_data import Profile, SpotWindows
 from aolink.estimation.kalman.gaussian import Gaussian
 from aolink.estimation.model import quadrature
@@ -214,8 +213,6 @@ def _paths(model: ExposureModel, expand: FloatArray, count: int = _PATHS) -> Flo
 class PixelView:
     """The pixels of one frame as a function of the reduced coefficients t of each axis: prediction and likelihood.
 
-    The functions that compiled code has for a line sensor are here for spots on a plane only.
-
     Points of each axis lie along the second dimension of every argument, (axes, k, ...). ``level`` is that
     of the reduction's resolution.
     """
@@ -299,17 +296,6 @@ class PixelView:
         assert isinstance(self.measured, SpotWindows)
         return WindowedSpots(self.sensor, self.outputs // 2).look(self.nodes, about, self.measured)
 
-    def paths(self, t: FloatArray) -> FloatArray:
-        """Outputs at the nodes, (axes, k, n_outputs, nodes)."""
-        flat = batched.long_matmul(t, self.rows.T)
-        return np.asarray(flat.reshape(*t.shape[:2], self.outputs, -1) + self.nodes.inputs[:, None])
-
-    def log_likelihoods(self, t: FloatArray) -> FloatArray:
-        """Log-likelihoods of many points (axes, points, n), (axes, points)."""
-        out = np.empty(t.shape[:2])
-        log_likelihoods(self.seen, np.ascontiguousarray(batched.transpose(t), self._number), out)
-        return out
-
     def log_likelihoods_and_gradients(self, t: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Log-likelihoods of many points (axes, points, n), (axes, points), and their gradients, (axes, points, n)."""
         out, points = np.empty(t.shape[:2]), np.ascontiguousarray(batched.transpose(t), self._number)
@@ -320,18 +306,15 @@ class PixelView:
     @property
     def seen(self) -> Line | Plane:
         """The frame for compiled code."""
-        line = self.line
-        return self._plane if line is None else line
+        return self._line if self.on_line else self._plane
 
     @property
-    def line(self) -> Line | None:
-        """The frame of a line sensor for compiled code; None for spots on a plane."""
-        if not self.on_line:
-            return None
+    def _line(self) -> Line:
+        """The frame of a line sensor for compiled code."""
         nodes, pixel = self.nodes, self.optics.pixel_size
         return Line(
-            y=self._array(self.y), usable=np.ascontiguousarray(self.mask), inputs=self._array(nodes.inputs[:, 0]),
-            basis=self._array(nodes.basis[0].T), weights=self._array(nodes.weights),
+            y=self._array(self.y), usable=np.ascontiguousarray(self.mask), inputs=self._array(nodes.inputs),
+            basis=self._array(batched.transpose(nodes.basis)), weights=self._array(nodes.weights),
             table=_light_table(float(self.kernel[0, 0]), pixel, 0, self._reach, 1.0, self._number),
             low=float(self.optics.profile.edges[0]), per_unit=1 / pixel, read_noise=self.read_noise, gain=self.gain,
         )  # fmt: skip
@@ -361,41 +344,6 @@ class PixelView:
         """Contiguous, of the view's type."""
         return np.ascontiguousarray(values, self._number)
 
-    def linearised(self, t: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Densities of the pixels without noise, (axes, k, pixels), and their Jacobian (axes, k, pixels, n)."""
-        seen, (axes, points, n) = self._plane, t.shape
-        light = np.empty((axes, points, *seen.y.shape[1:]))
-        slopes = np.empty((*light.shape, n))
-        linearised_light_of_spots(seen, np.ascontiguousarray(t), light, slopes)
-        return light.reshape(axes, points, -1), slopes.reshape(axes, points, -1, n)
-
-    def log_likelihood(self, f: FloatArray) -> FloatArray:
-        """Log-likelihood of the usable pixels, up to a constant, (axes, k), if f (axes, k, pixels) is expected."""
-        R = self._variance(f)
-        e = self.y[:, None] - f
-        terms = e * e / R
-        if self.gain:
-            terms = terms + np.log(R / self.read_noise)
-        return np.asarray(-0.5 * np.add.reduce(np.where(self.mask[:, None], terms, 0.0), axis=-1))
-
-    def information(self, f: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Score and Fisher information of each pixel by its expected density f, all (axes, k, pixels).
-
-        The variance grows with f (shot noise), which adds information of its own.
-        """
-        R = self._variance(f)
-        e = self.y[:, None] - f
-        score, information = e / R, 1 / R
-        if self.gain:
-            grows = np.where(f > 0, self.gain, 0.0)
-            score = score + grows * (e * e / R - 1) / (2 * R)
-            information = information + grows**2 / (2 * R * R)
-        usable = self.mask[:, None]
-        return np.where(usable, score, 0.0), np.where(usable, information, 0.0)
-
-    def _variance(self, f: FloatArray) -> FloatArray:
-        return self.read_noise + self.gain * np.maximum(f, 0.0)
-
 
 @lru_cache(maxsize=_SIDE_BY_SIDE)
 def _light_table(
@@ -404,8 +352,7 @@ def _light_table(
     """Taylor coefficients of the densities of pixels about a spot, for points in its own pixel, (points, 4, pixels).
 
     They are those of powers of its distance from the point, in pixels; of the derivative of this ``order`` by the
-    spot's position, times ``scale``. ``reach`` is in standard deviations. The bytes of a row are rounded up to a
-    multiple of `BYTES`; the pixels added get no light.
+    spot's position, times ``scale``. ``reach`` is in standard deviations.
     """
     points = math.ceil(_POINTS * pixel / math.sqrt(variance))
     half = _half(variance, pixel, reach)
@@ -417,9 +364,7 @@ def _light_table(
     places = (np.arange(points) + 0.5) * pixel / points
     masses = pixel_masses(variance, pixel * np.arange(-half, half + 1.0), places, order + 3)[order:]
     table = np.stack([mass * pixel ** (k - 1) / math.factorial(k) for k, mass in enumerate(masses)], axis=1)
-    table = (scale * table).astype(number)
-    beyond = (-half) % (BYTES // table.itemsize // 2)
-    return np.pad(table, [(0, 0), (0, 0), (beyond, beyond)])
+    return (scale * table).astype(number)
 
 
 def _half(variance: float, pixel: float, reach: float) -> int:

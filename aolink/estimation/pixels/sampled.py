@@ -16,7 +16,7 @@ from aolink.estimation.model.base import ExposureModel
 from aolink.estimation.pixels.filter import MixtureUpdate
 from aolink.estimation.pixels.gaussian_mixture import GaussianMixture, stacked_axes
 from aolink.estimation.pixels.likelihood import PixelView, Reduction, reduction
-from aolink.estimation.pixels.modes import find_modes, innovation, whitened, with_reversals, without_repeats
+from aolink.estimation.pixels.modes import find_modes, innovation, whitened, without_repeats
 from aolink.estimation.pixels.moves import affordable
 from aolink.estimation.pixels.profile import has_several
 from aolink.estimation.pixels.tempering import Particles, fitted, tempered_points
@@ -51,8 +51,8 @@ class TemperedUpdater:
             after = Gaussian(mean, batched.matmul(batched.transpose(away), away) / (t.shape[1] - 1))
         fit = stacked_axes([fitted(points, reduced.end_rows, _COMPONENTS, self.seed) for points in t])
         # With one Gaussian as the prior: components of a mixture that overlap would count as modes of their own.
-        found = find_modes(view, before, whitened(before, fit.ordered(_SEARCHED).mean))
-        modes = without_repeats(with_reversals(view, before, found))
+        starts = whitened(before, fit.ordered(_SEARCHED).mean)
+        modes = without_repeats(find_modes(view, before, starts, reversals=True))
         new = innovation(view, before, modes)
         end = Gaussian(fit.mean, fit.covariance).mapped(reduced.end_rows, reduced.end_remainder)
         carried = GaussianMixture(fit.log_weight, end.mean, end.covariance)

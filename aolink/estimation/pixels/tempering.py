@@ -35,7 +35,7 @@ class Particles(NamedTuple):
     points: FloatArray
     """(axes, count, n)"""
     log_evidence: FloatArray
-    """Estimate of the frame's log-likelihood, up to the constant that `PixelView.log_likelihoods` leaves out, (axes,):
+    """Estimate of the frame's log-likelihood, up to a constant of the camera and the mask, (axes,):
     the sum over the steps of the power of the log of the points' mean weight."""
 
 

@@ -4,7 +4,15 @@ import numpy as np
 import pytest
 
 from aolink.estimation.compiled.likelihoods import gradients_of_row, log_likelihoods_and_gradients
-from tests.estimation.compiled.test_pixels import KINDS, MANY, PLANES, looked_at, looked_at_plane, three_spots
+from tests.estimation.compiled.test_pixels import (
+    KINDS,
+    MANY,
+    PLANES,
+    log_likelihoods,
+    looked_at,
+    looked_at_plane,
+    three_spots,
+)
 
 ALL = pytest.mark.parametrize("kind", [*KINDS, *PLANES])
 
@@ -28,8 +36,8 @@ def drawn(view, state, seed=2):
 def test_gradients_are_the_twins_and_log_likelihoods_those_without(kind):
     view, in_numpy, state = looked(kind)
     t = drawn(view, state)
-    log_likelihoods, gradients = view.log_likelihoods_and_gradients(t)
-    np.testing.assert_allclose(log_likelihoods, view.log_likelihoods(t), rtol=1e-11)
+    with_them, gradients = view.log_likelihoods_and_gradients(t)
+    np.testing.assert_allclose(with_them, log_likelihoods(view.seen, t), rtol=1e-11)
     f, J = in_numpy.linearised(t)
     score, _ = in_numpy.information(f)
     expected = np.einsum("akp,akpi->aki", score, J)
@@ -74,7 +82,7 @@ def test_rough_log_likelihoods_and_gradients_are_near_the_exact_ones(kind):
     found, rough_slopes = rough.log_likelihoods_and_gradients(t)
     # The light that is left out hides in the noise of a pixel where the path is that of the frame; elsewhere an error
     # of the light counts as often as the frame is away from it.
-    for each in (found, rough.log_likelihoods(t)):
+    for each in (found, log_likelihoods(rough.seen, t)):
         worst = (np.abs(each - exact) / (0.02 * np.sqrt(np.maximum(1.0, -exact)) + 3e-6 * np.abs(exact))).max()
         assert worst < 1.0
         assert each.tobytes() != exact.tobytes()

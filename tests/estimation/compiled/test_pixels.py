@@ -5,14 +5,15 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy import linalg
+from scipy import linalg, stats
 
 from aolink.estimation import exposure_model, make_estimator
-from aolink.estimation.compiled.likelihoods import log_likelihoods, log_likelihoods_of_row
+from aolink.estimation.compiled import modes as compiled_modes
+from aolink.estimation.compiled.likelihoods import information_of_row, log_likelihoods_of_row
 from aolink.estimation.compiled.line import place, places_of
-from aolink.estimation.compiled.modes import find_modes_of_lines
 from aolink.estimation.frames.frame_data import Needs, Profile, SpotWindows
 from aolink.estimation.frames.measure import measure
+from aolink.estimation.kalman.filter import GATE_PROBABILITY
 from aolink.estimation.kalman.gaussian import Gaussian
 from aolink.estimation.pixels import likelihood, modes
 from aolink.estimation.pixels.filter import MixtureFilter
@@ -94,6 +95,14 @@ def looked_at(kind):
     return view, PlainView.of(view), Gaussian(mean, np.tile(P, (AXES, 1, 1)))
 
 
+def log_likelihoods(seen, t):
+    """Log-likelihoods of points (rows, points, n), (rows, points)."""
+    out = np.empty(t.shape[:2])
+    for row, points in enumerate(t):
+        log_likelihoods_of_row(seen, row, np.ascontiguousarray(points.T, seen.y.dtype), 0, len(points), out[row])
+    return out
+
+
 @pytest.fixture(scope="module", params=KINDS)
 def pair(request):
     return looked_at(request.param)
@@ -105,7 +114,7 @@ def test_the_likelihood_of_many_points_is_that_of_the_twin(pair):
     rng = np.random.default_rng(2)
     t = prior.mean[:, None] + rng.standard_normal((AXES, MANY, view.reduced.size)) * 0.3
     f = in_numpy.predicted(t)
-    ours, theirs = view.log_likelihoods(t), in_numpy.log_likelihoods(t)
+    ours, theirs = log_likelihoods(view.seen, t), in_numpy.log_likelihoods(t)
     # An error of the light by 2e-7 of the brightest pixel moves it by what that is of a pixel's noise, times residuals.
     noise = np.sqrt(view.read_noise)
     residual = np.abs(view.y[:, None] - f).sum(axis=2) / noise
@@ -144,7 +153,9 @@ def test_the_search_starts_where_its_twin_does(pair):
     view, in_numpy, state = pair
     prior = view.reduced.prior(state)
     wide = broad(in_numpy, prior)
-    (ours, squares), (theirs, their_squares) = (spread_starts(each, prior, wide) for each in (view, in_numpy))
+    (ours, squares), (theirs, their_squares) = (
+        starts_of(each, prior, wide) for starts_of, each in ((spread_starts, view), (plain.spread_starts, in_numpy))
+    )
     np.testing.assert_allclose(squares, their_squares, atol=1e-9 * their_squares.max())
     np.testing.assert_allclose(ours[:, 0], theirs[:, 0], atol=1e-6)
     # A direction is one whichever way it points.
@@ -155,7 +166,7 @@ def test_the_search_starts_where_its_twin_does(pair):
 def test_every_start_leads_to_the_same_mode(pair):
     view, in_numpy, state = pair
     prior = view.reduced.prior(state)
-    starts, _ = spread_starts(in_numpy, prior, broad(in_numpy, prior))
+    starts, _ = plain.spread_starts(in_numpy, prior, broad(in_numpy, prior))
     for k in range(starts.shape[1]):
         ours, theirs = (settled_modes(each, prior, starts[:, k : k + 1]) for each in (view, in_numpy))
         # A long search may end in another mode, as one that begins 1e-6 away may.
@@ -173,16 +184,16 @@ def test_reversals_of_the_best_are_those_of_the_twin(pair):
     """With no pass of the search modes are where it starts, and after them the reversals of the best."""
     view, in_numpy, state = pair
     prior = view.reduced.prior(state)
-    starts, _ = spread_starts(in_numpy, prior, broad(in_numpy, prior))
+    starts, _ = plain.spread_starts(in_numpy, prior, broad(in_numpy, prior))
     starts = np.ascontiguousarray(starts[:, :3])
     found = Modes.none(AXES, 6, starts.shape[2])
-    find_modes_of_lines(
-        view.line, prior.mean, prior.covariance, starts, np.full(AXES, 3), view.whole_nodes,
+    compiled_modes.find_modes(
+        view.seen, prior.mean, prior.covariance, starts, np.full(AXES, 3), view.whole_nodes,
         modes.precision_of_reversal(view), 0, FIRST_DAMPING, LARGEST_DAMPING, FREE_DAMPING, 0.0, *found,
     )  # fmt: skip
     ends = prior.mean[:, None] + batched.matmul(starts, batched.transpose(cholesky(prior.covariance)))
     best = ends[np.arange(AXES), np.argmin(found.objective[:, :3], axis=1)]
-    expected = modes.reversed_starts(in_numpy, prior, best[:, None])
+    expected = plain.reversed_starts(in_numpy, prior, best[:, None])
     ours = whitened(prior, found.mean[:, 3:])
     there = np.isfinite(found.log_evidence[:, 3:])
     assert there.mean() > 0.3
@@ -196,7 +207,10 @@ def test_searches_that_end_early_find_the_modes_that_matter(pair):
     prior, some = view.reduced.prior(state), slice(1, None)  # not the one beyond the sensor
     prior = Gaussian(prior.mean[some], prior.covariance[some])
     wide, at_length = broad(in_numpy.part(some), prior), np.arange(AXES - 1) % 4 > 0
-    ours, theirs = (without_repeats(modes_of(each.part(some), prior, wide, at_length)) for each in (view, in_numpy))
+    ours, theirs = (
+        without_repeats(found(each.part(some), prior, wide, at_length))
+        for found, each in ((modes_of, view), (plain.modes_of, in_numpy))
+    )
     found = 0
     for axis in range(AXES - 1):
         most = theirs.log_evidence[axis].max()
@@ -257,13 +271,15 @@ def test_the_innovation_is_that_of_the_twin(pair):
     view, in_numpy, state = pair
     prior = view.reduced.prior(state)
     found = find_modes(view, prior, whitened(prior, broad(view, prior).mean[:, None]))
-    ours, theirs = (innovation(each, prior, found) for each in (view, in_numpy))
+    ours, k = innovation(view, prior, found), innovation(view, prior, found).value.shape[1]
+    value, information, _, square = plain.innovations(in_numpy, prior, found.mean[:, 0], k)
     # In a direction of next to no information, the innovation is the noise along any direction of the pixels.
-    information = np.einsum("aii->ai", theirs.covariance) - 1
     tells = information > 1e-5 * information[:, :1]
-    np.testing.assert_allclose(ours.value[tells] ** 2, theirs.value[tells] ** 2, rtol=0.02, atol=0.02)
-    np.testing.assert_array_equal(ours.within_gate, theirs.within_gate)
-    np.testing.assert_allclose(ours.covariance, theirs.covariance, rtol=5e-3, atol=1e-3)
+    np.testing.assert_allclose(ours.value[tells] ** 2, value[tells] ** 2, rtol=0.02, atol=0.02)
+    np.testing.assert_allclose(np.einsum("aii->ai", ours.covariance), 1 + information, rtol=5e-3, atol=1e-3)
+    degrees = view.mask.sum(axis=1) + found.mean.shape[2]
+    total = square + found.distance[:, 0]
+    np.testing.assert_array_equal(ours.within_gate, total <= stats.chi2(degrees).isf(GATE_PROBABILITY))
 
 
 @pytest.mark.slow
@@ -331,7 +347,7 @@ def test_the_likelihood_of_a_spot_on_a_plane_is_that_of_the_twin(kind, masked):
     assert np.median(light[0, :-20]) > 0.99
     assert ((light[0, -20:-10] > 0.01) & (light[0, -20:-10] < 0.9)).any()
     assert light[0, -10:].max() < 1e-6
-    ours, theirs = view.log_likelihoods(t), in_numpy.log_likelihoods(t)
+    ours, theirs = log_likelihoods(view.seen, t), in_numpy.log_likelihoods(t)
     noise = np.sqrt(view.read_noise)
     residual = np.abs(view.y[:, None] - f).sum(axis=2) / noise
     assert np.all(np.abs(ours - theirs) < 4e-7 * f.max() / noise * (residual + 1) + 1e-9 * np.abs(theirs))
@@ -363,8 +379,8 @@ def test_the_likelihood_of_several_spots_is_the_product_of_theirs(gain):
     together, apart = np.empty((1, MANY)), np.empty((3, 1, MANY))
     spots, joined = three_spots(one)
     for spot, out in zip(spots, apart, strict=True):
-        log_likelihoods(spot, t, out)
-    log_likelihoods(joined, t, together)
+        out[:] = log_likelihoods(spot, t.transpose(0, 2, 1))
+    together[:] = log_likelihoods(joined, t.transpose(0, 2, 1))
     np.testing.assert_allclose(together, apart.sum(axis=0), rtol=1e-12)
     assert len(np.unique(apart[:, 0, 0])) == 3
 
@@ -383,17 +399,42 @@ def test_points_have_the_same_likelihood_wherever_they_are_among_others(kind):
     assert np.isnan(part[133:]).all()
 
 
-@pytest.mark.parametrize("kind", PLANES)
-def test_the_light_of_a_spot_on_a_plane_and_its_slopes_are_the_twins(kind):
-    """A spot in the window, one half outside and one quite outside."""
-    view, in_numpy, state = looked_at_plane(kind, 0)
-    t = np.tile(view.reduced.prior(state).mean, (1, 3, 1))
+@pytest.mark.parametrize("kind", [*KINDS, *PLANES])
+def test_the_information_of_the_pixels_is_the_twins(kind):
+    """With a spot in the window, one half outside and one quite outside."""
+    view, in_numpy, state = looked_at_plane(kind, 9) if kind in PLANES else looked_at(kind)
+    t = np.tile(view.reduced.prior(state).mean[-1:, None], (1, 3, 1))
     t[0, 1, 0] += 1.0
     t[0, 2, :4] += 7.0
-    light, slopes = view.linearised(t)
-    expected, expected_slopes = in_numpy.linearised(t)
-    np.testing.assert_allclose(light, expected, atol=1e-6 * expected.max())
-    np.testing.assert_allclose(slopes, expected_slopes, atol=3e-5 * np.abs(expected_slopes).max())
+    seen, n, last = view.seen, t.shape[2], len(view.y) - 1
+    f, J = in_numpy.part(slice(last, None)).linearised(t)
+    score, information = in_numpy.part(slice(last, None)).information(f)
+    for k in range(3):
+        path = seen.inputs[last] + np.einsum("oim,i->om", seen.basis, t[0, k])
+        H, pull = np.zeros((n, n)), np.zeros(n)
+        log_likelihood, square = information_of_row(seen, last, path, seen.basis, H, pull)
+        expected = (J[0, k] * information[0, k][:, None]).T @ J[0, k]
+        np.testing.assert_allclose(np.tril(H), np.tril(expected), atol=1e-4 * np.abs(expected).max() + 1e-12)
+        scale = np.abs(score[0, k]) @ np.abs(J[0, k])
+        np.testing.assert_allclose(pull, score[0, k] @ J[0, k], atol=1e-4 * scale.max() + 1e-9)
+        assert log_likelihood == pytest.approx(log_likelihoods(seen, t.repeat(last + 1, axis=0))[last, k], rel=1e-9)
+        lit = information[0, k] > 0
+        # With shot noise a pixel of next to no light counts otherwise than one of none.
+        assert view.gain or square == pytest.approx((score[0, k][lit] ** 2 / information[0, k][lit]).sum(), rel=1e-4)
+
+
+@pytest.mark.parametrize("kind", PLANES)
+def test_the_modes_of_a_spot_on_a_plane_are_those_of_the_twin(kind):
+    view, in_numpy, state = looked_at_plane(kind, 0)
+    prior = view.reduced.prior(state)
+    wide, at_length = broad(view, prior), np.ones(1, dtype=bool)
+    ours, theirs = (
+        without_repeats(found(each, prior, wide, at_length))
+        for found, each in ((modes_of, view), (plain.modes_of, in_numpy))
+    )
+    assert ours.objective.min() == pytest.approx(theirs.objective.min(), abs=0.05)
+    sd = np.sqrt(np.diag(theirs.covariance[0, theirs.best[0]]))
+    np.testing.assert_allclose(ours.best_mean[0, 0] / sd, theirs.best_mean[0, 0] / sd, atol=0.2)
 
 
 @pytest.mark.parametrize("kind", ["round", "aslant"])

@@ -5,11 +5,12 @@ import math
 import numpy as np
 
 from aolink.estimation import Profile
-from aolink.estimation.pixels import importance
+from aolink.estimation.pixels import importance, modes
 from aolink.estimation.pixels.constants import PROFILE
 from aolink.estimation.pixels.gaussian_mixture import GaussianMixture, log_sum
+from aolink.estimation.pixels.levenberg_marquardt import Points, minimise
 from aolink.estimation.pixels.likelihood import PixelView
-from aolink.estimation.pixels.modes import find_modes, whitened
+from aolink.estimation.pixels.modes import whitened
 from aolink.numerics import batched
 from aolink.numerics.covariance import cholesky
 from aolink.optics.kernel import pixel_masses
@@ -85,6 +86,38 @@ class PlainView(PixelView):
     def log_likelihoods(self, t):
         return self.log_likelihood(self.predicted(t))
 
+    def paths(self, t):
+        """Outputs at the nodes, (axes, k, n_outputs, nodes)."""
+        flat = batched.long_matmul(t, self.rows.T)
+        return np.asarray(flat.reshape(*t.shape[:2], self.outputs, -1) + self.nodes.inputs[:, None])
+
+    def log_likelihood(self, f):
+        """Log-likelihood of the usable pixels, up to a constant, (axes, k), if f (axes, k, pixels) is expected."""
+        R = self._variance(f)
+        e = self.y[:, None] - f
+        terms = e * e / R
+        if self.gain:
+            terms = terms + np.log(R / self.read_noise)
+        return np.asarray(-0.5 * np.add.reduce(np.where(self.mask[:, None], terms, 0.0), axis=-1))
+
+    def information(self, f):
+        """Score and Fisher information of each pixel by its expected density f, all (axes, k, pixels).
+
+        The variance grows with f (shot noise), which adds information of its own.
+        """
+        R = self._variance(f)
+        e = self.y[:, None] - f
+        score, information = e / R, 1 / R
+        if self.gain:
+            grows = np.where(f > 0, self.gain, 0.0)
+            score = score + grows * (e * e / R - 1) / (2 * R)
+            information = information + grows**2 / (2 * R * R)
+        usable = self.mask[:, None]
+        return np.where(usable, score, 0.0), np.where(usable, information, 0.0)
+
+    def _variance(self, f):
+        return self.read_noise + self.gain * np.maximum(f, 0.0)
+
 
 def with_noise(prior, t):
     """Log-densities of t = (start state, standard normal noise coefficients), (axes, points, n) -> (axes, points)."""
@@ -94,12 +127,128 @@ def with_noise(prior, t):
     return prior.log_density(t[..., :states]) - 0.5 * np.add.reduce(rest * rest, axis=-1) + constant
 
 
+def find_modes(view, prior, starts):
+    """The mode that each start, in whitened coordinates, (axes, starts, n), leads to, with this prior of each axis."""
+    axes, count, n = starts.shape
+    rows = view.part(np.repeat(np.arange(axes), count))
+    m, L = np.repeat(prior.mean, count, axis=0)[:, None], cholesky(np.repeat(prior.covariance, count, axis=0))
+
+    def at(s, which):
+        return _at(rows.part(which), m[which], L[which], s)
+
+    s, found = minimise(at, starts.reshape(-1, n), PROFILE.passes, PROFILE.converged)
+    covariance = batched.congruence(L, batched.symmetric(np.asarray(np.linalg.inv(found.hessian), dtype=np.float64)))
+    _, log_H = np.linalg.slogdet(found.hessian)
+    evidence = -found.objective - 0.5 * log_H
+    mean = m[:, 0] + batched.matvec(L, s)
+    shape = (axes, count)
+    return modes.Modes(
+        mean.reshape(*shape, n), batched.symmetric(covariance).reshape(*shape, n, n), evidence.reshape(shape),
+        batched.dot(s, s).reshape(shape), found.objective.reshape(shape),
+    )  # fmt: skip
+
+
+def modes_of(view, prior, wide, at_length):
+    """The modes of a posterior; ``wide`` is the posterior of windowed moments, from which searches start.
+
+    A search starts at its mean and, where it is to be ``at_length``, (axes,), at points on both sides of it
+    (`spread_starts`). After their modes come those that the best mode's reversal and mirror images lead to.
+    """
+    starts, squares = spread_starts(view, prior, wide)
+    many = at_length & (squares[:, 0] > PROFILE.wide_path * view.kernel_variance)
+    found = find_modes(view, prior, starts[:, :1])
+    for which, some in ((at_length, starts[:, 1:3]), (many, starts[:, 3:])):
+        if len(rows := np.flatnonzero(which)):
+            found = with_more(found, rows, find_modes(view.part(rows), prior.part(rows), some[rows]))
+    if len(rows := np.flatnonzero(at_length)):
+        back = reversed_starts(view.part(rows), prior.part(rows), found.best_mean[rows])
+        found = with_more(found, rows, find_modes(view.part(rows), prior.part(rows), back))
+    return found
+
+
+def _at(rows, m, L, s):
+    """Information, gradient and objective at whitened coordinates, one start a row."""
+    f, J = rows.linearised(m + batched.matvec(L, s)[:, None])
+    score, information = rows.information(f)
+    J = batched.long_matmul(J[:, 0], L)
+    H = batched.long_matmul(batched.transpose(J) * information, J) + np.eye(s.shape[1])
+    g = batched.matvec(batched.transpose(J), score[:, 0]) - s
+    return Points(0.5 * batched.dot(s, s) - rows.log_likelihood(f)[:, 0], g, batched.symmetric(H))
+
+
+def spread_starts(view, prior, wide):
+    """The mean of a wide Gaussian and points on both sides of it along the path's most uncertain directions.
+
+    They are (axes, 1 + 2 directions, n), in coordinates in which the prior is N(0, I): the mean, and a pair for each
+    direction. The second result is the mean square of the path along each direction at one standard deviation, the
+    largest first, (axes, n).
+    """
+    axes, n = wide.mean.shape
+    L = cholesky(wide.covariance)
+    values, V = np.linalg.eigh(batched.symmetric(batched.matmul(batched.transpose(L), batched.matmul(view.gram, L))))
+    V = batched.transpose(V[:, :, ::-1])
+    along = batched.matmul(V[:, : PROFILE.directions], batched.transpose(L)) * PROFILE.start_reach
+    mean = wide.mean[:, None]
+    pairs = np.stack([mean + along, mean - along], axis=2).reshape(axes, -1, n)
+    return whitened(prior, np.concatenate([mean, pairs], axis=1)), values[:, ::-1]
+
+
+def reversed_starts(view, prior, points):
+    """Whitened coordinates of paths with the same blur as those of points, (axes, k, n) -> (axes, 3 k, n).
+
+    The paths are reversed in time, which gives the same blur; mirrored about their mean, which gives the same blur
+    where it is symmetric, as that of a vibration is; and both.
+    """
+    L, m = cholesky(prior.covariance), prior.mean
+    nodes, outputs = view.whole_nodes, view.outputs
+    rows = view.rows.reshape(outputs, -1, view.reduced.size)[:, :nodes].reshape(outputs * nodes, -1)
+    weights = view.nodes.weights[:nodes] / view.nodes.weights[:nodes].sum()
+    precision = np.tile(weights, outputs) * modes.precision_of_reversal(view)
+    B = batched.matmul(np.broadcast_to(rows, (len(L), *rows.shape)), L)
+    path = view.paths(points)[..., :nodes]
+    mirrored = 2 * (path @ weights)[..., None] - path
+    like = np.concatenate([path[..., ::-1], mirrored, mirrored[..., ::-1]], axis=1)
+    back = like.reshape(len(like), -1, outputs * nodes)
+    away = back - view.paths(m[:, None])[..., :nodes].reshape(-1, 1, outputs * nodes)
+    weighted = B * precision[:, None]
+    H = batched.matmul(batched.transpose(weighted), B) + np.eye(B.shape[-1])
+    right = batched.matmul(away, weighted)
+    return np.asarray(np.linalg.solve(H, batched.transpose(right)).swapaxes(-1, -2))
+
+
+def with_more(found, axes, more):
+    """The same modes, and after them those that more starts of some axes led to."""
+    spread = modes.Modes.none(len(found.mean), *more.mean.shape[1:])
+    for room, new in zip(spread, more, strict=True):
+        room[axes] = new
+    return modes.Modes(*(np.concatenate(each, axis=1) for each in zip(found, spread, strict=True)))
+
+
+def innovations(view, prior, t, k):
+    """Innovations at points t (axes, n) in k directions: values, S^2, NIS, and e'e with e = R^(-1/2) (y - f)."""
+    L, s = cholesky(prior.covariance), whitened(prior, t[:, None])[:, 0]
+    f, J = view.linearised(t[:, None])
+    score, information = (each[:, 0] for each in view.information(f))
+    root = np.sqrt(information)
+    A = batched.matmul(J[:, 0] * root[..., None], L)
+    e = score / np.where(root > 0, root, 1.0)
+    values, V = np.linalg.eigh(batched.matmul(batched.transpose(A), A))
+    values, V = np.maximum(values[:, ::-1][:, :k], 0.0), V[:, :, ::-1][:, :, :k]
+    S = np.sqrt(values)
+    # The innovation is zero in a direction about which the pixels have no information.
+    tells = values > PROFILE.no_information * values[:, :1]
+    pull = batched.matvec(batched.transpose(batched.matmul(A, V)), e)
+    u = np.where(tells, pull / np.where(tells, S, 1.0), 0.0) + S * batched.matvec(batched.transpose(V), s)
+    return u, values, np.add.reduce(u * u / (1 + values), axis=1), batched.dot(e, e)
+
+
 def settled_modes(view, prior, starts):
-    """`find_modes` again from where it has ended, until a search leads next to nowhere."""
-    modes = find_modes(view, prior, starts)
+    """The modes again from where the search has ended, until it leads next to nowhere."""
+    search = find_modes if isinstance(view, PlainView) else modes.find_modes
+    found = search(view, prior, starts)
     for _ in range(4):
-        modes = find_modes(view, prior, whitened(prior, modes.mean))
-    return modes
+        found = search(view, prior, whitened(prior, found.mean))
+    return found
 
 
 def importance_corrected(view, prior, proposal, share, enough):

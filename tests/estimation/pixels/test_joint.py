@@ -76,7 +76,7 @@ def frame(rig: Rig) -> Frame:
     return Frame(model, exposures[2], windows, Gaussian(estimate.end_state, estimate.end_covariance))
 
 
-def dense_view(rig: Rig, frame: Frame, paths: JointPaths) -> PixelView:
+def dense_view(rig: Rig, frame: Frame, paths: JointPaths) -> PlainView:
     """The same pixels with a dense basis of the same coefficients and nodes."""
     model, size = frame.model, paths.size
     reduced = Reduction(
@@ -84,7 +84,7 @@ def dense_view(rig: Rig, frame: Frame, paths: JointPaths) -> PixelView:
         end_remainder=model.end_remainder, widening=paths.widening, resolution=paths.resolution,
     )  # fmt: skip
     (level,) = paths.resolution.of(frame.response.path).tolist()
-    view: PixelView = PlainView.of(PixelView(rig.sensor, model, frame.response, frame.windows, reduced, level))
+    view: PlainView = PlainView.of(PixelView(rig.sensor, model, frame.response, frame.windows, reduced, level))
     return view
 
 

@@ -181,7 +181,7 @@ def test_a_path_and_its_reversal_are_two_readings():
     assert update.several[0]
     modes, _ = explored(view, single(state))
     there = np.isfinite(modes.log_evidence[0])
-    ends = view.paths(modes.mean)[0, there][:, 0, [0, -1]]
+    ends = PlainView.of(view).paths(modes.mean)[0, there][:, 0, [0, -1]]
     evidence = modes.log_evidence[0, there]
     forth, back = evidence[ends[:, 1] > ends[:, 0]].max(), evidence[ends[:, 1] < ends[:, 0]].max()
     assert abs(forth - back) < 3.0
@@ -383,7 +383,7 @@ def test_the_posterior_of_a_single_coefficient_is_an_integral_over_a_line():
     view, state = seen(dataclasses.replace(RIG, plant=plant), width=0.5)
     assert view.reduced.size == 1
     t = np.linspace(-3, 3, 60_001)
-    log = view.log_likelihoods(t[None, :, None])[0] - 0.5 * t**2 / state.covariance[0, 0, 0]
+    log = PlainView.of(view).log_likelihoods(t[None, :, None])[0] - 0.5 * t**2 / state.covariance[0, 0, 0]
     w = np.exp(log - log.max())
     w /= w.sum()
     mean = w @ t

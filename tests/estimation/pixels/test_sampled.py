@@ -93,7 +93,7 @@ def test_other_particles_and_twice_as_many_say_the_same():
 
 def functions(view, t):
     """Start state, first noise coefficient, and one that is not linear: the path's spread."""
-    return np.stack([t[:, 0], t[:, 1], t[:, 2], view.paths(t[None])[0, :, 0].std(axis=1)])
+    return np.stack([t[:, 0], t[:, 1], t[:, 2], PlainView.of(view).paths(t[None])[0, :, 0].std(axis=1)])
 
 
 def ranks(count, particles, seed=5):
