@@ -1,11 +1,11 @@
-"""A quantity that wanders: copies of an estimator at several values of it, weighted by the likelihood of the frames.
+"""A frequency that wanders: copies of an estimator at several values of it, weighted by the likelihood of the frames.
 
-Each copy has one relative value s of a frequency, a gain, a width or a noise. At a frequency s all motion of the plant
-runs s times as fast with the same spread: A -> A^s, and a process noise that leaves the stationary covariance as it
-is. The value is a Markov chain over the copies, a random walk in log s. Each copy is weighted by the likelihood of each
-frame under it (multiple models: Magill, IEEE Trans. Autom. Control 10 (1965); with a chain over them: Blom, Bar-Shalom,
-ibid. 33 (1988)). States are not mixed between copies, as the latter do: since the plant forgets its state, each copy's
-estimate follows from its own value, and each copy can keep a Gaussian mixture as well as a Gaussian.
+Each copy has one relative frequency s, at which all motion of the plant runs s times as fast with the same spread: A ->
+A^s, and a process noise that leaves the stationary covariance as it is. The value is a Markov chain over the copies, a
+random walk in log s. Each copy is weighted by the likelihood of each frame under it (multiple models: Magill, IEEE
+Trans. Autom. Control 10 (1965); with a chain over them: Blom, Bar-Shalom, ibid. 33 (1988)). States are not mixed
+between copies, as the latter do: since the plant forgets its state, each copy's estimate follows from its own
+frequency, and each copy can keep a Gaussian mixture as well as a Gaussian.
 
 Each axis has a value of its own. An estimate is the mixture of the copies' estimates, by its mean and covariance.
 Its path is written in the basis of the plant as it is in the rig file, so a recording needs no other: the noise inside
@@ -17,7 +17,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from scipy import linalg
@@ -33,13 +32,11 @@ from aolink.numerics.arrays import FloatArray
 from aolink.numerics.block_diagonal import stationary_covariance
 from aolink.numerics.covariance import psd_root
 from aolink.plant.alike import MANY_STATES
-from aolink.rig import Plant, Rig, Wandering, Wanders
+from aolink.rig import Plant, Rig, Wandering
 
 # Neighbours are apart by this many damping ratios of the least damped resonance, as far as the number of copies allows.
 _APART = 2.0
 _FEWEST, _MOST = 9, 21
-# How far apart neighbours of the other quantities are in the logarithm, as far as the number of copies allows.
-_SPACING = {"gain": 0.05, "process_noise": 0.15, "kernel_width": 0.03, "sensor_noise": 0.05}
 # A frame's evidence is raised to this power: it is approximate, and not quite of the same windows in all copies, and
 # what is wrong in it would add up while a value stays where it is.
 _TRUST = 0.5
@@ -56,12 +53,14 @@ class WanderingEstimator(Estimator):
     def __init__(self, rig: Rig, make: Callable[[Rig], Estimator]) -> None:
         wandering = rig.plant.wandering
         assert wandering is not None
+        if wandering.parameter != "frequency":
+            raise EstimatorError(f"plant.wandering follows a frequency only, not {wandering.parameter}: leave it out")
         logs = _grid(rig.plant, wandering)
-        rigs = [at_value(rig, wandering.parameter, math.exp(each)) for each in logs]
+        rigs = [replace(rig, plant=at_frequency(rig.plant, math.exp(each))) for each in logs]
         self._each = [make(each) for each in rigs]
         nominal = self._each[len(logs) // 2]
         super().__init__(rig, nominal.name, nominal.filter)
-        self._copied = [part for each in rigs for part in (each, each.plant, each.sensor)]
+        self._copied = [part for each in rigs for part in (each, each.plant)]
         self._logs, self._wandering = logs, wandering
         self._log_weight = np.full((rig.plant.axes, len(logs)), -math.log(len(logs)))
         self._last_step: int | None = None
@@ -79,7 +78,7 @@ class WanderingEstimator(Estimator):
                 assert copy.posterior is not None
                 evidence.append(_evidence(copy.posterior))
             self.several = self._each[len(series) // 2].several
-            self._weigh(exposure.first_step, _nearest_known(np.stack(evidence, axis=1)))
+            self._weigh(exposure.first_step, np.stack(evidence, axis=1))
             yield self._combined(estimates)
 
     def _weigh(self, first_step: int, evidence: FloatArray) -> None:
@@ -117,28 +116,6 @@ class WanderingEstimator(Estimator):
         )  # fmt: skip
 
 
-def at_value(rig: Rig, parameter: Wanders, relative: float) -> Rig:
-    """A rig whose frequency, gain, width or noise is multiplied by a factor.
-
-    Raises EstimatorError: its plant cannot run faster or slower.
-    """
-    plant, sensor, kernel = rig.plant, rig.sensor, rig.sensor.kernel
-    if relative == 1.0:
-        return rig
-    if parameter == "frequency":
-        plant = at_frequency(plant, relative)
-    elif parameter == "gain":
-        plant = replace(plant, B=relative * plant.B)
-    elif parameter == "process_noise":
-        plant = replace(plant, process_noise=relative**2 * plant.process_noise)
-    elif parameter == "sensor_noise":
-        sensor = replace(sensor, noise_density=relative**2 * sensor.noise_density)
-    else:
-        matrix: Any = kernel.matrix and tuple(tuple(relative * each for each in row) for row in kernel.matrix)
-        sensor = replace(sensor, kernel=replace(kernel, sigma=relative * kernel.sigma, matrix=matrix))
-    return replace(rig, plant=plant, sensor=sensor)
-
-
 def at_frequency(plant: Plant, relative: float) -> Plant:
     """A plant whose motion is faster by a factor, with the same spread and the same static response.
 
@@ -171,12 +148,9 @@ def _grid(plant: Plant, wandering: Wandering) -> FloatArray:
             f"plant.wandering is for at most {MANY_STATES} states, this plant has {plant.n_states}: leave it out"
         )
     half = math.log1p(wandering.largest)
-    if wandering.parameter == "frequency":
-        rates = np.log(np.linalg.eigvals(plant.A).astype(complex))
-        damping = float((-rates.real / np.maximum(np.abs(rates), 1e-12)).min())
-        wanted = half / (_APART * max(damping, 1e-6))
-    else:
-        wanted = half / _SPACING[wandering.parameter]
+    rates = np.log(np.linalg.eigvals(plant.A).astype(complex))
+    damping = float((-rates.real / np.maximum(np.abs(rates), 1e-12)).min())
+    wanted = half / (_APART * max(damping, 1e-6))
     side = int(min(max(math.ceil(wanted), _FEWEST // 2), _MOST // 2))
     return np.asarray(half * np.arange(-side, side + 1) / side)
 
@@ -194,21 +168,8 @@ def _evidence(posterior: Posterior) -> FloatArray:
     return np.where(seen, -0.5 * (posterior.nis + sizes), np.nan)
 
 
-def _nearest_known(evidence: FloatArray) -> FloatArray:
-    """Evidence (axes, copies), replaced where it is not finite by that of the nearest copy with a finite one.
-
-    A copy with much noise, or a wide kernel, may see no spot where the others do; this is no evidence about its value.
-    """
-    known = np.isfinite(evidence)
-    places = np.arange(evidence.shape[1])
-    away = np.where(known[:, None, :], np.abs(places[:, None] - places), evidence.shape[1])
-    return np.take_along_axis(evidence, away.argmin(axis=2), axis=1)
-
-
 def _in_basis(nominal: Estimate, other: Estimate, tolerance: float) -> tuple[FloatArray, FloatArray]:
     """Mean and covariance of another copy's path as coefficients of the nominal basis."""
-    if other.model is nominal.model:  # the quantity that wanders belongs to the camera
-        return other.coefficients, other.coefficient_covariance
     model, theirs = nominal.model, other.model
     n = nominal.end_state.shape[1]
     own, basis = (each.basis.reshape(-1, each.n_coefficients) for each in (model, theirs))
