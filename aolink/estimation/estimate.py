@@ -11,7 +11,7 @@ from typing import Literal
 import numpy as np
 
 from aolink.estimation.model.base import ExposureModel
-from aolink.estimation.model.exposure_model import path_from_coefficients
+from aolink.estimation.model.exposure_model import path_of, path_sd_of
 from aolink.numerics.arrays import FloatArray, Indices
 from aolink.numerics.covariance import from_correlation_steps, in_correlation_steps, psd_root
 from aolink.plain import plain_data
@@ -143,15 +143,16 @@ class Estimate:
     """The drifting quantity, where the rig has ``plant.wandering`` and the estimator follows it; recordings do not have
     it."""
 
-    @property
+    @cached_property
     def path(self) -> FloatArray:
         """Output at each fast step of the exposure, slope units, (n_outputs, n_steps)."""
-        return self._unfolded[0]
+        return path_of(self.model, self.coefficients, self.inputs)
 
-    @property
+    @cached_property
     def path_sd(self) -> FloatArray:
         """Standard deviation of the path, slope units, (n_outputs, n_steps)."""
-        return self._unfolded[1]
+        sd = path_sd_of(self.model, self.coefficient_covariance, len(self.inputs))
+        return sd if self.alignment is None else np.hypot(sd, self.alignment_path())
 
     def path_covariance(self, outputs: Sequence[int] | None = None) -> FloatArray:
         """Covariance of the path over its fast steps, slope units squared.
@@ -180,15 +181,7 @@ class Estimate:
         if self.alignment is None:
             return np.zeros_like(self.path)
         rate = np.gradient(self.inputs, axis=0) if len(self.inputs) > 1 else np.zeros_like(self.inputs)
-        change, _ = path_from_coefficients(
-            self.model, self.alignment.coefficients, self.coefficient_covariance, self.alignment.steps * rate
-        )
-        return change
-
-    @cached_property
-    def _unfolded(self) -> tuple[FloatArray, FloatArray]:
-        path, sd = path_from_coefficients(self.model, self.coefficients, self.coefficient_covariance, self.inputs)
-        return (path, sd) if self.alignment is None else (path, np.hypot(sd, self.alignment_path()))
+        return path_of(self.model, self.alignment.coefficients, self.alignment.steps * rate)
 
 
 COMPARED = (*(each.name for each in fields(Estimate) if each.compare), "path", "path_sd")

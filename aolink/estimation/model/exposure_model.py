@@ -34,14 +34,22 @@ def path_from_coefficients(
 ) -> tuple[FloatArray, FloatArray]:
     """Path and its standard deviation, both (axes * n_outputs, n_steps), from coefficients of ``model.basis``, (axes,
     n_states) or more of its columns, their covariance, (axes, n, n), and the exposure's inputs, (n_steps, axes *
-    n_inputs).
-
-    An exposure of another length has a model of its own. Estimators and the reader of recordings both come here, so
-    that a recorded estimate unfolds to the bits that the estimator gave.
+    n_inputs). An exposure of another length has a model of its own.
     """
-    plant = model.plant
-    if len(inputs) != model.n_steps:
-        model = exposure_model(plant, len(inputs))
+    return path_of(model, coefficients, inputs), path_sd_of(model, covariance, len(inputs))
+
+
+def path_of(model: ExposureModel, coefficients: FloatArray, inputs: FloatArray) -> FloatArray:
+    """The path of `path_from_coefficients`; many times as fast as its standard deviation on a plant of many states."""
+    plant, model = model.plant, _of_length(model, len(inputs))
     input_path, _ = input_response(plant, by_axis(plant, numbers(inputs)))
-    shape = (plant.axes * plant.n_outputs, model.n_steps)
-    return model.path(coefficients, input_path).reshape(shape), model.path_sd(covariance).reshape(shape)
+    return model.path(coefficients, input_path).reshape(-1, model.n_steps)
+
+
+def path_sd_of(model: ExposureModel, covariance: FloatArray, n_steps: int) -> FloatArray:
+    """The standard deviation of `path_from_coefficients`."""
+    return _of_length(model, n_steps).path_sd(covariance).reshape(-1, n_steps)
+
+
+def _of_length(model: ExposureModel, n_steps: int) -> ExposureModel:
+    return model if n_steps == model.n_steps else exposure_model(model.plant, n_steps)
