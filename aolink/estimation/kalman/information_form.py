@@ -15,14 +15,9 @@ from aolink.numerics.single_thread import (
     congruence_one_thread,
     gram,
     information_matrix,
-    inverse_by_cholesky,
     matmul_one_thread,
     root_of_information,
 )
-
-# A gain settles within this many exposures, or there is none; relative changes of a covariance below this are rounding.
-_MOST_EXPOSURES = 1000
-_SETTLED = 1e-11
 
 
 def information_update(
@@ -62,21 +57,3 @@ def _updated(
         covariance = congruence_one_thread(keep, P) + matmul_one_thread(gain_R, np.ascontiguousarray(gain.T))
         covariance = symmetric(covariance)
     return mean + moved, covariance, S, nis
-
-
-def stepped_gain(A: FloatArray, H: FloatArray, Q: FloatArray, R: FloatArray) -> FloatArray | None:
-    """The gain that a Kalman filter settles at, (n_states, m); None where it does not settle.
-
-    The Riccati equation stepped from exposure to exposure: a second for 288 states of a plant that forgets its state
-    within a few exposures. R are blocks along the diagonal, (blocks, size, size).
-    """
-    blocks, size, _ = R.shape
-    weighted = np.asarray(np.linalg.solve(R, H.reshape(blocks, size, -1)), dtype=np.float64).reshape(len(H), -1)
-    information = matmul_one_thread(np.ascontiguousarray(H.T), weighted)
-    information, P = symmetric(information), Q
-    for _ in range(_MOST_EXPOSURES):
-        before, after = P, inverse_by_cholesky(information_matrix(P) + information)
-        P = symmetric(congruence_one_thread(A, after) + Q)
-        if np.abs(P - before).max() <= _SETTLED * np.abs(P).max():
-            return matmul_one_thread(after, np.ascontiguousarray(weighted.T))
-    return None

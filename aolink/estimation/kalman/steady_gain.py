@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy import linalg
 
-from aolink.estimation.kalman.information_form import stepped_gain
 from aolink.estimation.model.base import ExposureModel
 from aolink.numerics.arrays import FloatArray
-from aolink.plant.alike import MANY_STATES
+from aolink.numerics.batched import symmetric
+from aolink.numerics.single_thread import by_one_thread
 
+# Steps that double the number of exposures: what has not settled after a million does not. Relative changes of a
+# covariance below the second number are rounding.
+_DOUBLINGS = 20
+_SETTLED = 1e-13
 # The largest eigenvalue of a stable filter exceeds one by rounding at most.
 _ROUNDING = 1e-6
 
 
+@by_one_thread
 def steady_gain(model: ExposureModel, Q: FloatArray, R: FloatArray) -> FloatArray | None:
     """Steady-state gain of the centroid filter on the lifted plant (A^N, C-bar), (n_states, n_outputs).
 
@@ -21,33 +25,32 @@ def steady_gain(model: ExposureModel, Q: FloatArray, R: FloatArray) -> FloatArra
     has no stabilising solution: the centroid does not observe an eigenmode that does not decay. R is the covariance of
     the centroids as blocks along its diagonal, (blocks, size, size), or whole.
     """
-    H = model.mean_row
-    if R.ndim == 3 and H.shape[1] > MANY_STATES:
-        return stepped_gain(model.transition, H, Q, R)
-    if R.ndim == 3 and len(H) > H.shape[1]:
-        return _compressed_gain(model, Q, R)
-    return _riccati_gain(model.transition, H, Q, linalg.block_diag(*R) if R.ndim == 3 else R)
-
-
-def _compressed_gain(model: ExposureModel, Q: FloatArray, R: FloatArray) -> FloatArray | None:
-    """The gain of `steady_gain` for more outputs than states: of the whitened outputs only as many as there are states
-    carry information."""
-    root = np.linalg.cholesky(R)
-    blocks, size, _ = R.shape
-    white = np.linalg.solve(root, model.mean_row.reshape(blocks, size, -1)).reshape(blocks * size, -1)
-    rotation, H = np.linalg.qr(white)
-    gain = _riccati_gain(model.transition, H, Q, np.eye(len(H)))
-    rotated = np.linalg.solve(root.swapaxes(1, 2), rotation.reshape(blocks, size, -1)).reshape(blocks * size, -1)
-    return None if gain is None else np.asarray(gain @ rotated.T)
-
-
-def _riccati_gain(A: FloatArray, H: FloatArray, Q: FloatArray, R: FloatArray) -> FloatArray | None:
+    H, n = model.mean_row, model.mean_row.shape[1]
+    R = R if R.ndim == 3 else R[None]
+    weighted = np.linalg.solve(R, H.reshape(*R.shape[:2], n)).reshape(len(H), n)
+    information = symmetric(H.T @ weighted)
     try:
-        P = linalg.solve_discrete_are(A.T, H.T, Q, R)
-    except (np.linalg.LinAlgError, ValueError):
+        P = _settled_covariance(model.transition, information, Q)
+        gain = np.asarray(np.linalg.solve(np.eye(n) + P @ information, P @ weighted.T))
+        growth = np.abs(np.linalg.eigvals(model.transition @ (np.eye(n) - gain @ H))).max()
+    except np.linalg.LinAlgError:
         return None
-    gain = np.asarray(P @ H.T @ np.linalg.inv(H @ P @ H.T + R))
-    # A state that neither decays nor is driven by noise can make the solver return another solution than the
-    # stabilising one, without an error.
-    growth = np.abs(np.linalg.eigvals(A @ (np.eye(len(A)) - gain @ H))).max()
     return gain if growth <= 1 + _ROUNDING else None
+
+
+def _settled_covariance(A: FloatArray, information: FloatArray, Q: FloatArray) -> FloatArray:
+    """The covariance that predictions settle at, by the structure-preserving doubling algorithm (Chu, Fan, Lin, Wang,
+    Int. J. Control 77 (2004) 767): its k-th step is that of 2^k exposures.
+
+    Raises numpy.linalg.LinAlgError where there is none.
+    """
+    A, G, P = A.T, information, Q
+    with np.errstate(over="ignore", invalid="ignore"):
+        for _ in range(_DOUBLINGS):
+            left = np.linalg.solve(np.eye(len(A)) + G @ P, np.concatenate([A, G], axis=1))
+            through, kept = left[:, : len(A)], left[:, len(A) :]
+            before, P = P, symmetric(P + A.T @ P @ through)
+            A, G = A @ through, symmetric(G + A @ kept @ A.T)
+            if np.abs(P - before).max() <= _SETTLED * np.abs(P).max():
+                return P
+    raise np.linalg.LinAlgError("the covariance grows without end")

@@ -13,7 +13,6 @@ from aolink.estimation import SpotWindows, Status, exposure_model, make_estimato
 from aolink.estimation.frames.centroid_noise import centroid_covariance
 from aolink.estimation.frames.frame_data import Measurement
 from aolink.estimation.frames.measure import measure
-from aolink.estimation.kalman import information_form
 from aolink.estimation.kalman.gaussian import Gaussian
 from aolink.estimation.kalman.path_moments import predicted_moments
 from aolink.estimation.kalman.steady_gain import steady_gain
@@ -246,8 +245,13 @@ def test_the_gain_of_o1_solves_the_riccati_equation(small_membrane):
     P = linalg.solve_discrete_are(model.transition.T, H.T, model.process_noise, noise)
     np.testing.assert_allclose(gain, P @ H.T @ np.linalg.inv(H @ P @ H.T + noise), atol=1e-6 * np.abs(gain).max())
     # A plant that keeps what it is never shown: two actuators in the place of each, of which only sums are seen.
-    sums = np.repeat(np.eye(40), 2, axis=1)
-    assert information_form.stepped_gain(np.eye(80), sums, np.eye(80), np.tile(np.eye(2), (20, 1, 1))) is None
+    one = np.eye(80)
+    unseen = dataclasses.replace(
+        plant, A=one, B=one, B_w=one, C=np.repeat(np.eye(40), 2, axis=1), process_noise=one, initial_mean=np.zeros(80),
+        initial_covariance=one,
+    )  # fmt: skip
+    model = exposure_model(unseen, 4)
+    assert steady_gain(model, model.process_noise, np.tile(np.eye(2), (20, 1, 1))) is None
 
 
 @pytest.fixture(scope="module")
