@@ -4,8 +4,8 @@ plant.
 Whole-array calls for thousands of axes run through memory again and again; these loops keep one axis in the
 processor's cache (rows `moments_of_many_axes`, `profile_of_many_axes` and `membrane_in_real_time` of
 tools/bench). Each loop for line sensors and for spots has a twin in NumPy that tests compare
-it with: in `pixels.modes`, where spots on a plane use it, or in `plain.py` of `tests/estimation/pixels` and
-`tests/estimation/moments`. The loops for many spots of one plant are tested against
+it with, in `plain.py` of `tests/estimation/pixels` and `tests/estimation/moments`; the Kalman filter's is
+`kalman.filter.BlurFilter`. The loops for many spots of one plant are tested against
 the dense view of the same pixels. They hold no lock, so axes are shared among threads; the result for one axis does
 not depend on how many others there are, bit for bit.
 
