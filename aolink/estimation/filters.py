@@ -77,15 +77,15 @@ def moments(rig: Rig, options: Options) -> Filter:
 
 def _windowed(rig: Rig, options: Options) -> Observation[Any]:
     """Windowed moments of a line sensor, of spots, or of all spots of a plant with hundreds of states."""
-    orders, basis, flux, n_outputs = options.orders, options.basis, options.flux, rig.plant.n_outputs
+    orders, flux, n_outputs = options.orders, options.flux, rig.plant.n_outputs
     if n_outputs == 1:
         from aolink.estimation.moments.lines import WindowedMoments
 
-        return WindowedMoments(rig.sensor.profile, orders, basis=basis, flux=flux)
+        return WindowedMoments(rig.sensor.profile, orders, flux=flux)
     sensor = _spots(rig)
     if alike_systems(rig.plant) is not None:
-        return JointMoments(sensor, n_outputs, orders, basis=basis, flux=flux)
-    return WindowedSpots(sensor, n_outputs // 2, orders, basis=basis, flux=flux)
+        return JointMoments(sensor, n_outputs, orders, flux=flux)
+    return WindowedSpots(sensor, n_outputs // 2, orders, flux=flux)
 
 
 def _spots(rig: Rig) -> SpotSensor:

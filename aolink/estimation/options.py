@@ -8,7 +8,6 @@ from typing import Any, Literal, get_args, get_origin, get_type_hints
 from aolink.errors import EstimatorError
 from aolink.estimation.frames.frame_data import Flux
 from aolink.estimation.kalman.predict import Noise
-from aolink.estimation.moments.windowed import Basis
 
 Engine = Literal["aolink", "filterpy"]
 
@@ -37,9 +36,7 @@ class Options:
     their covariance is then right where the prior is as wide as the spot's motion, at the price of a weaker
     correction."""
     orders: tuple[int, ...] = (0, 1, 2, 3)
-    """Orders of the moments that `moments` takes, in its basis; 0 is the light in the window."""
-    basis: Basis = "monomial"
-    """Basis of `moments`: "monomial", "legendre" or "fourier"."""
+    """Orders of the moments that `moments` takes; 0 is the light in the window."""
     draws: int = 100
     """Points that `profile` draws for importance sampling, in per cent of the usual number: the budget of work. With 5
     an exposure takes a sixth of the time, the estimates have larger errors, and the log-evidence, which is not from
@@ -67,9 +64,15 @@ def with_options(text: str) -> tuple[str, dict[str, Any]]:
         key, given, value = each.partition("=")
         field = Options.__dataclass_fields__.get(key)
         if field is None:
-            raise EstimatorError(f"{text}: estimators have no option {key!r}: use {', '.join(_NAMES)}")
+            raise EstimatorError(f"{text}: {_no_option(key)}")
         options[key] = _read(text, key, field.default, value if given else "true")
     return name, options
+
+
+def _no_option(key: str) -> str:
+    if key == "basis":
+        return "moments are monomials: leave basis out"
+    return f"estimators have no option {key!r}: use {', '.join(_NAMES)}"
 
 
 def _read(text: str, key: str, default: object, value: str) -> object:
@@ -89,7 +92,7 @@ def checked_options(**options: Any) -> Options:
     """Options by their names. Raises EstimatorError: there is no such option, or it cannot have this value."""
     for key in options:
         if key not in _NAMES:
-            raise EstimatorError(f"estimators have no option {key!r}: use {', '.join(_NAMES)}")
+            raise EstimatorError(_no_option(key))
     chosen = Options(**options)
     for key, kind in get_type_hints(Options).items():
         if get_origin(kind) is Literal and getattr(chosen, key) not in (values := get_args(kind)):

@@ -26,10 +26,10 @@ def padded(count: int, group: int) -> int:
 
 @compiled
 def window_weights(
-    row: int, usable: BoolArray, first: float, end: float, pixel: float, orders: IntArray, functions: int,
+    row: int, usable: BoolArray, first: float, end: float, pixel: float, orders: IntArray,
     path: FloatArray, variance: FloatArray, path_reach: float, margin: float, W: FloatArray,
 ) -> None:  # fmt: skip
-    """Weights of the pixels in a window about the path: as `Windowed.window` and `Windowed.function`."""
+    """Weights of the pixels in a window about the path: as `Windowed.window`, monomials."""
     room = max(margin, 2.0 * pixel)
     low, high = math.inf, -math.inf
     for k in range(len(path)):
@@ -41,18 +41,7 @@ def window_weights(
         inside = left + pixel > low and left < high and usable[row, p]
         u = (left + pixel / 2.0 - (low + high) / 2.0) / ((high - low) / 2.0)
         for a in range(len(W)):
-            W[a, p] = _function(functions, orders[a], u) if inside else 0.0
-
-
-@compiled
-def _function(functions: int, order: int, u: float) -> float:
-    if functions == 2:
-        turn = math.pi * ((order + 1) // 2) * u
-        return math.sin(turn) if order % 2 else math.cos(turn)
-    before, value = 0.0, 1.0
-    for p in range(order):
-        before, value = value, u * value if functions == 0 else ((2 * p + 1) * u * value - p * before) / (p + 1)
-    return value
+            W[a, p] = u ** orders[a] if inside else 0.0
 
 
 @compiled

@@ -61,9 +61,7 @@ class Lines(NamedTuple):
     widening: float
     """Variance of the path about its nodes that no coefficient covers, slope units squared."""
     orders: IntArray
-    """Orders of the basis functions, (sums,)."""
-    functions: int
-    """Which they are: 0 monomials, 1 Legendre's polynomials, 2 sines and cosines."""
+    """Orders of the moments, (sums,)."""
     ratios: bool
     """Whether the sums are divided by the first one, the light in the window."""
 
@@ -111,7 +109,7 @@ def linearise(
             left, right,
         )  # fmt: skip
         window_weights(
-            row, lines.usable, lines.low, lines.high, lines.pixel, lines.orders, lines.functions, path, variance,
+            row, lines.usable, lines.low, lines.high, lines.pixel, lines.orders, path, variance,
             path_reach, kernel_reach * math.sqrt(lines.kernel_variance + lines.pixel * lines.pixel / 12.0), W,
         )  # fmt: skip
         light = lines.light[row]

@@ -20,7 +20,6 @@ from aolink.estimation.moments.windowed import (
     NOT_BELIEVED,
     PASSES,
     PATH_REACH,
-    Basis,
     error_memory,
     slowest,
 )
@@ -29,7 +28,6 @@ from aolink.numerics.workers import in_threads, thread_count
 from aolink.optics.camera import effective_noise_density
 from aolink.optics.sensor import Sensor
 
-_BASES: tuple[Basis, ...] = ("monomial", "legendre", "fourier")
 # With fewer axes a second thread costs more than it saves.
 _AXES_OF_A_THREAD = 16
 
@@ -37,16 +35,13 @@ _AXES_OF_A_THREAD = 16
 class WindowedMoments:
     """Windowed moments of line-sensor profiles, one output for each axis.
 
-    ``orders`` are those of the basis functions; 0 is the light in the window. ``basis`` and ``flux`` are as in
-    `Windowed`.
+    ``orders`` are those of the moments; 0 is the light in the window. ``flux`` is as in `Windowed`.
     """
 
     models_noise = True
 
-    def __init__(
-        self, sensor: Sensor, orders: Sequence[int] = (0, 1, 2, 3), *, basis: Basis = "monomial", flux: Flux = "known"
-    ) -> None:
-        self.sensor, self.basis, self.flux = sensor, basis, flux
+    def __init__(self, sensor: Sensor, orders: Sequence[int] = (0, 1, 2, 3), *, flux: Flux = "known") -> None:
+        self.sensor, self.flux = sensor, flux
         # A ratio to the light in the window needs the light first.
         self.orders = tuple(orders) if flux == "known" else (0, *(p for p in orders if p))
         self.n_measurements = len(self.orders) - (flux == "measured")
@@ -56,7 +51,7 @@ class WindowedMoments:
         """Iterated statistical linearisation, from the prior to the posterior."""
         nodes = quadrature_paths(model, response, equal_parts(model.n_steps, MOST_NODES))
         axes, n_states = len(prior.mean), len(model.transition)
-        lines = _lines(self.sensor, self.orders, self.basis, self.flux, nodes, measured, n_states, model.end_rows)
+        lines = _lines(self.sensor, self.orders, self.flux, nodes, measured, n_states, model.end_rows)
         mean, covariance = _contiguous(prior.mean), _contiguous(prior.covariance)
         fits = _no_fits(prior, self.n_measurements, n_states)
         rho = slowest(model.transition[None])
@@ -90,7 +85,7 @@ def updated(
     ``memory`` is the factor of the covariance of what the linearisation leaves out, (axes,), the same in all passes.
     """
     orders, n = (0, 1, 2, 3), prior.mean.shape[1]
-    lines = _lines(sensor, orders, "monomial", "known", nodes, measured, n, np.empty((0, n)))
+    lines = _lines(sensor, orders, "known", nodes, measured, n, np.empty((0, n)))
     fits, mean, covariance = _no_fits(prior, len(orders), 0), _contiguous(prior.mean), _contiguous(prior.covariance)
     for to_come in reversed(range(passes)):
         linearise(lines, mean, covariance, memory, PATH_REACH, KERNEL_REACH, not to_come, fits)
@@ -108,7 +103,7 @@ def _no_fits(prior: Gaussian, m: int, n_states: int) -> Fits:
 
 
 def _lines(
-    sensor: Sensor, orders: Sequence[int], basis: Basis, flux: Flux, nodes: QuadraturePaths, measured: Profile,
+    sensor: Sensor, orders: Sequence[int], flux: Flux, nodes: QuadraturePaths, measured: Profile,
     free: int, end_rows: FloatArray,
 ) -> Lines:  # fmt: skip
     """The frames for compiled code."""
@@ -121,7 +116,7 @@ def _lines(
         pixel=pixel, read_noise=effective_noise_density(sensor) * pixel,
         shot_noise=pixel / sensor.photoelectrons if sensor.photoelectrons else 0.0,
         kernel_variance=float(sensor.kernel.variance), widening=float(nodes.widening), orders=np.array(orders),
-        functions=_BASES.index(basis), ratios=flux == "measured",
+        ratios=flux == "measured",
     )  # fmt: skip
 
 

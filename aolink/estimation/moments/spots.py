@@ -20,7 +20,7 @@ import numpy as np
 from aolink.estimation.frames.frame_data import HALF, Flux, Needs, SpotWindows
 from aolink.estimation.kalman.gaussian import Gaussian
 from aolink.estimation.model.quadrature import QuadraturePaths
-from aolink.estimation.moments.windowed import Basis, Regression, Windowed, expected_response, weighted_sums
+from aolink.estimation.moments.windowed import Regression, Windowed, expected_response, weighted_sums
 from aolink.numerics import batched
 from aolink.numerics.arrays import BoolArray, FloatArray
 from aolink.optics.sensor import SpotSensor
@@ -38,16 +38,15 @@ class WindowedSpots(Windowed[SpotWindows]):
     """Windowed moments of all spots that one copy of the plant moves; its outputs are spot 0's x and y, spot 1's x and
     y, ...
 
-    ``orders`` says which functions of the basis, along x and along y; 0 is the light in the window. The product of both
-    directions' first functions belongs to the sums as well, y_11. Basis and flux are as in `Windowed`.
+    ``orders`` are those of the moments along x and along y; 0 is the light in the window. The first along both belongs
+    to the sums as well, y_11. Flux is as in `Windowed`.
     """
 
     most_nodes = _MOST_NODES
 
     def __init__(
-        self, sensor: SpotSensor, spots: int, orders: Sequence[int] = (0, 1, 2, 3), *, basis: Basis = "monomial",
-        flux: Flux = "known",
-    ) -> None:  # fmt: skip
+        self, sensor: SpotSensor, spots: int, orders: Sequence[int] = (0, 1, 2, 3), *, flux: Flux = "known"
+    ) -> None:
         self.sensor, self.spots = sensor, spots
         beyond = [p for p in orders if p]
         light = [(0, 0)] if flux == "measured" or 0 in orders else []
@@ -55,7 +54,7 @@ class WindowedSpots(Windowed[SpotWindows]):
         each = len(self.orders)
         lights = [k * each for k in range(spots)]
         self.needs = Needs(what="windows", least_usable=HALF)
-        super().__init__(basis, flux, lights=lights, light_of=[k for k in lights for _ in range(each)])
+        super().__init__(flux, lights=lights, light_of=[k for k in lights for _ in range(each)])
 
     def look(
         self, nodes: QuadraturePaths, about: Gaussian, measured: SpotWindows
@@ -83,7 +82,7 @@ class WindowedSpots(Windowed[SpotWindows]):
         for direction, good in enumerate((good_columns, good_rows)):
             place, width = (each[..., direction].reshape(-1, mean.shape[2]) for each in (mean, variance))
             u, inside = self.window(line, kernel[direction, direction], place, width, good.reshape(-1, good.shape[-1]))
-            functions = [self.function(order[direction], u) * inside for order in self.orders]
+            functions = [u ** order[direction] * inside for order in self.orders]
             out.append(np.stack(functions, axis=1).reshape(*mean.shape[:2], len(self.orders), -1))
         return out[0], out[1]
 

@@ -2,7 +2,7 @@
 
 Line sensors have compiled code for it (`aolink.estimation.moments.lines`); the class here is for spots on a plane.
 
-A moment, in any basis and with any window or mask, is a weighted sum of pixels, y = sum_i W_i Y_i D. A
+A moment, with any window or mask, is a weighted sum of pixels, y = sum_i W_i Y_i D. A
 spot resting at theta makes g(theta) = sum_i W_i (kernel integrated over pixel i) of it, so that
 E[y | path] = mean_k g(theta_k) holds with kernel, pixels, window and mask all in it: there is no bias to remove.
 
@@ -26,7 +26,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Generic, Literal, TypeVar
+from typing import Generic, TypeVar
 
 import numpy as np
 
@@ -41,8 +41,6 @@ from aolink.numerics.arrays import BoolArray, FloatArray
 from aolink.optics.camera import effective_noise_density
 from aolink.optics.kernel import gaussian_below
 from aolink.optics.sensor import BaseSensor, Sensor
-
-Basis = Literal["monomial", "legendre", "fourier"]
 
 PASSES = 3
 # Half width of the window beyond the path's mean, in standard deviations of the path, and of the kernel beyond that.
@@ -77,9 +75,6 @@ class Windowed(ABC, Generic[Data]):
 
     Parameters
     ----------
-    basis:
-        Functions of u in [-1, 1] across the window: "monomial" u^p, "legendre" P_p(u), or "fourier", where
-        orders 2q - 1 and 2q are sin(pi q u) and cos(pi q u).
     flux:
         "known": the light of a frame sums to one; "measured": all is divided by the light in the window,
         and order 0 left out.
@@ -94,8 +89,8 @@ class Windowed(ABC, Generic[Data]):
     most_memory = MOST_MEMORY
     """Bound of `error_memory`; with 1, errors of an exposure count as independent of those before."""
 
-    def __init__(self, basis: Basis, flux: Flux, lights: Sequence[int], light_of: Sequence[int]) -> None:
-        self.basis, self.flux = basis, flux
+    def __init__(self, flux: Flux, lights: Sequence[int], light_of: Sequence[int]) -> None:
+        self.flux = flux
         self._lights, self._light_of = list(lights), np.array(light_of)
         self.n_measurements = len(light_of) - (len(self._lights) if flux == "measured" else 0)
 
@@ -158,15 +153,6 @@ class Windowed(ABC, Generic[Data]):
         edges = sensor.edges
         inside = (edges[1:] > low[:, None]) & (edges[:-1] < high[:, None]) & mask
         return (sensor.centres - (low + high)[:, None] / 2) / ((high - low)[:, None] / 2), inside
-
-    def function(self, order: int, u: FloatArray) -> FloatArray:
-        """The basis' function of an order, (...) -> (...)."""
-        if self.basis == "fourier":
-            turn = np.pi * ((order + 1) // 2) * u
-            return np.asarray(np.sin(turn) if order % 2 else np.cos(turn))
-        if self.basis == "monomial":
-            return np.asarray(u**order)
-        return np.asarray(np.polynomial.legendre.legval(u, np.eye(order + 1)[order]))
 
     def ratios(self, y: FloatArray, noise: FloatArray, fit: Regression) -> tuple[FloatArray, FloatArray, Regression]:
         """All sums divided by the light that belongs to each, to first order."""

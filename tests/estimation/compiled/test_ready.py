@@ -164,7 +164,7 @@ def test_nothing_is_compiled_in_a_session():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["moments", "moments:flux=measured,basis=fourier"])
+@pytest.mark.parametrize("name", ["moments", "moments:flux=measured"])
 def test_nothing_is_compiled_in_a_session_of_moments(name):
     before, after, _ = first_session("section-vi-lively", name, 0.003, 4)
     assert before == after > 1

@@ -11,10 +11,10 @@ from aolink.numerics import batched
 class PlainMoments(Windowed[Profile]):
     """`WindowedMoments` with the arithmetic of `Windowed`."""
 
-    def __init__(self, sensor, orders=(0, 1, 2, 3), *, basis="monomial", flux="known"):
-        twin = WindowedMoments(sensor, orders, basis=basis, flux=flux)
+    def __init__(self, sensor, orders=(0, 1, 2, 3), *, flux="known"):
+        twin = WindowedMoments(sensor, orders, flux=flux)
         self.sensor, self.orders, self.needs = twin.sensor, twin.orders, twin.needs
-        super().__init__(basis, flux, lights=[0], light_of=[0] * len(self.orders))
+        super().__init__(flux, lights=[0], light_of=[0] * len(self.orders))
 
     def look(self, nodes, about, measured):
         """The weighted sums, their noise, and their regression on the coefficients."""
@@ -28,7 +28,7 @@ class PlainMoments(Windowed[Profile]):
     def window_weights(self, mean, variance, mask):
         """Weights of the pixels about a path, (axes, sums, pixels), from its mean and variance, both (axes, nodes)."""
         u, inside = self.window(self.sensor, self.sensor.kernel.variance, mean, variance, mask)
-        return np.stack([self.function(p, u) * inside for p in self.orders], axis=1)
+        return np.stack([u**p * inside for p in self.orders], axis=1)
 
     def regression(self, W, mean, spread, basis, weights, widening=0.0):
         """Regression of the weighted sums on the coefficients.
