@@ -89,10 +89,11 @@ def candidates(space: Space, found: Sequence[Maximum], seen: Sequence[Readings])
 
     A candidate whose vibrations never change loses against any other alias with some damping as soon as the true
     vibration has changed, although its frequency is right. So where a maximum's vibrations last for longer than the
-    recording, the other takes its place; where they last for less, both are candidates.
+    recording, the other takes its place; where they last for less, both are candidates. The other's further parameters
+    are those that then maximise the likelihood of readings.
     """
     whole = max(each.slots * each.period_steps * each.step_s for each in seen)
-    out = []
+    of, out = [Likelihood(each, SHORT_RUN) for each in seen], []
     for each in found:
         x = each.x.copy()
         lasting = False
@@ -104,7 +105,8 @@ def candidates(space: Space, found: Sequence[Maximum], seen: Sequence[Readings])
         if not lasting:
             out.append(Candidate(each.x, each))
         if (x != each.x).any():
-            out.append(Candidate(x, each))
+            fixed = [at for k in space.vibrations for at in (k, k + 1)]
+            out.append(Candidate(climb(space, x, of, _NEAR_ENOUGH, fixed).x, each))
     return out
 
 

@@ -138,7 +138,7 @@ def test_a_maximum_whose_vibration_lasts_for_longer_than_the_recording_is_tried_
     np.testing.assert_allclose([math.exp(each.x[3]) for each in found], expected)
     for each in found:
         assert each.maximum is at
-        np.testing.assert_array_equal(np.delete(each.x, 3), np.delete(at.x, 3))
+        assert each.x[2] == pytest.approx(at.x[2])
 
 
 @pytest.mark.rare
