@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
-from aolink.control.controller import Seen
+from aolink.control.controller import ControllerRow, Seen
 from aolink.control.modes import MirrorModes, response_at_rest
 from aolink.numerics.arrays import FloatArray
 from aolink.rig import Rig
@@ -31,3 +33,12 @@ class Integrator:
 
     def step(self, held: FloatArray) -> FloatArray:
         return self._u
+
+
+INTEGRATOR = ControllerRow(
+    name="integrator", summary="leaky integrator on the centroids, modal", build=Integrator, needs_state=False
+)
+STILL = ControllerRow(
+    name="still", summary="holds the safe input", needs_state=False,
+    build=lambda rig: Integrator(replace(rig, control=replace(rig.control, gain=0.0, leak=1.0))),
+)  # fmt: skip

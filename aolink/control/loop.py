@@ -12,7 +12,7 @@ import numpy as np
 from aolink.control.checked import CheckedController
 from aolink.control.controller import ControllerRow, Seen
 from aolink.control.drift import Fit, FitMonitor
-from aolink.control.fall_back import ControllerChange, FallBack
+from aolink.control.fall_back import FallBack
 from aolink.control.registry import find_controller
 from aolink.estimation import Estimate, Needs, Status
 from aolink.estimation.frames.measure import measure
@@ -63,8 +63,8 @@ class Act:
     acting: str
     """The controller that acts: another one while the loop's own is worse (`FallBack`)."""
     gained: float
-    """Where the acting controller has changed with this exposure, the reduction of the slopes with it, as a share of
-    their root mean square; NaN otherwise."""
+    """Where another controller acts from this exposure on because it is better, the reduction of the slopes with it, as
+    a share of their root mean square; NaN otherwise."""
 
 
 def centroids(rig: Rig, exposure: Exposure) -> FloatArray:
@@ -182,7 +182,7 @@ class ControlLoop:
         pending = np.array(self._held[max(end - self._oldest, 0) : first - self._oldest]).reshape(-1, len(self._park))
         if estimate is not None:
             self.fit = self._monitor.add(estimate)
-        change = self._compare(exposure, slopes, estimate)
+        gained = self._compare(exposure, slopes)
         if self.state is State.CLOSED and len(pending):
             state = None if estimate is None else estimate.end_state
             self._controller.see(Seen(slopes=slopes, state=state, pending=pending))
@@ -194,8 +194,7 @@ class ControlLoop:
             late=first > end + self.delay_steps, state=self.state, reason=self.reason,
             slope_rms=rms(slopes[np.isfinite(slopes)]),
             path_rms=math.nan if estimate is None else rms(estimate.path[np.isfinite(estimate.path)]),
-            clipped_steps=clipped, fit=self.fit, acting=self.acting,
-            gained=math.nan if change is None else change.gained,
+            clipped_steps=clipped, fit=self.fit, acting=self.acting, gained=gained,
         )  # fmt: skip
 
     @property
@@ -210,17 +209,18 @@ class ControlLoop:
             self._trusted = 0
         self.reason = reason
 
-    def _compare(self, exposure: Exposure, slopes: FloatArray, estimate: Estimate | None) -> ControllerChange | None:
-        """Let another controller act where this one is worse, or this one again where it is better."""
+    def _compare(self, exposure: Exposure, slopes: FloatArray) -> float:
+        """Let another controller act where this one is worse, or this one again; what is gained, NaN where unknown."""
         if self._fall_back is None:
-            return None
+            return math.nan
         if self.state is not State.CLOSED or not self._seen_any:
             self._fall_back.interrupt()
-            return None
-        change = self._fall_back.see(exposure, slopes, estimate, self.fit)
-        if change is not None:
-            self._controller = self._fall_back.controller()
-        return change
+            return math.nan
+        gained = self._fall_back.see(exposure, slopes, self.fit)
+        if gained is None:
+            return math.nan
+        self._controller = self._fall_back.controller()
+        return gained
 
     def _judge(self, slopes: FloatArray, estimate: Estimate | None, end: int) -> None:
         """Decide whether the loop is closed, from the quality of this exposure's measurement."""

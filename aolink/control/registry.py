@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from aolink.control.checked import refusal
 from aolink.control.controller import ControllerRow
-from aolink.control.fall_back import INTEGRATOR
+from aolink.control.integrator import INTEGRATOR
 from aolink.control.lqg import LQG
 from aolink.errors import ControlError
 from aolink.extensions import names_with, row_named

@@ -66,13 +66,14 @@ class ShortRuns:
 
 
 class Likelihood:
-    """Log-likelihood of readings, for many models one after the other, by short runs of ``length`` exposures.
+    """Log-likelihood of readings, for many models one after the other, by equal short runs of at most ``length``
+    exposures.
 
     All outputs of the readings have one model, of which each output is an independent draw.
     """
 
     def __init__(self, seen: Readings, length: int) -> None:
-        self.seen, self.length = seen, min(length, seen.slots)
+        self.seen, self.length = seen, -(-seen.slots // -(-seen.slots // length))
         self._short_runs: dict[int, list[ShortRuns]] = {}
         self._means: dict[int, list[tuple[BoolArray, Indices, FloatArray]]] = {}
         good = seen.usable
@@ -155,9 +156,9 @@ class Likelihood:
                 table[0] += weights @ process.covariance(np.abs(at[:, None] - at)) @ weights
         sigma = linalg.toeplitz(table)
         if walk := _walk(model):
-            inside = walk * (np.minimum(at[:, None], at) @ weights @ weights - weights @ at)
+            within = walk * (np.minimum(at[:, None], at) @ weights @ weights - weights @ at)
             sigma += walk * (np.minimum(begin[:, None], begin) + weights @ at) + _WALK_START * seen.reach**2
-            sigma[np.diag_indices(run)] += inside
+            sigma[np.diag_indices(run)] += within
         top, count = np.zeros(len(out)), np.zeros(len(out))
         whitened = []
         for usable, output, y in self._in_long_runs(nodes, run):
@@ -199,13 +200,13 @@ class Likelihood:
         apart = np.arange(len(usable))[:, None] - np.arange(len(usable))
         earlier, later = (np.tensordot(weights, table, axes=(0, axis)) for axis in (2, 1))
         with_means = np.where((apart > 0)[:, :, None], later[np.abs(apart)], earlier[np.abs(apart)])
-        own = np.broadcast_to(table[0], (len(usable), *table.shape[1:]))
+        inside = np.broadcast_to(table[0], (len(usable), *table.shape[1:]))
         if walk := _walk(model):
             times = begin[:, None] + at
             shared = np.minimum(times[:, :, None, None], times) + _WALK_START * seen.reach**2 / walk
             with_means = with_means + walk * np.tensordot(weights, shared, axes=(0, 1))
-            own = own + walk * np.einsum("jajb->jab", shared)
-        return _GivenMeans(with_means, own, weights, usable, noise * self.mean_noise)
+            inside = inside + walk * np.einsum("jajb->jab", shared)
+        return _GivenMeans(with_means, inside, weights, usable, noise * self.mean_noise)
 
 
 def _stationary(model: DisturbanceProcesses, apart: FloatArray, at: FloatArray) -> FloatArray:
@@ -228,10 +229,10 @@ def _walk(model: DisturbanceProcesses) -> float:
 
 class _GivenMeans:
     """The path in a short run of exposures, given its means over them, from ``with_means``, Cov(y_i, path in exposure
-    j), (L, L, nodes), and ``own``, the covariance of the path in each exposure, (L, nodes, nodes)."""
+    j), (L, L, nodes), and ``inside``, the covariance of the path in each exposure, (L, nodes, nodes)."""
 
     def __init__(
-        self, with_means: FloatArray, own: FloatArray, weights: FloatArray, usable: BoolArray, mean_noise: float
+        self, with_means: FloatArray, inside: FloatArray, weights: FloatArray, usable: BoolArray, mean_noise: float
     ) -> None:
         self.weights, self.good = weights, np.flatnonzero(usable)
         over = with_means[np.ix_(self.good, self.good)]
@@ -241,7 +242,7 @@ class _GivenMeans:
         flat = over.reshape(len(self.good), -1)
         gain = linalg.solve_triangular(self.root, flat, lower=True, check_finite=False)
         self.gain = gain.reshape(over.shape)
-        S = own[self.good] - np.einsum("ija,ijb->jab", self.gain, self.gain, optimize=True)
+        S = inside[self.good] - np.einsum("ija,ijb->jab", self.gain, self.gain, optimize=True)
         root_w = np.sqrt(weights)
         self.S = S * root_w[:, None] * root_w
         """S of each exposure, multiplied by the square roots of the nodes' weights on both sides, (good, nodes,

@@ -58,8 +58,8 @@ class Covariance(ABC):
 
     @property
     @abstractmethod
-    def shares(self) -> ComplexArray:
-        """The share of each pole in the stationary covariance, slope units squared."""
+    def residues(self) -> ComplexArray:
+        """The residue of the stationary covariance at each pole, slope units squared."""
 
     @property
     @abstractmethod
@@ -73,20 +73,20 @@ class Covariance(ABC):
 
     def covariance(self, lag_s: FloatArray) -> FloatArray:
         """Cov(theta(t), theta(t + lag)) of a stationary process, lags at least zero, shape of ``lag_s``."""
-        return np.asarray((self.shares * np.exp(self.poles * lag_s[..., None])).sum(axis=-1).real)
+        return np.asarray((self.residues * np.exp(self.poles * lag_s[..., None])).sum(axis=-1).real)
 
     def covariance_across(self, apart_s: FloatArray, at_s: FloatArray) -> FloatArray:
         """Cov(theta(t + at_b), theta(t + apart + at_a)), (m, k, k), a first, for times (m,) and (k,), s; ``apart`` is
         more than all differences of ``at``."""
         poles = self._tamed(at_s)
-        inside = self.shares[:, None, None] * np.exp(poles[:, None, None] * (at_s[:, None] - at_s))
+        inside = self.residues[:, None, None] * np.exp(poles[:, None, None] * (at_s[:, None] - at_s))
         return np.asarray(np.tensordot(np.exp(np.outer(apart_s, poles)), inside, axes=1).real)
 
     def covariance_of_means(self, apart_s: FloatArray, at_s: FloatArray, weights: FloatArray) -> FloatArray:
         """The covariance of means with these ``weights`` over ``at``, (m,)."""
         poles = self._tamed(at_s)
         means = np.exp(np.outer(poles, at_s)) @ weights, np.exp(-np.outer(poles, at_s)) @ weights
-        return np.asarray((np.exp(np.outer(apart_s, poles)) @ (self.shares * means[0] * means[1])).real)
+        return np.asarray((np.exp(np.outer(apart_s, poles)) @ (self.residues * means[0] * means[1])).real)
 
     def _tamed(self, at_s: FloatArray) -> ComplexArray:
         """The poles, limited so that none decays within ``at`` so fast that its inverse overflows."""
@@ -147,10 +147,10 @@ class Process(Covariance):
         return self["sd"] ** 2
 
     @cached_property
-    def shares(self) -> ComplexArray:
-        poles = self.poles  # shares are proportional to 1 / (a'(lambda) a(-lambda))
-        shares = np.array([1 / (np.prod(p - np.delete(poles, k)) * np.prod(-p - poles)) for k, p in enumerate(poles)])
-        return np.asarray(shares * (self.variance / shares.sum().real))
+    def residues(self) -> ComplexArray:
+        poles = self.poles  # residues are proportional to 1 / (a'(lambda) a(-lambda))
+        residues = np.array([1 / (np.prod(p - np.delete(poles, k)) * np.prod(-p - poles)) for k, p in enumerate(poles)])
+        return np.asarray(residues * (self.variance / residues.sum().real))
 
 
 @dataclass(frozen=True)

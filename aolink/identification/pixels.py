@@ -16,7 +16,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cache
 
 import numpy as np
 
@@ -25,14 +25,12 @@ from aolink.estimation import Estimator, make_estimator
 from aolink.exposure import Exposure
 from aolink.identification.likelihood import Likelihood
 from aolink.identification.readings import Readings
-from aolink.identification.search import SHORT_RUN, Maximum, Space, climb
+from aolink.identification.search import DECAY, KEPT, SHORT_RUN, SPACING, Maximum, Space, climb, scan, starting_points
 from aolink.numerics.arrays import FloatArray
-from aolink.numerics.workers import in_threads
 from aolink.rig import Rig
 
-_ESTIMATOR = "profile"
-_QUICK = f"{_ESTIMATOR}:draws=5"
-"""With few points, which cost most of the rest: enough to decide between candidates."""
+_ESTIMATOR = "profile:draws=5"
+"""With few points, which cost most of the rest and of which the evidence is not made."""
 _RULED_OUT = 30.0
 """Nats by which a candidate is behind where it is left out: the evidence is approximate."""
 _MOST = 10.0
@@ -41,22 +39,18 @@ _SETTLED = 4
 """Exposures at the beginning that do not count: every filter first has to find its state."""
 _ENOUGH = 256
 """Exposures after which candidates that are still alike are left as they are."""
-_DECAY = 1 / 8
-"""Decay time of the vibration of a candidate beside a maximum, in lengths of the recording."""
 _ALIKE = 3.0
 """Such a candidate is not made where the maximum's own damping is within this factor."""
 _LASTING, _LEAST_CYCLES = 3.0, 0.25
-"""How long the vibrations of a scan's first round last, in exposures, and its lowest frequency, in cycles an exposure:
-below that, centroids show the frequency."""
-_SPACING = 0.15
-"""Distance of a scan's frequencies, in cycles in the time that its vibrations last: half of a resonance's width."""
+"""How long the vibrations of a scan last at first, in exposures, and its lowest frequency, in cycles an exposure: below
+that, centroids show the frequency."""
 _PEAKS = 4
-"""Most frequencies of a round of a scan, each better than its neighbours, about which the next one looks."""
+"""Most frequencies of the scan, each better than its neighbours, about which vibrations that last longer are tried."""
 _NEAR_ENOUGH = 0.1
 """Nats to which a scan maximises the likelihood of readings."""
 _STAYED = 0.02
 """A maximum of the likelihood of readings belongs to a frequency of a scan if it differs by less than this share."""
-_AROUND = np.arange(-2.0, 3.0)
+_AROUND = np.array([-1.5, 0.0, 1.5])
 """Steps from a parameter at which the evidence is compared."""
 _MOVES = 3
 """How often a parameter is moved at most: again where the best is at an end of these steps."""
@@ -95,22 +89,24 @@ def candidates(space: Space, found: Sequence[Maximum], seen: Sequence[Readings])
 
     A candidate whose vibrations never change loses against any other alias with some damping as soon as the true
     vibration has changed, although its frequency is right. So where a maximum's vibrations last for longer than the
-    recording, the other takes its place; where they last for less, both are candidates.
+    recording, the other takes its place; where they last for less, both are candidates. The other's further parameters
+    are those that then maximise the likelihood of readings.
     """
     whole = max(each.slots * each.period_steps * each.step_s for each in seen)
-    out = []
+    of, out = [Likelihood(each, SHORT_RUN) for each in seen], []
     for each in found:
         x = each.x.copy()
         lasting = False
-        for k in _frequencies(space):
-            damping = -math.log(2 * math.pi * _DECAY * whole) - x[k]
-            lasting |= x[k + 1] < damping + math.log(_DECAY)
+        for k in space.vibrations:
+            damping = -math.log(2 * math.pi * DECAY * whole) - x[k]
+            lasting |= x[k + 1] < damping + math.log(DECAY)
             if abs(damping - x[k + 1]) > math.log(_ALIKE):
                 x[k + 1] = np.clip(damping, *space.bounds[k + 1])
         if not lasting:
             out.append(Candidate(each.x, each))
         if (x != each.x).any():
-            out.append(Candidate(x, each))
+            fixed = [at for k in space.vibrations for at in (k, k + 1)]
+            out.append(Candidate(climb(space, x, of, _NEAR_ENOUGH, fixed).x, each))
     return out
 
 
@@ -120,9 +116,9 @@ def scanned(
 ) -> Scan:  # fmt: skip
     """Candidates for each vibration of a sum at the frequencies that the pixels prefer, wherever the maxima are.
 
-    In the first round vibrations last for three exposures, so that their frequencies may be far apart; at each
-    frequency the other parameters are those that maximise the likelihood of readings. In each further round they last
-    twice as long, up to an eighth of the recording, at half the distance, beside the frequencies that are left.
+    First vibrations last for three exposures, so that their frequencies may be far apart; at each frequency the other
+    parameters are those that maximise the likelihood of readings. About the best of them vibrations that last an eighth
+    of the recording are tried.
 
     There is no candidate for a vibration that is alone, which `maxima` finds, and where `profile` cannot work on the
     rig. The parameters are those of `candidates`; the highest maximum of ``found`` comes first.
@@ -131,72 +127,48 @@ def scanned(
     if len(space.kinds) < 2 or not exposures:
         return out
     try:
-        make_estimator(rig_of(found[0].x), _QUICK)
+        make_estimator(rig_of(found[0].x), _ESTIMATOR)
     except EstimatorError:
         return out
-    for k in _frequencies(space):
-        best, out.left[k] = _scan(space, k, found, seen, rig_of, exposures, tell)
-        out.candidates.extend(best)
+    of = [Likelihood(each, SHORT_RUN) for each in seen]
+    period_s, exposure_s = (steps * seen[0].step_s for steps in (seen[0].period_steps, seen[0].n_steps))
+    beside = [*found[:_PEAKS], *starting_points(space, seen, of)]
+
+    def judged(k: int, points: Sequence[FloatArray], tell: Tell) -> list[Candidate]:
+        tops = [climb(space, x, of, _NEAR_ENOUGH, fixed=(k, k + 1)) for x in points]
+        least = max(top.log_likelihood for top in tops) - KEPT
+        possible = [Candidate(top.x, top) for top in tops if top.log_likelihood > least]
+        return by_pixels(possible, rig_of, exposures, tell)
+
+    for k in space.vibrations:
+        lasting = _LASTING * period_s
+        points = scan(space, k, beside, seen, of, lasting, _LEAST_CYCLES / exposure_s)
+        left = judged(k, [each.x for each in points], lambda done, of: tell(done, 2 * of))
+        # Each stands for half the distance on either side, and a little more.
+        half = 0.51 * SPACING / lasting
+        best_hz = [math.exp(each.x[k]) for each in left]
+        out.left[k] = [(0.0, math.exp(points[0].x[k]) - half), *((hz - half, hz + half) for hz in best_hz)]
+        longer = max(lasting, DECAY * len(exposures) * period_s)
+        close = []
+        for each in _apart(left, k, 3 * half):
+            hz = math.exp(each.x[k])
+            for at in np.arange(math.ceil((hz - half) * longer / SPACING), (hz + half) * longer / SPACING):
+                x = each.x.copy()
+                x[k], x[k + 1] = math.log(at * SPACING / longer), -math.log(2 * math.pi * at * SPACING)
+                close.append(np.clip(x, *np.array(space.bounds).T))
+        for each in _apart(judged(k, close, lambda done, of: tell(of + done, 2 * of)), k, 1.5 * SPACING / longer):
+            top = climb(space, each.x, of)
+            out.candidates.append(Candidate(each.x, top if abs(top.x[k] - each.x[k]) < _STAYED else each.maximum))
     return out
 
 
-def _scan(
-    space: Space, k: int, maxima: Sequence[Maximum], seen: Sequence[Readings], rig_of: RigOf,
-    exposures: Sequence[Exposure], tell: Tell,
-) -> tuple[list[Candidate], list[tuple[float, float]]]:  # fmt: skip
-    """The candidates of the vibration whose frequency is parameter k, and the frequencies that are left."""
-    of = [Likelihood(each, SHORT_RUN) for each in seen]
-    period_s, exposure_s = (steps * seen[0].step_s for steps in (seen[0].period_steps, seen[0].n_steps))
-    longest = max(_LASTING, _DECAY * len(exposures))
-    rounds = 1 + math.ceil(math.log2(longest / _LASTING))
-    low, high = np.array(space.bounds).T
-    intervals: list[tuple[float, float]] = []
-    peaks: list[Candidate] = []
-    for number in range(rounds):
-        lasting = min(_LASTING * 2**number, longest) * period_s
-        spacing = _SPACING / lasting
-        if peaks:
-            best_hz = np.array([math.exp(each.x[k]) for each in peaks])
-            at = np.unique(np.round(best_hz / spacing)[:, None] + [-1, 0, 1])
-        else:
-            first, last = np.round(np.array([_LEAST_CYCLES / exposure_s, math.exp(high[k])]) / spacing)
-            at = np.arange(first, last + 1)
-        found: list[Candidate] = []
-        for hz in at * spacing:
-            near = min((each.x for each in peaks or maxima), key=lambda x: abs(math.exp(x[k]) - hz))
-            # The vibration of the highest maximum may have taken the place of the other process.
-            starts = [near] if peaks else [maxima[0].x, near, *(each.x for each in found[-1:])]
-            tops = []
-            for x in map(np.copy, starts):
-                x[k], x[k + 1] = math.log(hz), -math.log(2 * math.pi * hz * lasting)
-                tops.append(climb(space, np.clip(x, low, high), of, _NEAR_ENOUGH, fixed=(k, k + 1)))
-            top = max(tops, key=lambda each: each.log_likelihood)
-            found.append(Candidate(top.x, top))
-        left = by_pixels(found, rig_of, exposures, partial(_tell_of_round, tell, number, rounds))
-        if not number:
-            # The first round has them all: each stands for half the distance on either side, and a little more.
-            half = 0.51 * spacing
-            intervals = [(hz - half, hz + half) for hz in (math.exp(each.x[k]) for each in left)]
-            intervals.append((0.0, float(at[0]) * spacing - half))
-        peaks = [
-            each for rank, each in enumerate(left)
-            if all(abs(math.exp(each.x[k]) - math.exp(better.x[k])) > 1.5 * spacing for better in left[:rank])
-        ][:_PEAKS]  # fmt: skip
-    tops = [climb(space, each.x, of) for each in peaks]
-    best = [
-        Candidate(each.x, top if abs(top.x[k] - each.x[k]) < _STAYED else each.maximum)
-        for each, top in zip(peaks, tops, strict=True)
-    ]
-    return best, intervals
-
-
-def _tell_of_round(tell: Tell, number: int, rounds: int, done: int, of: int) -> None:
-    tell(done + number * of, rounds * of)
-
-
-def _frequencies(space: Space) -> list[int]:
-    """Where the frequencies of the disturbance's vibrations are among the parameters; a damping follows each."""
-    return [k for k, name in enumerate(space.names) if name.endswith("frequency_hz") and not name.startswith("plant.")]
+def _apart(left: Sequence[Candidate], k: int, distance_hz: float) -> list[Candidate]:
+    """The best candidates, none of them so near to a better one."""
+    out: list[Candidate] = []
+    for each in left:
+        if len(out) < _PEAKS and all(abs(math.exp(each.x[k]) - math.exp(one.x[k])) > distance_hz for one in out):
+            out.append(each)
+    return out
 
 
 def by_pixels(
@@ -211,14 +183,14 @@ def by_pixels(
     if len(found) < 2:
         return list(found)
     try:
-        running = {k: make_estimator(rig_of(each.x), _QUICK) for k, each in enumerate(found)}
+        running = {k: make_estimator(rig_of(each.x), _ESTIMATOR) for k, each in enumerate(found)}
     except EstimatorError:
         return list(found)
     total = np.zeros(len(found))
     used = exposures[:_ENOUGH]
     for number, exposure in enumerate(used):
         tell(number, len(used))
-        each = np.array(in_threads(partial(_log_evidence, exposure), list(running.values())))
+        each = np.array([_log_evidence(exposure, estimator) for estimator in running.values()])
         if number < _SETTLED or not np.isfinite(each).any():
             continue
         at = list(running)
@@ -236,27 +208,28 @@ def refined(
 ) -> FloatArray:
     """Parameters in which damping and frequency of each vibration are where the pixels' evidence is highest.
 
-    First the damping, then the frequency is moved to the vertex of the parabola through five evidences. Where `profile`
-    cannot work on the rig, they stay. The parameters are those of `candidates`, and the others as in `by_pixels`;
+    First the damping, then the frequency is moved to the vertex of the parabola through three evidences. Where
+    `profile` cannot work on the rig, they stay. The parameters are those of `candidates`, the others as in `by_pixels`;
     `tell` is called with the number of parameters that are done.
     """
     x = x.copy()
 
-    def evidence(x: FloatArray) -> FloatArray:
-        estimator = make_estimator(rig_of(x), _ESTIMATOR)
+    @cache
+    def evidence(*x: float) -> FloatArray:
+        estimator = make_estimator(rig_of(np.array(x)), _ESTIMATOR)
         return np.array([_log_evidence(exposure, estimator) for exposure in exposures[:_ENOUGH]][_SETTLED:])
 
     # With a damping that is far too high, any frequency nearby will do.
-    moved = [at for k in _frequencies(space) for at in (k + 1, k)]
+    moved = [at for k in space.vibrations for at in (k + 1, k)]
     for number, k in enumerate(moved):
         tell(number, len(moved))
         # Half of a resonance's width, over its frequency, is its damping.
-        step = math.exp(x[k + 1]) if k in _frequencies(space) else math.log(2)
+        step = math.exp(x[k + 1]) if k in space.vibrations else math.log(2)
         for _ in range(_MOVES):
             beside = np.tile(x, (len(_AROUND), 1))
             beside[:, k] = np.clip(x[k] + step * _AROUND, *space.bounds[k])
             try:
-                each = np.array(in_threads(evidence, list(beside)))
+                each = np.array([evidence(*at) for at in beside])
             except EstimatorError:
                 return x
             # The evidence of an exposure jumps where the filter has lost a mode of the posterior.

@@ -49,7 +49,7 @@ _NARROWEST, _WIDEST = 0.25, 4.0
 _SEEN, _EXACT, _LEAST_LIGHT = 4.0, 0.02, 0.2
 """The light is measured where its deviations from one have their neighbours' sign more often than chance allows by this
 many standard deviations, and are larger than the second value; with less than the last there is no spot to speak of."""
-_LOST = 0.05
+_MISSING = 0.05
 """Share of the weights' noise that may be in pixels that did not arrive."""
 
 
@@ -339,7 +339,7 @@ def _at(seen: _Seen, variances: FloatArray, blank: Readings, centre: FloatArray,
             off = centre[o, k] - (sensor.field[0] + 0.01 * D * place)
             here = seen.mask[o, k]
             noise = (W**2).sum(axis=1)
-            if ((W[:, ~here] ** 2).sum(axis=1) > _LOST * noise).any():
+            if ((W[:, ~here] ** 2).sum(axis=1) > _MISSING * noise).any():
                 continue
             first, second = W @ seen.density[o, k] * D
             mean[o, k], square[o, k] = first - off, second - 2 * off * first + off**2
@@ -363,10 +363,10 @@ def _weights(sensor: Sensor, variance: float, centre: float, motion: float) -> F
     margin = math.sqrt(variance)
     low, high = sensor.field[0] + margin - centre, sensor.field[1] - margin - centre
     at = np.linspace(max(-_REACH * motion, min(low, -margin)), min(_REACH * motion, max(high, margin)), _POINTS)
-    share = np.exp(-0.5 * (at / (1.5 * motion)) ** 2) + 0.02
-    share /= share.sum()
+    prior = np.exp(-0.5 * (at / (1.5 * motion)) ** 2) + 0.02
+    prior /= prior.sum()
     G = pixel_masses(variance, edges, centre + at, 0)[0]
-    root = np.sqrt(share)[:, None]
+    root = np.sqrt(prior)[:, None]
     U, values, V = linalg.svd(root * G, full_matrices=False)
     out = np.empty((2, len(V[0])))
     for p in (1, 2):

@@ -37,7 +37,7 @@ class _Stationary(Covariance):
         return self.of_poles[0]
 
     @property
-    def shares(self) -> ComplexArray:
+    def residues(self) -> ComplexArray:
         return self.of_poles[1]
 
     @property
@@ -52,13 +52,13 @@ class RigModel:
     processes: tuple[Covariance, ...]
 
     def text(self) -> str:
-        """Its poles in words, those of the largest share first."""
+        """Its poles in words, those of the largest residue first."""
         words = []
         for process in self.processes:
             if not process.is_stationary:
                 words.append(f"a random walk of {process.walk:.3g} /s")
                 continue
-            for k in np.argsort(-np.abs(process.shares)):
+            for k in np.argsort(-np.abs(process.residues)):
                 pole, size = process.poles[k], abs(process.poles[k])
                 if pole.imag > 0:
                     words.append(f"{size / (2 * math.pi):.4g} Hz of damping {-pole.real / size:.2g}")
@@ -94,11 +94,11 @@ def rig_model(rig: Rig, output: int) -> RigModel:
     held = np.flatnonzero(driven & ~walks)
     if len(held):
         P = Q[np.ix_(held, held)] / (1 - mu[held][:, None] * mu[held].conj())
-        shares = seen[held] * (P @ seen[held].conj())
+        residues = seen[held] * (P @ seen[held].conj())
         size = np.maximum(np.abs(mu[held]), _LEAST)
         poles = (np.log(size) + 1j * np.angle(mu[held])) / step
-        counts = np.abs(shares) > _NOTHING * abs(shares.sum())
-        processes.append(_Stationary((poles[counts], shares[counts])))
+        counts = np.abs(residues) > _NOTHING * abs(residues.sum())
+        processes.append(_Stationary((poles[counts], residues[counts])))
     free = np.flatnonzero(driven & walks)
     if len(free):
         gained = (seen[free] @ Q[np.ix_(free, free)] @ seen[free].conj()).real

@@ -1,4 +1,9 @@
-"""The fit of a model to readings: a coarse grid, which contains the aliases of each frequency, then local maxima."""
+"""The fit of a model to readings: scans over frequency with the other parameters' best, then local maxima.
+
+A scan takes vibrations that last for a given time at all frequencies, so near to each other that no maximum is between
+two of them; so it meets the aliases of every vibration as well. The first scans, of short vibrations, are beside coarse
+points for the other processes, the later ones, of long vibrations, beside the highest maximum, until it stays.
+"""
 
 from __future__ import annotations
 
@@ -20,26 +25,23 @@ SHORT_RUN = 16
 """Exposures in a short run (`Likelihood`): more of them add little information, and take longer."""
 CYCLES = 4.0
 """Highest frequency that is searched, in cycles per exposure."""
-_SPACING = 0.06
-"""Spacing of the grid of frequencies, cycles per frame period: below the width of a maximum with the grid's damping."""
-_DECAY = 0.4
-"""Decay of the grid's resonances in a frame period, in nats."""
+SPACING = 0.15
+"""Distance of a scan's frequencies, in cycles in the time that its vibrations last: half of a resonance's width."""
+_SHORT = 2.5
+"""How long the vibrations of the first scan last, in frame periods."""
+DECAY = 1 / 8
+"""How long those of the later ones last, in lengths of the recording."""
+_SIZES = (0.25, 0.8)
+"""Sizes of a scan's vibrations, over the sd of the motion."""
 _STARTS = 8
-_ROUNDS = 5
-"""How often, at most, the aliases of a maximum are tried again."""
-_FINE = 0.01
-"""Spacing of the scan for a sharp vibration, cycles per exposure."""
-_SHARP = 0.003
-"""Damping of the scan's vibration."""
-_PEAKS = 12
-"""Most peaks of a scan that are climbed."""
-_MOST = 3000
-"""Most points of a grid of several processes."""
+"""Most points of the coarse grid, and peaks of a scan, that are climbed from."""
+_BESIDE = 4
+"""Most points of the coarse grid beside which the first scans look for a vibration."""
+_ROUNDS = 4
+"""Most rounds of scans beside the highest maximum."""
 KEPT = 30.0
 """Local maxima that are lower than the highest by more than this, in nats, are forgotten: the pixels may prefer one
 that is lower by less (`pixels`)."""
-_SAME = 0.02
-"""Maxima whose parameters differ by less than this share are one."""
 _RIDGE = 0.5
 _STEP = 1e-3
 _KERNEL_CHANGE = 0.05
@@ -76,6 +78,14 @@ class Space:
     @property
     def _of_plant(self) -> tuple[str, ...]:
         return PLANTS[self.plant] if self.plant else ()
+
+    @property
+    def vibrations(self) -> list[int]:
+        """Where the frequencies of the disturbance's vibrations are among the parameters; a damping follows each."""
+        return [
+            k for k, name in enumerate(self.names)
+            if name.endswith("frequency_hz") and not name.startswith("plant.")
+        ]  # fmt: skip
 
     def fitted_plant(self, x: FloatArray) -> IdentifiedPlant | None:
         """The plant of a vector, where one is fitted."""
@@ -200,116 +210,83 @@ class Maximum:
 def maxima(space: Space, seen: Sequence[Readings]) -> list[Maximum]:
     """The local maxima within `KEPT` of the highest, the highest first."""
     of = [Likelihood(each, SHORT_RUN) for each in seen]
-    of_sensor = [0.0] * space.with_noise + [0.0, math.log(_KERNEL_CHANGE)] * space.with_kernel
-    points = [np.array([*point, *of_sensor]) for point in _grid(space, seen)]
-    points = [np.clip(point, *np.array(space.bounds).T) for point in points]
-    values = [space.log_likelihood(point, of) for point in points]
-    order = np.argsort(values)[::-1]
-    chosen: list[FloatArray] = []
-    for k in order[np.isfinite(np.array(values)[order])]:
-        if len(chosen) < _STARTS and not any(_near(space, points[k], o, 0.04) for o in chosen):
-            chosen.append(points[k])
-    found: list[Maximum] = []
-    for start in chosen:
-        _add(space, found, climb(space, start, of, enough=0.1))
-    for each in sorted(found, key=lambda each: -each.log_likelihood)[:2]:
-        for start in _aliases(space, each.x, seen[0]):
-            _add(space, found, climb(space, start, of, enough=0.1))
-    best: list[Maximum] = []
-    highest = max(each.log_likelihood for each in found)
-    for each in found:
-        if each.log_likelihood > highest - KEPT:
-            _add(space, best, climb(space, each.x, of))
-    if not best:
-        raise IdentificationError("no model of this kind has a likelihood here: are there readings at all?")
-    looked_at: list[Maximum] = []
-    for _ in range(_ROUNDS):
-        # A sharp vibration beside a drift is often found at an alias first; the true one is found only from exactly
-        # that maximum. Once the highest one's aliases are known, those of the next family are tried.
-        ranked = sorted(best, key=lambda each: -each.log_likelihood)
-        fresh = [each for each in ranked if not any(_near(space, each.x, other.x, 5e-3) for other in looked_at)]
-        if fresh[:1] != ranked[:1]:
-            others = [x for at in looked_at for x in _aliases(space, at.x, seen[0])]
-            fresh = [each for each in fresh if not any(_near(space, each.x, x, 5e-3) for x in others)]
-        if not fresh:
+    period_s = seen[0].period_steps * seen[0].step_s
+    short, long = _SHORT * period_s, max(_SHORT, DECAY * max(each.slots for each in seen)) * period_s
+    beside = starting_points(space, seen, of)
+    found = [] if space.vibrations else _distinct(space, [climb(space, each.x, of) for each in beside], of)
+    for lasting_s in (short, *[long] * _ROUNDS) if space.vibrations else ():
+        before = found[0].log_likelihood if found else -math.inf
+        for k in space.vibrations:
+            known = [math.exp(each.x[k]) for each in found] if len(space.vibrations) == 1 else []
+            for point in peaks(scan(space, k, beside, seen, of, lasting_s))[:_STARTS]:
+                if all(abs(hz - math.exp(point.x[k])) > SPACING / lasting_s / 2 for hz in known):
+                    found.append(climb(space, point.x, of))
+            found = _distinct(space, found, of)
+            beside = found[:1] or beside
+        if lasting_s == long and found and found[0].log_likelihood < before + _RIDGE:
             break
-        looked_at.append(fresh[0])
-        for start in _aliases(space, fresh[0].x, seen[0]):
-            _add(space, best, climb(space, start, of))
-    for start in _sharp(space, max(best, key=lambda each: each.log_likelihood).x, seen[0], of):
-        _add(space, best, climb(space, start, of))
-    highest = max(each.log_likelihood for each in best)
-    best = [each for each in best if each.log_likelihood > highest - KEPT]
-    apart: list[Maximum] = []
-    for each in sorted(best, key=lambda each: -each.log_likelihood):
-        if not any(_on_a_ridge(space, each, other, of) for other in apart):
-            apart.append(each)
-    return apart
+    if not found:
+        raise IdentificationError("no model of this kind has a likelihood here: are there readings at all?")
+    return _distinct(space, [climb(space, each.x, of) for each in found], of)  # a second climb has new units
 
 
-def _on_a_ridge(space: Space, low: Maximum, high: Maximum, of: Sequence[Likelihood]) -> bool:
-    """Whether two maxima are one that was not reached from both ends: nowhere between them is it lower.
+def _distinct(space: Space, found: Sequence[Maximum], of: Sequence[Likelihood]) -> list[Maximum]:
+    """The maxima within `KEPT` of the highest, the highest first, without those that are a higher one, which was not
+    reached from both ends: nowhere between the two is it lower.
 
     One point alone between two distant frequencies may be at a third maximum.
     """
-    return all(
-        space.log_likelihood((1 - share) * low.x + share * high.x, of, high.nodes) > low.log_likelihood - _RIDGE
-        for share in (0.5, 0.25, 0.75)
-    )
-
-
-def _aliases(space: Space, x: FloatArray, one: Readings) -> list[FloatArray]:
-    """Points whose frequencies have the same values at the exposures' starts, with the same decay."""
-    rate = 1 / (one.period_steps * one.step_s)
-    out = []
-    for k, name in enumerate(space.names):
-        if name.endswith("frequency_hz"):
-            low, high = np.exp(space.bounds[k])
-            f = math.exp(x[k])
-            for m in range(1, math.ceil((high + f) / rate) + 1):
-                for alias in (m * rate - f, m * rate + f, f - m * rate):
-                    if low < alias < high:
-                        other = x.copy()
-                        other[k] = math.log(alias)
-                        other[k + 1] = np.clip(x[k + 1] + x[k] - other[k], *space.bounds[k + 1])  # its damping
-                        out.append(other)
-    return out
-
-
-def _sharp(space: Space, x: FloatArray, one: Readings, of: Sequence[Likelihood]) -> list[FloatArray]:
-    """The highest peaks of a fine scan of each resonance's frequency, sharp, beside the other processes of a point."""
-    step = _FINE / (one.n_steps * one.step_s)
-    out: list[FloatArray] = []
-    for k, name in enumerate(space.names):
-        if not (name.startswith("resonance") and name.endswith("frequency_hz")):  # of a sum: alone it is easily found
-            continue
-        low, high = np.exp(space.bounds[k])
-        points = np.tile(x, (int((high - low) / step), 1))
-        points[:, k] = np.log(low + step * (np.arange(len(points)) + 0.5))
-        points[:, k + 1] = np.clip(math.log(_SHARP), *space.bounds[k + 1])
-        values = np.array([space.log_likelihood(point, of) for point in points])
-        beside = np.pad(values, 1, constant_values=-np.inf)
-        peaks = np.flatnonzero(np.isfinite(values) & (values >= beside[:-2]) & (values > beside[2:]))
-        out += [points[p] for p in peaks[np.argsort(-values[peaks])][:_PEAKS]]
-    return out
-
-
-def _near(space: Space, a: FloatArray, b: FloatArray, share: float) -> bool:
-    """Whether two points have frequencies that differ by less than this share, or have none."""
-    where = [k for k, name in enumerate(space.names) if name.endswith("frequency_hz")] or list(range(len(a)))
-    return bool((np.abs(a[where] - b[where]) < share).all())
-
-
-def _add(space: Space, found: list[Maximum], new: Maximum) -> None:
-    if not math.isfinite(new.log_likelihood):
-        return
-    for k, old in enumerate(found):
-        if (np.abs(old.x - new.x) < _SAME).all() or (
-            _near(space, old.x, new.x, 5e-3) and abs(old.log_likelihood - new.log_likelihood) < 0.1
+    out: list[Maximum] = []
+    for each in sorted(found, key=lambda each: -each.log_likelihood):
+        if each.log_likelihood > (out or [each])[0].log_likelihood - KEPT and not any(
+            all(
+                space.log_likelihood((1 - part) * each.x + part * high.x, of, high.nodes) > each.log_likelihood - _RIDGE
+                for part in (0.5, 0.25, 0.75)
+            )
+            for high in out
         ):
-            found[k] = max(old, new, key=lambda each: each.log_likelihood)
-            return
-    found.append(new)
+            out.append(each)
+    return out
+
+
+def starting_points(space: Space, seen: Sequence[Readings], of: Sequence[Likelihood]) -> list[Maximum]:
+    """The best points of a coarse grid, whose vibrations hardly move, for scans to begin with."""
+    of_sensor = [0.0] * space.with_noise + [0.0, math.log(_KERNEL_CHANGE)] * space.with_kernel
+    points = [np.clip([*point, *of_sensor], *np.array(space.bounds).T) for point in _grid(space, seen)]
+    tried = [Maximum(x, space.log_likelihood(x, of), 0) for x in points]
+    best = sorted((each for each in tried if math.isfinite(each.log_likelihood)), key=lambda each: -each.log_likelihood)
+    return best[: _BESIDE if space.vibrations else _STARTS]
+
+
+def scan(
+    space: Space, k: int, beside: Sequence[Maximum], seen: Sequence[Readings], of: Sequence[Likelihood],
+    lasting_s: float, lowest_hz: float = 0.0,
+) -> list[Maximum]:  # fmt: skip
+    """The highest point at each of the frequencies of a scan for parameter k, from low to high, with a vibration of any
+    of several sizes that lasts for so long, beside the other processes of any of the given points."""
+    low, high = np.array(space.bounds).T
+    spacing = SPACING / lasting_s
+    first, last = np.round(np.array([max(lowest_hz, math.exp(low[k])), math.exp(high[k])]) / spacing)
+    sd = next(n for n in range(k, len(low)) if space.names[n].endswith("sd"))
+    motion = math.log(max(each.motion for each in seen))
+    found = []
+    for hz in np.arange(max(first, 1.0), last + 1) * spacing:
+        tried = []
+        for point, size in itertools.product(beside, _SIZES):
+            x = point.x.copy()
+            x[[k, k + 1, sd]] = math.log(hz), -math.log(2 * math.pi * hz * lasting_s), motion + math.log(size)
+            x = np.clip(x, low, high)
+            tried.append(Maximum(x, space.log_likelihood(x, of), 0))
+        found.append(max(tried, key=lambda each: each.log_likelihood))
+    return found
+
+
+def peaks(scanned: Sequence[Maximum]) -> list[Maximum]:
+    """The points of a scan that are higher than their neighbours, the highest first."""
+    values = np.array([each.log_likelihood for each in scanned])
+    beside = np.pad(values, 1, constant_values=-np.inf)
+    tops = np.flatnonzero(np.isfinite(values) & (values >= beside[:-2]) & (values > beside[2:]))
+    return [scanned[n] for n in tops[np.argsort(-values[tops])]]
 
 
 def climb(
@@ -323,67 +300,44 @@ def climb(
         value = space.log_likelihood(x, of, nodes)
         return -value if math.isfinite(value) else _NEVER
 
-    # Frequencies are known far better than the other parameters: in units of their own curvature all are alike.
     low, high = np.array(space.bounds).T
     at = np.clip(start, low + 2 * _STEP, high - 2 * _STEP)
-    here, scale = cost(at), np.empty(len(at))
-    for k, step in enumerate(_STEP * np.eye(len(at))):
-        scale[k] = min(1 / math.sqrt(max(cost(at + step) + cost(at - step) - 2 * here, 0.0) / _STEP**2 + 1), 1.0)
+    free, here = np.delete(np.arange(len(at)), list(fixed)), cost(at)
+    # Frequencies are known far better than the other parameters: in units of their own curvature all are alike.
+    steps = _STEP * np.eye(len(at))[free]
+    bends = np.array([cost(at + step) + cost(at - step) - 2 * here for step in steps]) / _STEP**2
+    scale = 1 / np.sqrt(np.maximum(bends, 0.0) + 1)
+    units = steps / _STEP * scale[:, None]
 
     def whitened(u: FloatArray) -> float:
-        return cost(at + u * scale)
+        return cost(at + u @ units)
 
-    low[list(fixed)] = high[list(fixed)] = at[list(fixed)]
     done = optimize.minimize(
-        whitened, np.zeros(len(at)), method="L-BFGS-B",
-        bounds=list(zip((low - at) / scale, (high - at) / scale, strict=True)),
+        whitened, np.zeros(len(free)), method="L-BFGS-B",
+        bounds=list(zip((low - at)[free] / scale, (high - at)[free] / scale, strict=True)),
         options={"maxiter": 60, "eps": 1e-3, "ftol": enough / max(abs(here), 1.0)},
     )  # fmt: skip
-    return Maximum(at + done.x * scale, -float(done.fun) if done.fun < _NEVER else -math.inf, nodes)
+    return Maximum(at + done.x @ units, -float(done.fun) if done.fun < _NEVER else -math.inf, nodes)
 
 
 def _grid(space: Space, seen: Sequence[Readings]) -> list[tuple[float, ...]]:
-    """Points of the coarse grid, logarithms."""
-    one = seen[0]
-    exposure, period = one.n_steps * one.step_s, one.period_steps * one.step_s
-    variance = max(each.motion for each in seen) ** 2
-    share = variance / max(len(space.kinds) + (space.plant is not None), 1)
-    sd = math.sqrt(share)
-    at = [name for kind in space.kinds for name in PARAMETERS[kind]]
-    low, high = next(
-        (np.exp(space.bounds[k]) for k, name in enumerate(at) if name.endswith("frequency_hz")), (1.0, 1.0)
-    )
-    frequencies = np.arange(max(low, 0.05 / period), high + _SPACING / period / 2, _SPACING / period)
-    pairs = [(f, min(_DECAY / (2 * math.pi * f * period), 0.5)) for f in np.minimum(frequencies, high)]
-
-    def points(kind: str) -> list[tuple[float, ...]]:
-        if kind == "random-walk":
-            return [(share / exposure * c,) for c in (0.01, 0.1, 1.0)]
-        if kind == "ornstein-uhlenbeck":
-            return [(c * exposure, 2 * share / (c * exposure)) for c in (0.3, 3.0, 30.0)]
-        if kind == "second-order":
-            return [(c * exposure, c * exposure * d, sd) for c in (0.3, 3.0, 30.0) for d in (0.1, 0.5)]
-        if kind == "resonance":
-            return [(f, z, sd) for f, z in pairs]
-        if kind == "ar3":
-            return [(f, z, c * exposure, sd) for f, z in pairs for c in (0.1, 2.0)]
-        # ar4: two pairs, whose order does not matter.
-        return [(f, z, g, y, sd) for (f, z), (g, y) in itertools.combinations(pairs[::2], 2)]
-
-    each = [points(kind) for kind in space.kinds]
+    """Points of the coarse grid, logarithms; their vibrations are fast, damped and small."""
+    exposure = seen[0].n_steps * seen[0].step_s
+    variance = max(each.motion for each in seen) ** 2 / max(len(space.kinds) + (space.plant is not None), 1)
+    sd, top = math.sqrt(variance), CYCLES / exposure
+    points: dict[str, list[tuple[float, ...]]] = {
+        "random-walk": [(variance / exposure * c,) for c in (0.01, 0.1, 1.0)],
+        "ornstein-uhlenbeck": [(c * exposure, 2 * variance / (c * exposure)) for c in (0.3, 3.0, 30.0)],
+        "second-order": [(c * exposure, c * exposure * d, sd) for c in (0.3, 3.0, 30.0) for d in (0.1, 0.5)],
+        "resonance": [(top, 0.5, sd / 10)],
+        "ar3": [(top, 0.9, c * exposure, sd) for c in (0.1, 2.0)],
+        "ar4": [(top, 0.9, top, 0.8, sd)],
+    }
+    parts = [points[kind] for kind in space.kinds]
     if space.plant is not None:
-        each.insert(0, _plant_grid(space, seen, sd))
-    while math.prod(len(some) for some in each) > _MOST:
-        longest = max(range(len(each)), key=lambda k: len(each[k]))
-        each[longest] = each[longest][::2]
-    grid = []
-    for product in itertools.product(*each):
-        # The order of the frequencies of equal processes does not matter.
-        own = product[1:] if space.plant is not None else product
-        beside = itertools.pairwise(zip(own, space.kinds, strict=True))
-        if all(a[0] < b[0] or kind != other for (a, kind), (b, other) in beside):
-            grid.append(tuple(math.log(value) for part in product for value in part))
-    return grid
+        parts.insert(0, _plant_grid(space, seen, sd))
+    products = itertools.product(*parts)
+    return [tuple(math.log(value) for part in product for value in part) for product in products]
 
 
 def _plant_grid(space: Space, seen: Sequence[Readings], sd: float) -> list[tuple[float, ...]]:

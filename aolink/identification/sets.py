@@ -15,6 +15,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy import optimize
 
 from aolink.identification.likelihood import Likelihood
 from aolink.identification.readings import Readings
@@ -32,10 +33,9 @@ _BELOW = 12.0
 _STEP = 0.02
 _WIDEST = 3.0
 """Longest single step along a profile, in the logarithm of the parameter."""
-_SIDES = 12
 _NEWTON = 5
-_CLOSE = 0.1
-"""Accuracy to which an end of a piece is found, nats."""
+_CLOSE = 0.05
+"""Accuracy to which a profile is found, nats, and an end of a piece, as a share of its distance."""
 
 
 @dataclass(frozen=True)
@@ -58,9 +58,17 @@ class Identified:
     name: str
     best: float
     pieces: tuple[Piece, ...]
-    """The pieces from low to high; more than one where the exposures leave aliases."""
+    """The pieces from low to high; more than one where the exposures leave aliases, none in a `contradiction`."""
     factor: float
     """The factor a."""
+
+    @property
+    def contradiction(self) -> str:
+        """What a set without any piece means."""
+        return (
+            f"{self.name}: the pixels rule out every value that centroids and widths allow, so that no set is left: the"
+            " model, the kernel or the noise is another than the rig file or --model says"
+        )
 
     def holds(self, value: float) -> bool:
         """Whether the set has a value."""
@@ -69,7 +77,7 @@ class Identified:
         )
 
     def within(self, intervals: Sequence[tuple[float, float]]) -> Identified:
-        """The part of the set that lies in these intervals, which may overlap; the whole set where none of it does."""
+        """The part of the set that lies in these intervals, which may overlap; no piece where none of it does."""
         pieces = [
             Piece(
                 low, high, min(max(each.best, low), high), each.open_low and low == each.low,
@@ -79,15 +87,18 @@ class Identified:
             for low, high in ((max(each.low, low), min(each.high, high)) for low, high in intervals)
             if low <= high
         ]  # fmt: skip
-        return replace(self, pieces=_joined(pieces) or self.pieces)
+        return replace(self, pieces=_joined(pieces))
 
     def at(self, value: float) -> Identified:
         """The set with another best value, which the pixels prefer; its nearest piece is extended to hold it."""
-        distances = [max(each.low - value, value - each.high) for each in self.pieces]
-        nearest = distances.index(min(distances))
+
+        def distance(each: Piece) -> float:
+            return max(each.low - value, value - each.high)
+
+        nearest = min(self.pieces, key=distance, default=None)
         pieces = tuple(
-            replace(each, low=min(each.low, value), high=max(each.high, value), best=value) if k == nearest else each
-            for k, each in enumerate(self.pieces)
+            replace(each, low=min(each.low, value), high=max(each.high, value), best=value) if each is nearest else each
+            for each in self.pieces
         )
         return replace(self, best=value, pieces=pieces)
 
@@ -97,29 +108,26 @@ def identified(
 ) -> tuple[Identified, ...]:
     """The sets of all parameters, from the local maxima, the best first: the highest, or the one that the pixels prefer
     (`pixels`)."""
-    of = [Likelihood(each, SHORT_RUN) for each in seen]
-    top = found[0]
-    curvature = _curvature(space, top, of)
-    factors = _factors(space, top, seen, curvature)
-    found = [each for each in found[:_MOST] if each.log_likelihood > top.log_likelihood - _BELOW]
-    allowed = [0.0, *(_allowed(space, top, each, seen) for each in found[1:])]
-    curvatures, own = [curvature], [factors]
-    for number, each in enumerate(found[1:], 1):
-        near = top.log_likelihood - each.log_likelihood < max(QUANTILE / 2 * factors.max(), allowed[number])
-        curvatures.append(_curvature(space, each, of) if near else curvature)
-        own.append(_factors(space, each, seen, curvatures[-1]) if near else factors)
+    of, top = [Likelihood(each, SHORT_RUN) for each in seen], found[0]
+    possible: list[tuple[Maximum, float, FloatArray, FloatArray]] = []
+    for each in found[:_MOST]:
+        below = top.log_likelihood - each.log_likelihood
+        allowed = _allowed(space, top, each, seen) if possible and below < _BELOW else 0.0
+        if not possible or below < max(allowed, QUANTILE / 2 * possible[0][3].max()):
+            # An alias that may be the truth is as uncertain as its own curvature and factor make it.
+            H = _curvature(space, each, of)
+            possible.append((each, allowed, H, _factors(space, each, seen, H)))
     out = []
     for k, name in enumerate(space.names):
         if tell:
             tell(k)
-        pieces = []
-        for number, each in enumerate(found):
-            least = top.log_likelihood - max(QUANTILE / 2 * factors[k], allowed[number])
+        factor, pieces = float(possible[0][3][k]), []
+        for each, allowed, H, factors in possible:
+            least = top.log_likelihood - max(QUANTILE / 2 * factor, allowed)
             if each.log_likelihood > least:
-                # An alias that may be the truth is as uncertain as its own curvature and factor make it.
-                least = min(least, each.log_likelihood - QUANTILE / 2 * own[number][k])
-                pieces.append(_piece(space, each, k, least, of, curvatures[number]))
-        out.append(Identified(name, math.exp(top.x[k]), _joined(pieces), float(factors[k])))
+                least = min(least, each.log_likelihood - QUANTILE / 2 * float(factors[k]))
+                pieces.append(_piece(space, each, k, least, of, H))
+        out.append(Identified(name, math.exp(top.x[k]), _joined(pieces), factor))
     return tuple(out)
 
 
@@ -209,76 +217,56 @@ def _factors(space: Space, top: Maximum, seen: Sequence[Readings], H: FloatArray
 
 def _piece(space: Space, at: Maximum, k: int, least: float, of: Sequence[Likelihood], H: FloatArray) -> Piece:
     """The interval of parameter ``k`` about a local maximum in which the profile is above ``least``."""
-    others = [j for j in range(len(at.x)) if j != k]
-    follow = -np.linalg.solve(H[np.ix_(others, others)], H[others, k]) if others else np.zeros(0)
-    sd = math.sqrt(np.linalg.inv(H)[k, k])
-    low, high = space.bounds[k]
+    inverse, depth = np.linalg.inv(H), at.log_likelihood - least
+    along, low, high = inverse[:, k] / inverse[k, k], *np.array(space.bounds).T
     ends, opens = [], []
-    for sign, bound in ((-1, low), (1, high)):
-        x, depth = at.x.copy(), at.log_likelihood - least
-        # Along a profile the root of the loss is nearly a straight line.
-        inside, step = 0.0, min(sd * math.sqrt(2 * depth), _WIDEST)
-        loss_inside, outside = 0.0, math.inf
-        moved, opened = 0.0, False
-        for _ in range(_SIDES):
-            moved = min(inside + step, abs(bound - at.x[k]))
-            start = x.copy()
-            start[k] = at.x[k] + sign * moved
-            start[others] = np.clip(x[others] + follow * (start[k] - x[k]), *np.array(space.bounds)[others].T)
-            there, value = _highest(space, at, start, others, H, of)
-            loss = at.log_likelihood - value
-            if abs(loss - depth) < _CLOSE:
-                break
-            if loss < depth:
-                inside, loss_inside, x = moved, max(loss, 0.0), there
-                if moved >= abs(bound - at.x[k]):
-                    opened = True
-                    break
-                if outside < math.inf:
-                    step = (outside - inside) / 2
-                else:
-                    slope = math.sqrt(loss_inside) / max(inside, 1e-12)
-                    step = min(max(math.sqrt(depth) / max(slope, 1e-12) - inside, 0.2 * inside), 2 * inside, _WIDEST)
-            else:
-                outside = moved
-                slope = (math.sqrt(loss) - math.sqrt(loss_inside)) / (outside - inside)
-                step = (math.sqrt(depth) - math.sqrt(loss_inside)) / slope
-                step = float(np.clip(step, 0.1 * (outside - inside), 0.9 * (outside - inside)))
-        ends.append(math.exp(at.x[k] + sign * moved))
-        opens.append(opened)
+    for sign, most in ((-1, at.x[k] - low[k]), (1, high[k] - at.x[k])):
+        known = {0.0: (at.x, -math.sqrt(depth))}
+
+        def beyond(moved: float, sign: int = sign, known: dict[float, tuple[FloatArray, float]] = known) -> float:
+            """The root of the loss less that of the depth: along a profile the root is nearly a straight line."""
+            if moved not in known:
+                near = min(known, key=lambda each: abs(each - moved))
+                start = np.clip(known[near][0] + sign * (moved - near) * along, low, high)
+                x, value = _profiled(space, at, start, k, H, of)
+                loss = max(at.log_likelihood - value, 0.0)
+                known[moved] = x, math.sqrt(loss) - math.sqrt(depth)
+            return known[moved][1]
+
+        inside, outside = 0.0, min(math.sqrt(2 * depth * inverse[k, k]), _WIDEST, most)
+        while beyond(outside) < 0 and outside < most:
+            inside, outside = outside, min(2 * outside, outside + _WIDEST, most)
+        opens.append(bool(beyond(outside) < 0))
+        if not opens[-1]:
+            outside = float(optimize.brentq(beyond, inside, outside, xtol=_CLOSE * outside, rtol=_CLOSE))
+        ends.append(math.exp(at.x[k] + sign * outside))
     return Piece(ends[0], ends[1], math.exp(at.x[k]), *opens)
 
 
-def _highest(
-    space: Space, at: Maximum, start: FloatArray, others: list[int], H: FloatArray, of: Sequence[Likelihood]
+def _profiled(
+    space: Space, at: Maximum, x: FloatArray, k: int, H: FloatArray, of: Sequence[Likelihood]
 ) -> tuple[FloatArray, float]:
-    """The maximum of the likelihood over the other parameters, and its value, by Newton's method with curvature H."""
-    x, value = start, _value(space, at, start, of)
-    if not others:
-        return x, value
-    low, high = np.array(space.bounds)[others].T
-    inside = H[np.ix_(others, others)]
-    for _ in range(_NEWTON):
-        g = np.empty(len(others))
-        for j, k in enumerate(others):
-            h = 0.1 / math.sqrt(H[k, k]) * (1 if x[k] < at.x[k] or x[k] - 1 < low[j] else -1)
-            beside = x.copy()
-            beside[k] += h
-            g[j] = (_value(space, at, beside, of) - value) / h + 0.5 * H[k, k] * h
-        move = np.linalg.solve(inside, g)
-        gain = 0.5 * float(g @ move)
-        if gain < _CLOSE / 2:
+    """The maximum over the parameters other than ``k``, and its value, by Newton's method with curvature H."""
+    others = np.delete(np.arange(len(x)), k)
+    curvature, value = H[np.ix_(others, others)], _value(space, at, x, of)
+    low, high = np.array(space.bounds).T
+    for _ in range(_NEWTON if len(others) else 0):
+        steps = 0.1 / np.sqrt(np.diagonal(H))
+        steps = np.diag(np.where(x + steps > high, -steps, steps))[others]
+        gained = np.array([_value(space, at, x + step, of) for step in steps]) - value
+        steps = steps.sum(axis=1)
+        g = gained / steps + 0.5 * np.diagonal(curvature) * steps
+        move = np.linalg.solve(curvature, g)
+        if (gain := 0.5 * float(g @ move)) < _CLOSE:
             return x, value + gain
-        new = x.copy()
-        new[others] = np.clip(x[others] + move, low, high)
-        there = _value(space, at, new, of)
         for _ in range(_NEWTON):
-            if there > value:
+            new = x.copy()
+            new[others] = np.clip(x[others] + move, low[others], high[others])
+            if (there := _value(space, at, new, of)) > value:
                 break
-            new[others] = (new[others] + x[others]) / 2
-            there = _value(space, at, new, of)
-        if there < value + _CLOSE / 4:
-            return (new, there) if there > value else (x, value)
+            move = move / 2
+        if there < value + _CLOSE:
+            break
         x, value = new, there
     return x, value
 

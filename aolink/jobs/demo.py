@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from aolink.colours import by_rank
-from aolink.control.fall_back import INTEGRATOR
+from aolink.control.integrator import INTEGRATOR
 from aolink.errors import AolinkError, DeviceError, ExportError, ViewerError
 from aolink.estimation import Score, estimator_row
 from aolink.estimation.registry import BASELINE_ESTIMATOR, DEFAULT_ESTIMATOR

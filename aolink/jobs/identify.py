@@ -195,6 +195,7 @@ def _of_output(
         notes.append(
             "kernel_change is not in the rig file: estimators take one kernel for all exposures, so less noise"
         )
+    notes += [each.contradiction for each in sets if not each.pieces]
     for each in sets:
         if each.name.endswith("frequency_hz") and len(each.pieces) > 1:
             rest = ", ".join(f"{piece.best:.4g}" for piece in each.pieces if not piece.low <= each.best <= piece.high)

@@ -3,6 +3,7 @@ loop."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -95,7 +96,8 @@ class Controlling:
             news.append(f"the rig file's model {fits} (frame {frame}): {act.fit.text()}")
         if act.acting != self._acting:
             pays = f"{act.acting} would have left {100 * act.gained:.0f} % less of the slopes (rms) than {self._acting}"
-            news.append(f"{pays}, and acts from frame {frame} on")
+            tried = f"the model of {act.acting} fits: it is tried again"
+            news.append(f"{tried if math.isnan(act.gained) else pays}, and acts from frame {frame} on")
         self._state, self._acting = act.state, act.acting
         return news
 

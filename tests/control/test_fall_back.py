@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from aolink.control import ControllerRow, Seen, delay_steps
-from aolink.control.fall_back import INTEGRATOR, Rival
+from aolink.control import delay_steps
+from aolink.control.integrator import INTEGRATOR
 from aolink.control.loop import centroids
+from aolink.control.rival import Rival
 from aolink.exposure import residual_rms
 from aolink.jobs.closed_loop import Closed, closed_loop
 from aolink.numerics.arrays import FloatArray
@@ -57,17 +58,18 @@ def residual(series: list[Closed], first: int) -> float:
     return residual_rms(each.exposure for each in series[first:])
 
 
-def test_what_the_integrator_would_have_left_is_what_it_leaves() -> None:
+@pytest.mark.parametrize("slew", [0, 2])
+def test_what_the_integrator_would_have_left_is_what_it_leaves(slew: float) -> None:
     """It is followed on exposures of a mirror that holds still; and really closes the loop, from the same seed."""
-    rig = small_rig(DRIFT)
-    rival = Rival(rig, INTEGRATOR, delay_steps(rig), rig.mirror.park)
+    rig = small_rig(DRIFT, mirror=f"slew_max_per_s = {slew}") if slew else small_rig(DRIFT)
+    rival = Rival(rig, INTEGRATOR, delay_steps(rig), rig.mirror.park, np.zeros(1))
     would, does = [], []
     for still, closed in zip(
         closed_loop(rig, "", "", 40), closed_loop(rig, "integrator", "", 40), strict=True
     ):  # fmt: skip
         seen = centroids(rig, still.exposure)
         held = np.concatenate([still.exposure.lead_inputs, still.exposure.inputs])
-        would.append(seen + rival.see(held, seen, None)[-STEPS:].mean(axis=0))
+        would.append(seen + rival.see(held, seen).mean(axis=1))
         does.append(centroids(rig, closed.exposure))
     assert np.std(does) < 0.7 * np.std([centroids(rig, each.exposure) for each in closed_loop(rig, "", "", 40)])
     # Noise of pixels, and a converter of 16 bits.
@@ -123,43 +125,3 @@ def test_a_controller_whose_model_fits_again_acts_again(tmp_path: Path) -> None:
 def test_it_can_be_switched_off() -> None:
     assert small_rig(control="fall_back = false").control.fall_back is False
     assert small_rig().control.fall_back is True
-
-
-class Pushed:
-    """A controller that always gives the same input, and remembers what it was shown."""
-
-    shown: list[Seen]
-
-    def __init__(self, rig: Rig) -> None:
-        self.shown, self._u = [], np.full(rig.n_inputs, 0.05)
-
-    def see(self, seen: Seen) -> None:
-        self.shown.append(seen)
-
-    def step(self, held: FloatArray) -> FloatArray:
-        return self._u
-
-
-def test_who_does_not_act_is_shown_the_state_and_slopes_of_a_mirror_of_its_own() -> None:
-    rig = small_rig(DRIFT)
-    pushed = Pushed(rig)
-    row = ControllerRow(name="pushed", summary="for show", build=lambda _: pushed, needs_state=True)
-    rival = Rival(rig, row, delay_steps(rig), rig.mirror.park)
-    held = np.tile(rig.mirror.park, (STEPS, 1))
-    plant = rig.plant
-    state = np.random.default_rng(0).standard_normal((plant.axes, plant.n_states))
-    rest = np.tile(rig.mirror.park, (STEPS + delay_steps(rig), 1))
-    inputs = np.concatenate([rest, rig.mirror.quantise(np.full((2 * STEPS, rig.n_inputs), 0.05))])
-    away, path = np.zeros_like(state), []
-    for u in inputs[: 3 * STEPS]:
-        path.append(away)
-        away = away @ plant.A.T + (u - rig.mirror.park).reshape(plant.axes, -1) @ plant.B.T
-    path.append(away)
-    for k in (1, 2, 3):
-        rival.see(held, np.zeros(rig.n_outputs), state)
-        seen = pushed.shown[-1]
-        assert seen.state is not None
-        np.testing.assert_allclose(seen.state - state, path[k * STEPS], atol=1e-12)
-        slopes = np.array(path[(k - 1) * STEPS : k * STEPS]) @ plant.C.T
-        np.testing.assert_allclose(seen.slopes, slopes.mean(axis=0).ravel(), atol=1e-12)
-    assert abs(path[-1]).max() > 0.01

@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import aolink
+from aolink.cli.tables.identification import set_text
 from aolink.errors import IdentificationError
 from aolink.identification import (
     Identified,
@@ -158,10 +159,17 @@ interval = st.tuples(st.floats(0.0, 10.0), st.floats(0.0, 10.0)).map(sorted)
 def test_the_part_of_a_set_within_intervals_is_what_both_hold(pieces, intervals, at):
     whole = Identified("frequency_hz", 1.0, tuple(Piece(low, high, low, False, False) for low, high in pieces), 1.0)
     part = whole.within(intervals)
-    both = whole.holds(at) and any(low <= at <= high for low, high in intervals)
-    meet = any(max(a, c) <= min(b, d) for a, b in pieces for c, d in intervals)
-    assert part.holds(at) == (both if meet else whole.holds(at))
+    assert part.holds(at) == (whole.holds(at) and any(low <= at <= high for low, high in intervals))
     assert all(piece.low <= piece.best <= piece.high for piece in part.pieces)
+
+
+def test_a_set_that_nothing_is_left_of_stays_empty():
+    """Two sets that contradict each other are not replaced by one of them."""
+    whole = Identified("frequency_hz", 5.0, (Piece(4.0, 6.0, 5.0, False, False),), 1.0)
+    nothing = whole.within([(0.0, 3.0), (7.0, 9.0)]).at(8.0)
+    assert (nothing.best, nothing.pieces) == (8.0, ())
+    assert set_text(nothing) == "none: contradiction"
+    assert nothing.contradiction.startswith("frequency_hz: the pixels rule out every value that centroids and widths")
 
 
 def test_an_end_that_was_not_an_end_of_the_set_stays_so_only_where_it_is():

@@ -8,6 +8,8 @@ import re
 import numpy as np
 import pytest
 
+import aolink
+from aolink.control.loop import centroids
 from aolink.jobs.check_rig import check_rig
 from aolink.rig import builtin_rigs, load_rig, parse_rig
 
@@ -95,6 +97,20 @@ def test_what_cannot_work_is_an_error(values: dict[str, str], key: str, message:
 def test_what_is_probably_a_slip_is_a_warning(values: dict[str, str], key: str, message: str) -> None:
     assert re.search(message, found("warning", **values)[key])
     assert found("warning") == {}
+
+
+@pytest.mark.parametrize("noise_density", ["0.3", "3"])
+def test_how_many_frames_will_show_no_spot_is_what_they_do(noise_density: str) -> None:
+    """At a signal to noise of 1.3 most frames are used, because noise adds to the brightest stretch."""
+    text = re.sub(r"(?m)^noise_density = [^#\n]*", f"noise_density = {noise_density} ", SECTION_VI)
+    text = re.sub(r"(?m)^black_level = [^#\n]*", "black_level = 30000 ", text)
+    rig = parse_rig(re.sub(r"(?m)^counts_per_density = [^#\n]*", "counts_per_density = 200 ", text))
+    findings = [f for f in check_rig(rig) if f.key == "sensor.noise_density" and f.severity != "info"]
+    assert {f.severity for f in findings} <= {"warning"}
+    said = [int(m[1]) for f in findings if (m := re.search(r"about (\d+) % of such frames", f.message))]
+    count = 120
+    unseen = sum(bool(np.isnan(centroids(rig, each)).any()) for each in aolink.simulate(rig, count, seed=1))
+    assert unseen == pytest.approx(count * sum(said) / 100, abs=3 * math.sqrt(count * 0.15 * 0.85))
 
 
 @pytest.mark.parametrize(("swings", "warned"), [(1.0, True), (1.49, True), (1.3, False)])

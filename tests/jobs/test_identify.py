@@ -27,6 +27,18 @@ def test_the_set_of_a_vibration_beside_a_drift_is_without_the_frequencies_that_t
     assert not any(frequency.holds(hz) for hz in np.arange(6.0, 18.0))
 
 
+@pytest.mark.rare
+def test_the_pixels_do_not_rule_out_a_vibration_whose_amplitude_goes_with_its_damping():
+    """The maximum at the truth, 12 Hz, never changes; a vibration there that does has another amplitude."""
+    exposures = aolink.simulate("jitter", 48, seed=2)
+    wanted = Wanted(models=("resonance",))
+    (found,) = from_readings(exposures.rig, [readings(exposures.rig, list(exposures))], list(exposures), wanted).found
+    frequency, damping, sd = found.parameters
+    assert frequency.best == pytest.approx(12.0, abs=0.1)
+    assert damping.holds(0.005)
+    assert sd.best == pytest.approx(0.2, rel=0.25)
+
+
 @pytest.mark.slow
 def test_changes_of_the_kernel_are_fitted_but_have_no_place_in_the_rig_file():
     rig = load_rig("jitter")

@@ -178,7 +178,7 @@ def likeliest(slopes: FloatArray, start: ProcessSum | None = None) -> ProcessSum
         density = np.zeros_like(omega)
         for each in model(x).processes:
             poles = each.poles[:, None]
-            density += (each.shares[:, None] * -2 * poles / (poles**2 + omega**2)).sum(axis=0).real
+            density += (each.residues[:, None] * -2 * poles / (poles**2 + omega**2)).sum(axis=0).real
         return float(np.sum(np.log(density) + power / density))
 
     limits = {

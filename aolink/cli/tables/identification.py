@@ -55,7 +55,11 @@ def offer_lines(offer: Offer) -> Iterator[str]:
 
 def set_text(parameter: Identified) -> str:
     """The pieces of a set, such as ``11.9 to 12; 13 to 13.1``; an open end has a sign."""
-    return "; ".join(
-        f"{'<' if piece.open_low else ''}{piece.low:.4g} to {'>' if piece.open_high else ''}{piece.high:.4g}"
-        for piece in parameter.pieces
+    return (
+        "none: contradiction"
+        if not parameter.pieces
+        else "; ".join(
+            f"{'<' if piece.open_low else ''}{piece.low:.4g} to {'>' if piece.open_high else ''}{piece.high:.4g}"
+            for piece in parameter.pieces
+        )
     )
