@@ -26,6 +26,9 @@ from aolink.optics.sensor import SpotSensor
 from aolink.plant.alike import alike_systems
 from aolink.rig import Rig
 
+_WARM: set[tuple[type, int]] = set()
+"""Updaters of pixels, and along how many directions, whose code is loaded in this process."""
+
 
 def _blur_filter(rig: Rig, options: Options, observation: Observation[Any] | None, **more: Any) -> BlurFilter:
     return BlurFilter(rig.plant, observation, process_noise=options.process_noise, gate=options.gate, **more)
@@ -134,6 +137,8 @@ def _of_pixels(rig: Rig, options: Options, updates: Any) -> Filter:
     from aolink.estimation.pixels.filter import MixtureFilter
 
     pixels = MixtureFilter(rig.plant, rig.sensor, updates, gate=options.gate)
-    pixels.warm_up(updates)
+    if (kind := (type(updates), rig.sensor.directions)) not in _WARM:
+        pixels.warm_up(updates)
+        _WARM.add(kind)
     updates.reduction(exposure_model(rig.plant, rig.timing.exposure_steps, rig.timing.exposure_offset), rig.sensor)
     return pixels
