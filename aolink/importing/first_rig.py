@@ -10,8 +10,8 @@ from typing import NamedTuple
 import numpy as np
 
 from aolink.errors import ImportingError
-from aolink.importing.film import Film
-from aolink.importing.frames import FilmSettings, film_rate, nonlinear_note
+from aolink.films.film import Film
+from aolink.importing.frames import FilmSettings, film_times, nonlinear_note
 from aolink.importing.motion import Motion, fit_motion
 from aolink.importing.survey import Survey, reach, survey
 from aolink.importing.tracker import find_objects
@@ -48,7 +48,8 @@ def first_rig(film: Film, settings: FilmSettings, name: str, progress: Callable[
         raise ImportingError(f"{film.name} has slopes and no pictures: a first rig file is made from pictures")
     if not settings.track:
         raise ImportingError("a first rig file is about objects in the film: say how many with --track N")
-    periods, rate, said = film_rate(film, settings)
+    times = film_times(film, settings)
+    periods, rate, said = times.periods, times.rate_hz, list(times.notes)
     if rate is None:
         raise ImportingError(f"it is not known how many frames a second {film.name} has: give --rate")
     if not 1 <= round(1e9 / rate) <= _LONGEST_NS:

@@ -12,8 +12,8 @@ import pytest
 import aolink
 from aolink.estimation import run
 from aolink.exposure import Exposures
+from aolink.films.film import array_film
 from aolink.importing.brightness import brightness_of
-from aolink.importing.film import array_film
 from aolink.importing.first_rig import first_rig
 from aolink.importing.frames import FilmSettings
 from aolink.importing.recording import import_film

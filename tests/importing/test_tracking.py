@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from aolink.errors import ImportingError
 from aolink.estimation import run, smooth
+from aolink.films.film import array_film
 from aolink.importing.exposures import imported
-from aolink.importing.film import array_film
 from aolink.importing.first_rig import first_rig
 from aolink.importing.frames import FilmAccount, FilmLight, FilmSettings
 from aolink.importing.motion import Motion, fit_motion, vibration_mean

@@ -7,7 +7,7 @@ import pytest
 from scipy import ndimage
 
 from aolink.errors import FrameError
-from aolink.optics.frame_file import read_frame
+from aolink.films.pictures import read_frame
 from aolink.optics.lattice import find_lattice
 from aolink.optics.maxima import cut_windows, flatten
 from aolink.optics.slopes import measure_files, measure_slopes
@@ -31,7 +31,7 @@ def test_the_reference_has_its_lenslets(measured):
 
 def test_the_pitch_is_the_period_of_the_frame(mmirs, measured):
     # Independent of spots: the spectrum of the frame's sums has its line at one over the pitch.
-    flat = np.clip(flatten(read_frame(mmirs / "mmirs_wfs_0150.fits.gz"))[0], 0, 300)
+    flat = np.clip(flatten(read_frame(mmirs / "mmirs_wfs_0150.fits.gz", FrameError))[0], 0, 300)
     for axis, step in ((0, measured.lattice.column_step[0]), (1, measured.lattice.row_step[1])):
         periods = np.linspace(18, 28, 1001)
         profile = flat.sum(axis=axis) - flat.sum(axis=axis).mean()
@@ -40,7 +40,7 @@ def test_the_pitch_is_the_period_of_the_frame(mmirs, measured):
 
 
 def test_spots_are_where_another_library_sees_them(mmirs, measured):
-    flat, _ = flatten(read_frame(mmirs / "mmirs_wfs_0150.fits.gz"))
+    flat, _ = flatten(read_frame(mmirs / "mmirs_wfs_0150.fits.gz", FrameError))
     windows, corners = cut_windows(flat, measured.lattice.spots, 5)
     windows = np.where(windows > 0.3 * windows.max(axis=(1, 2), keepdims=True), windows, 0)
     theirs = corners + [ndimage.center_of_mass(w)[::-1] for w in windows]
@@ -96,7 +96,7 @@ def test_frames_of_two_cameras_are_refused():
 
 @pytest.mark.slow
 def test_a_frame_against_itself_is_flat(mmirs):
-    frame = read_frame(mmirs / "mmirs_camera2_ref.fits.gz")
+    frame = read_frame(mmirs / "mmirs_camera2_ref.fits.gz", FrameError)
     same = measure_slopes(frame, frame)
     assert np.nanmax(np.abs(same.wavefront)) < 1e-9
     moved = measure_slopes(np.roll(frame, (2, 3), (0, 1)), frame)
@@ -204,8 +204,8 @@ def test_the_command_takes_a_hexagonal_sensor(aolink, tmp_path):
         assert file["zernike_coefficients"].shape == file["zernike_indices"].shape == (14,)
     assert (tmp_path / "out.rrd").stat().st_size > 10_000
     np.save(tmp_path / "noise.npy", np.random.default_rng(0).normal(0.5, 0.01, frame.shape).astype(np.float32))
-    np.save(tmp_path / "colour.npy", np.zeros((*frame.shape, 3), dtype=np.uint8))
-    for name, says in (("noise", "no usable spots"), ("colour", "rows and columns")):
+    np.save(tmp_path / "stack.npy", np.zeros((2, *frame.shape), dtype=np.uint8))
+    for name, says in (("noise", "no usable spots"), ("stack", "holds 2 pictures, expected one")):
         refused = aolink("slopes", f"{name}.npy", "--reference", "flat.npy")
         assert refused.returncode == 9
         assert refused.stderr.count("\n") == 1
