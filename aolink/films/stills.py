@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 COMPRESSED = "JPEG and video hold light after a gamma curve and lossy compression"
 LOSSY = (".jpg", ".jpeg", ".webp")
-_LOSSLESS = ("PNG", "BMP", "TIFF", "PPM", "PGM")
+_LOSSLESS = ("PNG", "BMP", "TIFF", "PPM", "JPEG2000")
 _NETPBM = (b"P1", b"P2", b"P3", b"P4", b"P5", b"P6", b"P7")
 
 
@@ -51,19 +51,16 @@ def decoded(data: bytes) -> tuple[NDArray[Any], float | None, bool]:
             pixels = file.asarray()
             if data[:2] in (b"P1", b"P4"):
                 return pixels.astype(np.bool_), None, False
-            if pixels.dtype.itemsize * rows * columns * max(file.shape[-1] if file.axes.endswith("S") else 1, 1) > len(
-                data
-            ) and data[:2] in (b"P5", b"P6"):
-                raise ImportingError("it is cut off")
             pixels = pixels.astype(pixels.dtype.newbyteorder("="))
             full = np.iinfo(pixels.dtype).max if pixels.dtype.kind in "iu" else None
             return pixels, None if full in (None, file.maxval) else float(file.maxval), False
     with opened_image(io.BytesIO(data), ImportingError) as image:
         lossy = image.format not in _LOSSLESS
-        if image.format == "PNG" and data[24:25] == b"\x10" and image.mode != "I;16":  # 16 bits, and channels
+        if image.format in ("JPEG2000", "TIFF") or (image.format == "PNG" and data[24] > 8 and image.mode != "I;16"):
             with needs_extra("films", ImportingError):
                 import imagecodecs
-            return imagecodecs.png_decode(data), None, False
+            decode = {"PNG": imagecodecs.png_decode, "TIFF": imagecodecs.tiff_decode}
+            return decode.get(image.format, imagecodecs.jpeg2k_decode)(data), None, lossy
         return image_pixels(image), None, lossy
 
 

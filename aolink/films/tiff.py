@@ -61,7 +61,11 @@ def tiff_film(path: Path) -> Film:
             for page in pages:
                 if page is None or math.prod(page.chunked) > len(page.dataoffsets):  # it would count them all
                     raise ImportingError(f"{path} is damaged: a page lacks some of its pixels")
+                handle = page.parent.filehandle
+                handle.open()  # of another file of the stack, it is closed
                 yield _light(path, page.aspage(), read=True)[0]
+                if handle is not file.filehandle:
+                    handle.close()
 
     notes = [f"{path.name} holds {len(kinds)} stacks: the first is taken"] if others and not one_by_one else []
     known = _ome_times(tifffile.xml2dict(ome), size[0], notes) if ome else _imagej_times(imagej)

@@ -4,7 +4,10 @@ import json
 
 import numpy as np
 import pytest
+from astropy.io import fits
+from PIL import Image
 from scipy import ndimage
+from scipy.special import ndtr
 
 from aolink.errors import FrameError
 from aolink.films.pictures import read_frame
@@ -229,3 +232,46 @@ def test_the_command_prints_and_writes(aolink, mmirs, tmp_path):
     assert refused.returncode == 9
     assert refused.stderr.count("\n") == 1
     assert "no grid" in refused.stderr
+
+
+def sharp_spots(sd: float, moves: np.ndarray, pitch: int = 20) -> np.ndarray:
+    """Spots of a square grid, integrated over pixels, moved by (n, n, 2) as (x, y)."""
+    n = len(moves)
+    edges = np.arange(n * pitch + 17) - 0.5
+
+    def along(middle: float) -> np.ndarray:
+        return np.diff(ndtr((edges - middle) / sd))
+
+    light = np.full((len(edges) - 1,) * 2, 100.0)
+    for j, i in np.ndindex(n, n):
+        x, y = moves[j, i]
+        light += 20_000 * np.outer(along(14 + j * pitch + y), along(14 + i * pitch + x))
+    return light + np.random.default_rng(3).normal(0, 3, light.shape)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("sd", "most"), [(0.4, 0.03), (0.55, 0.01), (0.7, 0.004), (1.0, 0.004)])
+def test_undersampled_spots_are_measured(sd, most):
+    moves = np.random.default_rng(9).uniform(-1, 1, (8, 8, 2))
+    found = measure_slopes(sharp_spots(sd, moves), sharp_spots(sd, np.full((8, 8, 2), 0.3)))
+    error = found.displacements_px - (moves - moves.mean(axis=(0, 1)))
+    assert np.sqrt(np.mean(error**2)) < most
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["tif", "png", "bmp", "fits"])
+def test_frames_of_other_formats_and_bad_pixels(kind, tmp_path):
+    moves = np.random.default_rng(9).uniform(-1, 1, (8, 8, 2))
+    pictures = [np.rint(sharp_spots(1.2, each) / 16).astype(np.uint8) for each in (moves, 0 * moves)]
+    bad = np.random.default_rng(2).uniform(size=pictures[0].shape) < 1e-3
+    paths = [tmp_path / f"{name}.{kind}" for name in ("frame", "flat", "bad")]
+    for path, picture in zip(paths, [*(np.where(bad, 200, each) for each in pictures), bad], strict=True):
+        if kind == "fits":
+            fits.PrimaryHDU(picture[None].astype(np.int16)).writeto(path)
+        else:
+            Image.fromarray(picture.astype(np.uint8)).save(path)
+    found = measure_files(paths[0], paths[1], bad=paths[2])
+    error = found.displacements_px - (moves - moves.mean(axis=(0, 1)))
+    assert np.sqrt(np.mean(error**2)) < 0.03
+    holes = [np.where(bad, np.nan, each) for each in pictures]
+    np.testing.assert_array_equal(measure_slopes(*holes).displacements_px, found.displacements_px)

@@ -5,12 +5,14 @@ from __future__ import annotations
 import json
 import subprocess
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import tifffile
+from astropy.io import fits
 from numpy.typing import NDArray
 from PIL import Image
 from typer.testing import CliRunner
@@ -18,6 +20,7 @@ from typer.testing import CliRunner
 from aolink.cli.common import app
 from aolink.errors import RestorationError
 from aolink.films.film import array_film
+from aolink.films.formats import open_film
 from aolink.films.pictures import read_picture, read_psf, write_pictures
 from aolink.restoration import restore
 from tests.restoration.scenes import UNIFORM, blocks, blurred
@@ -161,3 +164,79 @@ def test_a_file_that_is_no_picture_is_refused(tmp_path: Path, name: str) -> None
     (tmp_path / name).write_text("junk")
     with pytest.raises(RestorationError, match=name):
         read_picture(tmp_path / name, RestorationError)
+
+
+def moved(count: int, top: float, dtype: type, channels: int = 0) -> NDArray[Any]:
+    """Pictures of a scene blurred along the rows, (count, rows, columns, any channels)."""
+    rng = np.random.default_rng(2)
+    shape = (24, 40, channels) if channels else (24, 40)
+    sharp = np.repeat(np.repeat(rng.uniform(0.2, 0.8, (count, 4, 5, *shape[2:])), 6, axis=1), 8, axis=2)
+    return np.rint(top * sum(np.roll(sharp, k, axis=2) for k in (-1, 0, 1)) / 3).astype(dtype)
+
+
+@pytest.mark.parametrize("kind", ["stack", "white is zero", "colours", "12 bits", "FITS"])
+def test_what_is_written_is_what_was_read(kind: str, tmp_path: Path) -> None:
+    """Its type, channels and pictures, and its meaning of black and white."""
+    channels, top = (3 if kind == "colours" else 0), 4095 if kind == "12 bits" else 60_000
+    frames = moved(1 if kind in ("colours", "12 bits") else 3, top, np.uint16, channels)
+    name = {"colours": "a.png", "12 bits": "a.pgm", "FITS": "a.fits"}.get(kind, "a.tif")
+    if kind in ("colours", "12 bits"):
+        write_pictures(tmp_path / name, [frames[0]], replace(array_film(frames, "a"), top=top if top == 4095 else None))
+    elif kind == "FITS":
+        fits.PrimaryHDU(frames).writeto(tmp_path / name)
+    else:
+        stored, meaning = (65535 - frames, "miniswhite") if kind == "white is zero" else (frames, "minisblack")
+        tifffile.imwrite(tmp_path / name, stored, photometric=meaning)
+    np.save(tmp_path / "psf.npy", np.ones((1, 3)))
+    files = ["--image", str(tmp_path / name), "--psf", str(tmp_path / "psf.npy")]
+    done = CliRunner().invoke(app, ["deblur", *files, "-o", str(tmp_path / f"out-{name}")])
+    assert done.exit_code == 0, done.output
+    before, after = open_film(tmp_path / name), open_film(tmp_path / f"out-{name}")
+    for field in ("count", "shape", "dtype", "top", "white_is_zero"):
+        assert getattr(before, field) == getattr(after, field)
+    expected = [restore(each, np.ones(3)).image for each in frames]
+    np.testing.assert_array_equal(list(after.pictures()), expected)
+
+
+def test_a_stack_does_not_become_one_picture(tmp_path: Path) -> None:
+    np.save(tmp_path / "a.npy", moved(2, 200, np.uint8))
+    (tmp_path / "psf.csv").write_text("1 1 1")
+    files = ["--image", str(tmp_path / "a.npy"), "--psf", str(tmp_path / "psf.csv")]
+    done = CliRunner().invoke(app, ["deblur", *files, "-o", str(tmp_path / "b.png")])
+    assert isinstance(done.exception, RestorationError)
+    assert "it holds one picture, and there are 2" in str(done.exception)
+
+
+@pytest.mark.parametrize(("top", "dtype"), [(255, np.uint8), (1023, np.uint16), (16383, np.uint16), (65535, np.uint16)])
+def test_saturated_pixels_are_left_out(top: int, dtype: type, tmp_path: Path) -> None:
+    scene = np.full((40, 60), 0.02 * top)
+    scene[20, 30] = 40.0 * top
+    blurred = sum(np.roll(scene, k, axis=1) for k in range(-3, 4)) / 7 + np.random.default_rng(1).normal(
+        0, 2e-3 * top, scene.shape
+    )
+    np.save(tmp_path / "a.npy", np.clip(np.rint(blurred), 0, top).astype(dtype))
+    np.save(tmp_path / "psf.npy", np.ones((1, 7)))
+    files = ["--image", str(tmp_path / "a.npy"), "--psf", str(tmp_path / "psf.npy")]
+    done = CliRunner().invoke(app, ["deblur", *files, "-o", str(tmp_path / "b.npy")])
+    assert "7 saturated pixels left out" in done.output
+    assert abs(np.load(tmp_path / "b.npy")[20, :20] / top - 0.02).max() < 0.02
+
+
+def test_a_motion_that_a_log_has_restores_as_its_psf_does(tmp_path: Path) -> None:
+    """The log's clock is 2.5 s behind; the exposure is a part of it."""
+    picture = moved(1, 200, np.float64)[0]
+    t = np.linspace(0, 10, 1001)
+    x = np.where(t < 4, 50.0, np.where(t < 6, 50.0 + 1.5 * (t - 5), 80.0))
+    rows = "".join(f"{time - 2.5 + 1_790_000_000:.6f},{place:.6f},0\n" for time, place in zip(t, x, strict=True))
+    (tmp_path / "log.csv").write_text("time,x,y\n" + rows)
+    fits.PrimaryHDU(picture, fits.Header({"DATE-OBS": "2026-09-21T14:13:24", "EXPTIME": 2.0})).writeto(
+        tmp_path / "a.fits"
+    )
+    files = ["--image", str(tmp_path / "a.fits"), "--path", str(tmp_path / "log.csv"), "-o", str(tmp_path / "b.npy")]
+    done = CliRunner().invoke(app, ["deblur", *files, "--offset", "2.5"])
+    assert done.exit_code == 0, done.output
+    psf = np.ones(3)  # a motion of three pixels at a steady velocity
+    expected = restore(picture, psf).image
+    assert np.sqrt(np.mean((np.load(tmp_path / "b.npy") - expected)[:, 4:-4] ** 2)) < 0.3 * np.std(picture - expected)
+    wrong = CliRunner().invoke(app, ["deblur", *files, "--overwrite", "--offset", "20"])
+    assert "give the right --offset or --exposure" in str(wrong.exception)
