@@ -53,6 +53,9 @@ ColourOption = Annotated[
     ),
 ]
 
+_DARK = 0.01
+"""Share of the pixels below zero that is worth a word."""
+
 
 def film_settings(
     rate: float | None, frames: int, track: int, at: list[str] | None, invert: bool, gamma: float, **more: object
@@ -169,4 +172,11 @@ def import_(
             subject, they = ("pixel", "it is") if count == 1 else ("pixels", "they are")
             verb = "is" if count == 1 else "are"
             stdout.print(f"warning: {count} {subject} ({share:.2%}) {verb} {what}: {they} masked", markup=False)
-    stdout.print(f"{output}: {account.exposures} exposures of {account.frames} frames", markup=False)
+    if account.below > account.pixels * _DARK:
+        stdout.print(
+            f"warning: {account.below / account.pixels:.0%} of the pixels are below zero, as in a film from which the"
+            " dark level was subtracted: --background puts the ground at the rig's black level",
+            markup=False,
+        )
+    missing = f", {account.missing} frames are missing" if account.missing else ""
+    stdout.print(f"{output}: {account.exposures} exposures of {account.frames} frames{missing}", markup=False)

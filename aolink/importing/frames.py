@@ -84,6 +84,8 @@ class FilmAccount:
     objects."""
     clipped: int = 0
     """Pixels whose counts do not fit into the rig's range, which are masked as well."""
+    below: int = 0
+    """Those of the clipped pixels that are below zero."""
     pixels: int = 0
     notes: tuple[str, ...] = ()
 
@@ -264,6 +266,7 @@ def counts_of(
     account.pixels += whole.size
     account.saturated += int(np.count_nonzero(~usable))
     account.clipped += int(np.count_nonzero(outside & usable))
+    account.below += int(np.count_nonzero((whole < 0) & usable))
     return np.clip(np.nan_to_num(whole), 0, rig.sensor.full_scale).astype(np.uint16), usable & ~outside
 
 

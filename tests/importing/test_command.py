@@ -66,6 +66,22 @@ def test_notes_and_warnings_are_printed(aolink, rig, tmp_path):
     assert said["clipped"] == np.count_nonzero((frames > 65_535 / 300) & (frames < 255))
 
 
+def test_a_film_without_its_dark_level_is_told_of_the_option(aolink, rig, tmp_path):
+    frames = np.random.default_rng(1).normal(0, 20, (7, 8, 8)).round().astype(np.int16)
+    source = others.written_npy(tmp_path, frames)
+    made = aolink("import", source, "-o", "a.mcap", "--rig", rig, "--rate", "50")
+    assert "of the pixels are below zero" in made.stdout
+    assert "--background" in made.stdout
+    made = aolink("import", source, "-o", "b.mcap", "--rig", rig, "--rate", "50", "--background")
+    assert "below zero" not in made.stdout
+
+
+def test_missing_frames_are_counted(aolink, rig, tmp_path):
+    np.savez(tmp_path / "film.npz", frames=FRAMES, times_s=np.array([0, 1, 2, 5, 6, 7, 9]) / 50)
+    made = aolink("import", "film.npz", "-o", "a.mcap", "--rig", rig)
+    assert made.stdout.endswith("a.mcap: 7 exposures of 7 frames, 3 frames are missing\n")
+
+
 def test_frames_are_summed(aolink, tmp_path):
     (tmp_path / "rig.toml").write_text(small_rig(3, 3).toml)
     source = others.written_npy(tmp_path, FRAMES)
