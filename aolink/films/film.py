@@ -16,7 +16,7 @@ from aolink.errors import ImportingError
 
 FilmFrame = NDArray[np.generic]
 
-_CONVERTERS = (10, 12, 14)
+_CONVERTERS = (8, 10, 12, 14)
 """Bits of cameras whose pixels are stored in 16, at the lower end or at the upper one."""
 _READ_FRAMES = 2000
 """Frames that are read, at most, to find out where a film saturates."""

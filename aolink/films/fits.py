@@ -77,6 +77,7 @@ def fits_film(path: Path, topic: str | None) -> Film:
 
     numbers = {key: _number(own.get(key)) for key in ("EXPTIME", "EXPOSURE", "FRATE", "FRAMRATE", "KINTIME")}
     cycle = numbers["KINTIME"]
+    odd = [f"{key} = {own[key]!r} is no time or rate: not used" for key in numbers if key in own and not numbers[key]]
     several = f"{path.name} holds {len(more) + 1} cubes: the first is taken" if more else ""
     start_ns, unknown = start_of(own)
     mosaic = str(own.get("BAYERPAT", own.get("COLORTYP", ""))).strip()
@@ -84,7 +85,7 @@ def fits_film(path: Path, topic: str | None) -> Film:
         name=path.name, shape=(shape[-2], shape[-1]), dtype=dtype.newbyteorder("="), count=count, pictures=pictures,
         rate_hz=numbers["FRATE"] or numbers["FRAMRATE"] or (1 / cycle if cycle else None),
         exposure_s=numbers["EXPTIME"] or numbers["EXPOSURE"], start_ns=start_ns,
-        mosaic=mosaic if mosaic in _MOSAICS else "", notes=tuple(filter(None, (several, damaged, unknown))),
+        mosaic=mosaic if mosaic in _MOSAICS else "", notes=tuple(filter(None, (several, damaged, unknown, *odd))),
     )  # fmt: skip
 
 
@@ -114,7 +115,7 @@ def _opened(path: Path) -> Iterator[tuple[Any, int]]:
 
 def _number(value: Any) -> float | None:
     try:
-        number = float(value)
+        number = float(str(value).strip().upper().replace("D", "E"))
     except (TypeError, ValueError):
         return None
     return number if math.isfinite(number) and number > 0 else None

@@ -33,7 +33,7 @@ _FILMS: dict[str, _Reader] = {
                     video.video_film),
     **dict.fromkeys(_PICTURES, stills.picture_film),
 }  # fmt: skip
-_IN_FOLDERS = (".fits", ".fit", ".fts", ".npy", ".ser", ".tif", ".tiff", *_PICTURES)
+_IN_FOLDERS = (".fits", ".fit", ".fts", *_FILMS)
 """Formats, by the suffix of the file; those of one picture are read alike."""
 
 

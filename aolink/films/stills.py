@@ -28,11 +28,10 @@ _NETPBM = (b"P1", b"P2", b"P3", b"P4", b"P5", b"P6", b"P7")
 
 def picture_film(path: Path) -> Film:
     """A film of one picture."""
-    data = path.read_bytes()
-    pixels, top, lossy = decoded(data)
+    pixels, top, lossy = decoded(path.read_bytes())
     return Film(
         name=path.name, shape=pixels.shape[:2], dtype=pixels.dtype, count=1, top=top,
-        pictures=lambda: iter([decoded(path.read_bytes())[0]]), nonlinear=COMPRESSED if lossy else "",
+        pictures=lambda: iter([pixels]), nonlinear=COMPRESSED if lossy else "",
     )  # fmt: skip
 
 

@@ -68,6 +68,8 @@ def tiff_film(path: Path) -> Film:
                     handle.close()
 
     notes = [f"{path.name} holds {len(kinds)} stacks: the first is taken"] if others and not one_by_one else []
+    if axes[0] in "CZ" and size[0] > 1 and not one_by_one:
+        notes.append(f"its axis {axes[0]}, {'channels' if axes[0] == 'C' else 'depths'}, is taken for frames")
     known = _ome_times(tifffile.xml2dict(ome), size[0], notes) if ome else _imagej_times(imagej)
     return Film(
         name=path.name, shape=(size[1], size[2]), dtype=dtype, count=size[0], pictures=pictures,

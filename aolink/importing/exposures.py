@@ -55,6 +55,8 @@ def imported(film: Film, rig: Rig, settings: FilmSettings, account: FilmAccount)
     times = frame_times(film, rig, settings)
     account.missing = times.missing
     account.notes = (*film.notes, *times.notes, *(() if settings.invert else film.saturation_notes))
+    if film.start_ns is None and settings.start_ns is None:
+        account.notes += ("when the film was taken is not known: its times count from 1970 unless --start is given",)
     if film.nonlinear and settings.gamma == 1.0:
         account.notes += (nonlinear_note(film),)
     if film.slopes:

@@ -169,8 +169,9 @@ def read_mirror(table: Table, n_inputs: int, given: bool) -> MirrorDriver:
     law = table.read_any("voltage", read_voltage)
     if law and (table.has("input_min") or table.has("input_max")):
         raise RigError("mirror.input_min and mirror.input_max follow from [mirror.voltage]: leave them out")
-    low = np.full(n_inputs, law.input_range[0]) if law else table.vector("input_min", n_inputs, "inputs", None if given else -_STILL)
-    high = np.full(n_inputs, law.input_range[1]) if law else table.vector("input_max", n_inputs, "inputs", None if given else _STILL)
+    least, most = (None, None) if given else (-_STILL, _STILL)
+    low = np.full(n_inputs, law.input_range[0]) if law else table.vector("input_min", n_inputs, "inputs", least)
+    high = np.full(n_inputs, law.input_range[1]) if law else table.vector("input_max", n_inputs, "inputs", most)
     if (low >= high).any():
         raise RigError("mirror.input_min must be below mirror.input_max for every input")
     park = table.vector("park", n_inputs, "inputs", 0.0)

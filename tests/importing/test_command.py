@@ -55,6 +55,7 @@ def test_notes_and_warnings_are_printed(aolink, rig, tmp_path):
     made = aolink("import", source, "-o", "a.mcap", "--rig", rig)
     assert made.stdout.splitlines() == [
         "note: the film does not state its frame rate: that of the rig file is assumed, 50 frames/s",
+        "note: when the film was taken is not known: its times count from 1970 unless --start is given",
         "warning: 4 pixels (0.89%) are saturated in the film, hot or dead, no numbers, or shared by two objects: they"
         " are masked",
         "a.mcap: 7 exposures of 7 frames",
@@ -85,7 +86,7 @@ def test_missing_frames_are_counted(aolink, rig, tmp_path):
 def test_frames_are_summed(aolink, tmp_path):
     (tmp_path / "rig.toml").write_text(small_rig(3, 3).toml)
     source = others.written_npy(tmp_path, FRAMES)
-    made = aolink("import", source, "-o", "a.mcap", "--rig", "rig.toml", "--sum", "3", "--rate", "1000")
+    made = aolink("import", source, "-o", "a.mcap", "--rig", "rig.toml", "--sum", "3", "--rate", "1000", "--start", "2026-11-22")
     assert made.stdout == "a.mcap: 2 exposures of 6 frames\n"
     first = next(iter(Recording(tmp_path / "a.mcap")))
     np.testing.assert_array_equal(first.pixels, np.rint(FRAMES[:3].mean(axis=0) * 256))
