@@ -100,7 +100,7 @@ def encoded(path: Path, picture: NDArray[Any], top: float | None) -> bytes:
     if suffix == ".png" and picture.dtype == np.uint16 and picture.ndim == 3:
         with needs_extra("films", ImportingError):
             import imagecodecs
-        return bytes(imagecodecs.png_encode(picture))
+        return bytes(imagecodecs.png_encode(np.ascontiguousarray(picture)))
     from PIL import Image
 
     kind = Image.registered_extensions().get(suffix)

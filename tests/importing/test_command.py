@@ -86,7 +86,9 @@ def test_missing_frames_are_counted(aolink, rig, tmp_path):
 def test_frames_are_summed(aolink, tmp_path):
     (tmp_path / "rig.toml").write_text(small_rig(3, 3).toml)
     source = others.written_npy(tmp_path, FRAMES)
-    made = aolink("import", source, "-o", "a.mcap", "--rig", "rig.toml", "--sum", "3", "--rate", "1000", "--start", "2026-11-22")
+    made = aolink(
+        "import", source, "-o", "a.mcap", "--rig", "rig.toml", "--sum", "3", "--rate", "1000", "--start", "2026-11-22"
+    )
     assert made.stdout == "a.mcap: 2 exposures of 6 frames\n"
     first = next(iter(Recording(tmp_path / "a.mcap")))
     np.testing.assert_array_equal(first.pixels, np.rint(FRAMES[:3].mean(axis=0) * 256))
