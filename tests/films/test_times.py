@@ -74,7 +74,8 @@ def test_frames_that_a_video_lacks_are_a_gap(tmp_path):
     frames = numbers(np.uint8, 6, 16, 16)
     film = open_film(others.write_stream(tmp_path / "a.mkv", frames, "ffv1", "gray", 300.0, [0, 1, 2, 6, 7, 8]))
     np.testing.assert_array_equal(list(film.frames()), frames)
-    np.testing.assert_allclose(film.times_ns, np.array([0, 1, 2, 6, 7, 8]) * 1e9 / 300, atol=1)
+    assert film.times_ns is not None
+    assert abs(film.times_ns - np.array([0, 1, 2, 6, 7, 8]) * 1e9 / 300).max() <= 1
 
 
 def test_ome_planes_have_their_own_times(tmp_path):

@@ -50,7 +50,7 @@ def with_palette(path: Path, frames: NDArray[Any]) -> None:
     tifffile.imwrite(path, 255 - frames, photometric="palette", colormap=np.stack([grey] * 3))
 
 
-TIFFS: dict[str, tuple[Callable[[Path, NDArray[Any]], None], NDArray[Any]]] = {
+TIFFS: dict[str, tuple[Callable[[Path, NDArray[Any]], object], NDArray[Any]]] = {
     "packed 12 bits": (packed_tiff, TWELVE),
     "white is zero": (lambda path, frames: tifffile.imwrite(path, 65535 - frames, photometric="miniswhite"), TWELVE),
     "palette": (with_palette, EIGHT),
@@ -218,7 +218,7 @@ def test_one_colour_of_a_mosaic_and_of_colours(tmp_path):
     red, blue = TWELVE[:, ::2, 1::2], TWELVE[:, 1::2, ::2]
     green = (TWELVE[:, ::2, ::2].astype(float) + TWELVE[:, 1::2, 1::2]) / 2
     for name, expected in (("red", red), ("green", green), ("blue", blue), ("all", (red + green + blue) / 3)):
-        np.testing.assert_allclose(list(one_colour(film, name).frames()), expected)
+        assert abs(np.array(list(one_colour(film, name).frames())) - expected).max() < 1e-9
     tifffile.imwrite(tmp_path / "a.tif", COLOURS, photometric="rgb")
     np.testing.assert_array_equal(list(one_colour(open_film(tmp_path / "a.tif"), "blue").frames()), COLOURS[..., 2])
     tifffile.imwrite(tmp_path / "b.tif", TWELVE, photometric="minisblack")

@@ -235,7 +235,7 @@ def write_stream(
     """A video of a codec and a pixel format of FFmpeg's; frame k is the one numbered ``at[k]`` in time."""
     rate = Fraction(rate_hz).limit_denominator(10_000)
     with av.open(str(path), "w") as file:
-        stream = file.add_stream(codec, rate=rate)
+        stream: Any = file.add_stream(codec, rate=rate)
         stream.width, stream.height, stream.pix_fmt = frames.shape[2], frames.shape[1], kind
         stream.options = {"crf": "10", "qmin": "1", "qmax": "2"} if codec in ("libx264", "mpeg4") else {}
         plain = "rgb24" if frames.ndim == 4 and frames.dtype == np.uint8 else kind
