@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
-import cv2
+import av
 import h5py
 import imagecodecs
 import netpbmfile
@@ -42,6 +43,19 @@ def packed_tiff(path: Path, frames: NDArray[Any]) -> None:
         at = start + len(data)
         parts += [struct.pack("<H", 9), *entries, struct.pack("<I", at if k < len(frames) - 1 else 0), data]
     path.write_bytes(b"".join(parts))
+
+
+def png_of_ffmpeg(picture: NDArray[Any]) -> bytes:
+    """A PNG of three times 16 bits."""
+    codec: Any = av.CodecContext.create("png", "w")
+    codec.width, codec.height, codec.pix_fmt, codec.time_base = (
+        picture.shape[1],
+        picture.shape[0],
+        "rgb48be",
+        Fraction(1, 25),
+    )
+    frame = av.VideoFrame.from_ndarray(picture, "rgb48le").reformat(format="rgb48be")
+    return b"".join(map(bytes, [*codec.encode(frame), *codec.encode(None)]))
 
 
 def with_palette(path: Path, frames: NDArray[Any]) -> None:
@@ -113,7 +127,7 @@ def test_a_pgm_has_its_own_counts_and_its_own_largest_value(most, tmp_path):
 def test_three_times_16_bits_stay_16_bits(kind, tmp_path):
     picture = COLOURS[0]
     if kind == "PNG":
-        cv2.imwrite(str(tmp_path / "a.png"), picture[..., ::-1])
+        (tmp_path / "a.png").write_bytes(png_of_ffmpeg(picture))
     elif kind == "PNG with transparency":
         picture = np.dstack([picture, picture[..., 0]])
         (tmp_path / "a.png").write_bytes(imagecodecs.png_encode(picture))
