@@ -20,21 +20,18 @@ from aolink.errors import AolinkError, ImportingError
 from aolink.films import arrays, bags, fits, stills, tiff, video
 from aolink.films.film import Film, FilmFrame
 
-_Reader = Callable[[Path], Film]
-_OF_TOPICS: dict[str, Callable[[Path, str | None], Film]] = {
-    **dict.fromkeys((".fits", ".fit", ".fts"), fits.fits_film), **dict.fromkeys((".h5", ".hdf5"), arrays.hdf5_film),
-    ".mcap": bags.mcap_film, ".bag": bags.ros_film,
-}  # fmt: skip
 _PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".pgm", ".ppm", ".pbm", ".pnm", ".webp", ".jp2")
-_FILMS: dict[str, _Reader] = {
-    ".npy": arrays.npy_film, ".npz": arrays.npz_film, ".ser": arrays.ser_film,
-    **dict.fromkeys((".tif", ".tiff"), tiff.tiff_film),
-    **dict.fromkeys((".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg", ".wmv", ".gif", ".apng"),
-                    video.video_film),
+_FITS = (".fits", ".fit", ".fts")
+_VIDEOS = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg", ".wmv", ".gif", ".apng")
+_FORMATS: dict[str, Callable[..., Film]] = {
+    ".npy": arrays.npy_film, ".npz": arrays.npz_film, ".ser": arrays.ser_film, ".mcap": bags.mcap_film,
+    ".bag": bags.ros_film, **dict.fromkeys((".tif", ".tiff"), tiff.tiff_film), **dict.fromkeys(_FITS, fits.fits_film),
+    **dict.fromkeys((".h5", ".hdf5"), arrays.hdf5_film), **dict.fromkeys(_VIDEOS, video.video_film),
     **dict.fromkeys(_PICTURES, stills.picture_film),
 }  # fmt: skip
-_IN_FOLDERS = (".fits", ".fit", ".fts", *_FILMS)
-"""Formats, by the suffix of the file; those of one picture are read alike."""
+"""Readers by the suffix of the file."""
+_WITH_TOPICS = (".mcap", ".bag", ".h5", ".hdf5", *_FITS)
+"""Formats that may hold several films, one of which the topic names."""
 
 
 def open_film(source: str | Path, topic: str | None = None) -> Film:
@@ -56,26 +53,21 @@ def open_film(source: str | Path, topic: str | None = None) -> Film:
         raise ImportingError(f"cannot read {path}: there is no such file or folder")
     suffix = _suffix(path)
     with _one_error(path):
-        if path.is_dir() and (path / "metadata.yaml").exists():
-            film = bags.ros_film(path, topic)
-        elif not path.is_dir() and not path.is_file():
+        if not path.is_dir() and not path.is_file():
             raise ImportingError(f"{path} is a pipe or a device: copy what it gives into a file")
-        elif not path.is_dir() and suffix in _OF_TOPICS:
-            film = _OF_TOPICS[suffix](path, topic)
-        else:
-            read = (
-                _folder
-                if path.is_dir()
-                else _FILMS.get(suffix) or (stills.picture_film if suffix in _PICTURES else None)
-            )
-            if suffix == ".db3":
-                raise ImportingError(f"{path} is a part of a ROS 2 bag: give the bag's folder, which has metadata.yaml")
-            if read is None:
-                known = ", ".join([*_FILMS, *_OF_TOPICS])
-                raise ImportingError(f"{path} is no kind of film that is known: give {known} or a folder of pictures")
-            if topic is not None:
-                raise ImportingError(fits.no_topic(path, topic))
+        if suffix == ".db3":
+            raise ImportingError(f"{path} is a part of a ROS 2 bag: give the bag's folder, which has metadata.yaml")
+        is_bag = (path / "metadata.yaml").exists()
+        read = bags.ros_film if is_bag else _folder if path.is_dir() else _FORMATS.get(suffix)
+        if read is None:
+            known = ", ".join(_FORMATS)
+            raise ImportingError(f"{path} is no kind of film that is known: give {known} or a folder of pictures")
+        if is_bag or (path.is_file() and suffix in _WITH_TOPICS):
+            film = read(path, topic)
+        elif topic is None:
             film = read(path)
+        else:
+            raise ImportingError(fits.no_topic(path, topic))
     if film.mosaic:
         note = f"its pixels are under a Bayer mosaic, {film.mosaic}: --colour green (or red, blue) takes one colour"
         film = replace(film, notes=(*film.notes, note))
@@ -120,17 +112,17 @@ def _checked(film: Film, path: Path) -> Iterator[FilmFrame]:
 
 def _folder(path: Path) -> Film:
     """The films of a folder's files, one after the other."""
-    files = sorted(
-        (each for each in path.iterdir() if _suffix(each) in _IN_FOLDERS and each.name[0] != "." and each.is_file()),
-        key=_number_order,
-    )
+    known = {each for each in path.iterdir() if _suffix(each) in _FORMATS.keys() - {".mcap", ".bag"}}
+    files = sorted((each for each in known if each.name[0] != "." and each.is_file()), key=_number_order)
     if not files and any(each.suffix in (".db3", ".mcap") for each in path.iterdir()):
         raise ImportingError(f"{path} has no metadata.yaml, as a ROS 2 bag has: `ros2 bag reindex` makes one")
     if not files:
-        raise ImportingError(f"{path} holds no pictures ({', '.join(_IN_FOLDERS)})")
+        raise ImportingError(f"{path} holds no pictures ({', '.join(_FORMATS)})")
     notes = []
     lossless = [each for each in files if _suffix(each) not in stills.LOSSY]
     if lossless and (left := len(files) - len(lossless)):
+        if left > len(lossless):
+            raise ImportingError(f"{path} holds {left} JPEG files and {len(lossless)} others: which are the frames?")
         notes.append(f"{left} JPEG files beside other pictures are left out, as previews of them")
         files = lossless
     names: dict[str, Path] = {}

@@ -258,3 +258,10 @@ def test_compressed_depths(tmp_path):
         images.append(image)
     film = open_film(others.write_cdr_mcap(tmp_path / "a.mcap", images))
     np.testing.assert_array_equal(list(film.frames()), TWELVE)
+
+
+def test_one_picture_among_many_jpegs_is_not_taken_for_the_film(tmp_path):
+    for k in range(3):
+        Image.fromarray(EIGHT[k]).save(tmp_path / f"{k}.jpg")
+    Image.fromarray(EIGHT[0]).save(tmp_path / "plot.png")
+    assert "holds 3 JPEG files and 1 others: which are the frames?" in refused(tmp_path)
