@@ -58,7 +58,8 @@ def open_film(source: str | Path, topic: str | None = None) -> Film:
         if suffix == ".db3":
             raise ImportingError(f"{path} is a part of a ROS 2 bag: give the bag's folder, which has metadata.yaml")
         is_bag = (path / "metadata.yaml").exists()
-        read = bags.ros_film if is_bag else _folder if path.is_dir() else _FORMATS.get(suffix)
+        folder = bags.ros_film if is_bag else _folder
+        read: Callable[..., Film] | None = folder if path.is_dir() else _FORMATS.get(suffix)
         if read is None:
             known = ", ".join(_FORMATS)
             raise ImportingError(f"{path} is no kind of film that is known: give {known} or a folder of pictures")
@@ -112,8 +113,8 @@ def _checked(film: Film, path: Path) -> Iterator[FilmFrame]:
 
 def _folder(path: Path) -> Film:
     """The films of a folder's files, one after the other."""
-    known = {each for each in path.iterdir() if _suffix(each) in _FORMATS.keys() - {".mcap", ".bag"}}
-    files = sorted((each for each in known if each.name[0] != "." and each.is_file()), key=_number_order)
+    found = {each for each in path.iterdir() if _suffix(each) in _FORMATS.keys() - {".mcap", ".bag"}}
+    files = sorted((each for each in found if each.name[0] != "." and each.is_file()), key=_number_order)
     if not files and any(each.suffix in (".db3", ".mcap") for each in path.iterdir()):
         raise ImportingError(f"{path} has no metadata.yaml, as a ROS 2 bag has: `ros2 bag reindex` makes one")
     if not files:
