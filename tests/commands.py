@@ -29,8 +29,7 @@ TIMEOUT_S = 300
 _MODULES = (
     "aolink.cli",
     "aolink.exporting.files",
-    "aolink.importing.bags",
-    "aolink.importing.readers",
+    "aolink.films.pictures",
     "aolink.importing.recording",
     "aolink.jobs.batch",
     "aolink.jobs.calibrate",

@@ -165,6 +165,7 @@ def laboratory(tmp_path_factory: pytest.TempPathFactory) -> Path:
     beads = spot_film(rng, random_walk(rng, 80, 2, 0.5), np.array([[24.0, 32.0], [70.0, 30.0]]))
     tifffile.imwrite(folder / "beads.tif", beads.frames)
     np.savetxt(folder / "psf.csv", np.full((1, 9), 1 / 9), delimiter=",")
+    (folder / "log.csv").write_text("time,x,y\n0.0,0.0,0.0\n0.1,5.0,1.0\n")
     return folder
 
 

@@ -44,6 +44,18 @@ TopicOption = Annotated[
     ),
 ]
 
+ColourOption = Annotated[
+    str | None,
+    typer.Option(
+        "--colour",
+        metavar="red|green|blue|all",
+        help="One colour of pictures in colour or under a Bayer mosaic; all: the mean of a mosaic's colours.",
+    ),
+]
+
+_DARK = 0.01
+"""Share of the pixels below zero that is worth a word."""
+
 
 def film_settings(
     rate: float | None, frames: int, track: int, at: list[str] | None, invert: bool, gamma: float, **more: object
@@ -79,7 +91,8 @@ def import_(
         typer.Argument(
             metavar="SOURCE",
             parser=local_file,
-            help="A film: .npy, .npz, TIFF, FITS cube, video, MCAP, ROS bag, AOT telemetry, or a folder of pictures.",
+            help="A film: .npy, .npz, HDF5, SER, TIFF, FITS, video, MCAP, ROS bag, AOT telemetry, or a folder of"
+            " pictures or stacks.",
         ),
     ],
     output: OutputOption,
@@ -109,11 +122,13 @@ def import_(
         ),
     ] = None,
     topic: TopicOption = None,
+    colour: ColourOption = None,
     overwrite: OverwriteOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """Make a recording of a film: then estimate, replay, compare, deblur and view it like any other."""
-    from aolink.importing.readers import open_film
+    from aolink.films.film import one_colour
+    from aolink.films.formats import open_film
     from aolink.importing.recording import import_film
     from aolink.rig import load_rig
 
@@ -134,6 +149,10 @@ def import_(
     )  # fmt: skip
     loaded = load_rig(rig)
     film = open_film(source, topic)
+    if colour is not None:
+        if colour not in ("red", "green", "blue", "all"):
+            raise ImportingError(f"--colour {colour} is no colour: give red, green, blue or all")
+        film = one_colour(film, colour)
     with progress("import", film.count // frames) as tell:
         account = import_film(
             film, loaded, settings, output, overwrite=overwrite, sources=[source, Path(rig)],
@@ -153,4 +172,11 @@ def import_(
             subject, they = ("pixel", "it is") if count == 1 else ("pixels", "they are")
             verb = "is" if count == 1 else "are"
             stdout.print(f"warning: {count} {subject} ({share:.2%}) {verb} {what}: {they} masked", markup=False)
-    stdout.print(f"{output}: {account.exposures} exposures of {account.frames} frames", markup=False)
+    if account.below > account.pixels * _DARK:
+        stdout.print(
+            f"warning: {account.below / account.pixels:.0%} of the pixels are below zero, as in a film from which the"
+            " dark level was subtracted: --background puts the ground at the rig's black level",
+            markup=False,
+        )
+    missing = f", {account.missing} frames are missing" if account.missing else ""
+    stdout.print(f"{output}: {account.exposures} exposures of {account.frames} frames{missing}", markup=False)

@@ -148,6 +148,9 @@ def slopes(
         Path | None, typer.Option("--output", "-o", metavar="FILE.npz", help="Write all results.")
     ] = None,
     rrd: Annotated[Path | None, typer.Option(metavar="FILE.rrd", help="Write the results for Rerun.")] = None,
+    bad: Annotated[
+        Path | None, typer.Option("--bad", metavar="FILE", help="A picture that is not zero where pixels are bad.")
+    ] = None,
     pitch_m: Annotated[float | None, typer.Option(min=1e-9, help="Distance between neighbouring lenslets, m.")] = None,
     focal_m: Annotated[float | None, typer.Option(min=1e-9, help="Focal length of a lenslet, m.")] = None,
     overwrite: OverwriteOption = False,
@@ -168,7 +171,7 @@ def slopes(
         check_target(output, overwrite=overwrite, sources=inputs, suffix=".npz", error=FrameError)
     if rrd is not None:
         check_target(rrd, overwrite=overwrite, sources=inputs, suffix=".rrd", error=ViewerError)
-    result = job.measure_files(frame, reference, pitch_m=pitch_m, focal_m=focal_m)
+    result = job.measure_files(frame, reference, pitch_m=pitch_m, focal_m=focal_m, bad=bad)
     if output is not None:
         job.save(result, output, overwrite=overwrite)
     if rrd is not None:

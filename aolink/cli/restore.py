@@ -3,8 +3,9 @@
 import json
 import math
 import os
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from typer.core import TyperCommand, TyperOption
@@ -13,6 +14,9 @@ from aolink.cli import common
 from aolink.cli.common import JsonOption, OverwriteOption, app, check_measured, local_file, open_recording, stdout
 from aolink.errors import RestorationError
 from aolink.files import check_target
+
+if TYPE_CHECKING:
+    from aolink.restoration.films import PathClock
 
 
 class _NamingMethods(TyperCommand):
@@ -58,7 +62,8 @@ def deblur(
         typer.Option(
             "--image",
             metavar="IN.png",
-            help="A blurred picture: .png, .tif, .jpg, .npy. Pixels that are not numbers are filled in.",
+            help="A blurred picture, or a stack of them, of any kind that `aolink import` reads. Pixels that are not"
+            " numbers, or saturated, are left out.",
         ),
     ] = None,
     psf: Annotated[
@@ -66,9 +71,23 @@ def deblur(
         typer.Option(
             "--psf",
             metavar="PSF.csv",
-            help="Its PSF: .npy, or rows of numbers; one row of n taps lies along the picture's rows. Tap n // 2"
-            " is where the scene stays in place.",
+            help="Its PSF: a picture, .npy, or rows of numbers; one row of n taps lies along the picture's rows, one"
+            " column along its columns. Tap n // 2 is where the scene stays in place.",
         ),
+    ] = None,
+    path: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="LOG.csv",
+            help="Instead of a PSF, the motion as something else measured it (a gyro, an encoder): rows of time (s), x"
+            " and y (pixels along columns and rows).",
+        ),
+    ] = None,
+    offset: Annotated[
+        float, typer.Option(metavar="S", help="Seconds by which the log's clock is behind that of the pictures.")
+    ] = 0.0,
+    exposure: Annotated[
+        float | None, typer.Option(metavar="S", help="Exposure time of --image with --path, where its file lacks it.")
     ] = None,
     method: Annotated[str | None, typer.Option(help="The restoration method.")] = None,
     noise_sd: Annotated[
@@ -79,15 +98,17 @@ def deblur(
 ) -> None:
     """Remove the motion blur from every picture of a recording, or from a single picture with a known PSF."""
     from aolink.estimation.registry import DEFAULT_ESTIMATOR
+    from aolink.restoration.films import PathClock
     from aolink.restoration.registry import DEFAULT_METHOD
 
     method = method or DEFAULT_METHOD
-    if file is not None and not (image or psf or noise_sd):
+    if file is not None and not (image or psf or path or noise_sd):
         _deblur_recording(file, out, estimator or DEFAULT_ESTIMATOR, method, overwrite=overwrite, as_json=as_json)
-    elif file is None and image is not None and psf is not None:
-        _deblur_picture(image, psf, out, method, noise_sd, overwrite=overwrite, as_json=as_json)
+    elif file is None and image is not None and (blur := psf or path) is not None and None in (psf, path):
+        clock = PathClock(offset, exposure) if psf is None else None
+        _deblur_pictures(image, blur, clock, out, method, noise_sd, overwrite=overwrite, as_json=as_json)
     else:
-        raise typer.BadParameter("give a recording alone, or --image and --psf (and --noise-sd with these)")
+        raise typer.BadParameter("give a recording alone, or --image with --psf or --path (and --noise-sd with these)")
 
 
 def _deblur_recording(
@@ -111,34 +132,45 @@ def _deblur_recording(
     check_measured(file, {estimator: summary.motion.result()})
 
 
-def _deblur_picture(
-    image: Path, psf: Path, out: Path, method: str, noise_sd: float | None, *, overwrite: bool, as_json: bool
-) -> None:
-    import numpy as np
-
+def _deblur_pictures(
+    image: Path, blur: Path, clock: "PathClock | None", out: Path, method: str, noise_sd: float | None, *,
+    overwrite: bool, as_json: bool,
+) -> None:  # fmt: skip
     from aolink.cli.tables.sessions import adds_error
-    from aolink.optics.pictures import finite_pixels, read_picture, read_psf, write_picture
-    from aolink.restoration import find_method, restore
+    from aolink.films.pictures import read_film, read_psf, write_pictures
+    from aolink.restoration import find_method
+    from aolink.restoration.films import path_psfs, restored_film
 
-    check_target(out, overwrite=overwrite, sources=[image, psf], error=RestorationError)
-    whole = read_picture(image)
-    # Transparency is not light: it stays as it is.
-    picture = whole[..., :3] if whole.ndim == 3 and whole.shape[2] == 4 else whole
-    seen = finite_pixels(picture)
-    missing = 0 if seen is None else int((~seen).sum())
-    restored = restore(picture, read_psf(psf), method=method, noise_sd=noise_sd, mask=seen)
-    made = restored.image if picture is whole else np.dstack([restored.image, whole[..., 3]])
-    write_picture(out, made, overwrite=overwrite, sources=[image, psf])
-    if as_json:
-        found = None if math.isnan(restored.noise_sd) else restored.noise_sd
-        gain = None if math.isnan(restored.expected_gain_db) else restored.expected_gain_db
-        facts = {"method": method, "noise_sd": found, "direction": restored.direction, "pixels_filled": missing}
-        facts["expected_gain_db"] = gain
-        print(json.dumps({"out": str(out), **facts}))
+    check_target(out, overwrite=overwrite, sources=[image, blur], error=RestorationError)
+    film = read_film(image, RestorationError)
+    notes: tuple[str, ...] = ()
+    if clock is None:
+        psf, notes = read_psf(blur)
+        psfs: Sequence[Any] = [psf] * film.count
     else:
-        noise = "" if math.isnan(restored.noise_sd) else f", noise sd {restored.noise_sd:.3g}"
-        scanned = f", scanned {restored.direction}s" if "direction" in find_method(method).parameters else ""
-        filled = f", {missing} pixels that are not numbers filled in" if missing else ""
-        stdout.print(f"{out}: {method}{noise}{scanned}{filled}", markup=False)
-        for line in adds_error(method, restored.expected_gain_db):
+        psfs = path_psfs(blur, clock, film)
+    done = restored_film(film, psfs, method, noise_sd)
+    write_pictures(out, done.pictures, film, overwrite=overwrite, sources=[image, blur])
+    last = done.last
+    if as_json:
+        found = None if math.isnan(last.noise_sd) else last.noise_sd
+        gain = None if math.isnan(last.expected_gain_db) else last.expected_gain_db
+        facts: dict[str, Any] = {
+            "method": method,
+            "noise_sd": found,
+            "direction": last.direction,
+            "pixels_filled": done.missing,
+        }
+        facts |= {"pixels_saturated": done.saturated, "pictures": len(done.pictures), "warnings": notes}
+        print(json.dumps({"out": str(out), **facts, "expected_gain_db": gain}))
+    else:
+        noise = "" if math.isnan(last.noise_sd) else f", noise sd {last.noise_sd:.3g}"
+        scanned = f", scanned {last.direction}s" if "direction" in find_method(method).parameters else ""
+        filled = f", {done.missing} pixels that are not numbers filled in" if done.missing else ""
+        filled += f", {done.saturated} saturated pixels left out" if done.saturated else ""
+        several = f", {len(done.pictures)} pictures" if len(done.pictures) > 1 else ""
+        stdout.print(f"{out}: {method}{several}{noise}{scanned}{filled}", markup=False)
+        for note in notes:
+            stdout.print(f"warning: {note}", markup=False)
+        for line in adds_error(method, last.expected_gain_db):
             stdout.print(line, markup=False)

@@ -138,8 +138,8 @@ def _check_goes_with(context: typer.Context, film: Path | None) -> None:
 
 
 def _write_first_rig(path: Path, source: Path, topic: str | None, settings: "FilmSettings", overwrite: bool) -> None:
+    from aolink.films.formats import open_film
     from aolink.importing.first_rig import first_rig
-    from aolink.importing.readers import open_film
 
     check_target(path, overwrite=overwrite, suffix=".toml", error=RigError)
     film = open_film(source, topic)

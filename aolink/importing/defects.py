@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from aolink.errors import FrameError
-from aolink.importing.film import Film
-from aolink.importing.frames import FilmLight, mended
+from aolink.films.film import Film
+from aolink.importing.frames import FilmLight
 from aolink.numerics.arrays import BoolArray, FloatArray
 from aolink.numerics.rms import rms
 from aolink.optics.kernel import pixel_masses
-from aolink.optics.maxima import flatten, spread
+from aolink.optics.maxima import flatten, mended, spread
 
 _SAMPLES, FEWEST = 49, 9
 """Number of frames of whose pixels the median is taken, and the least."""

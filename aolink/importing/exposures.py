@@ -17,13 +17,14 @@ from numpy.typing import NDArray
 from aolink.assembly import Assembler, Frame
 from aolink.errors import ImportingError
 from aolink.exposure import Exposure, Exposures
+from aolink.films.film import Film
 from aolink.importing.brightness import brightness_of, change_of
 from aolink.importing.defects import defects_note, find_defects
-from aolink.importing.film import Film
 from aolink.importing.frames import (
     FilmAccount,
     FilmLight,
     FilmSettings,
+    FrameTimes,
     ImportedExposure,
     counts_of,
     default_scale,
@@ -42,8 +43,6 @@ _FASTER = 0.75
 """Commands at a shorter distance than this part of a fast step are too many for the rig."""
 _WEIGHT = 2.5
 """Standard deviation of the weight under which a spot's light is measured, in those of the kernel."""
-_LATEST_NS = 2**63
-"""Nanoseconds since 1970 that a recording can hold."""
 _FEWEST = 10
 """Number of exposures from which on it can be seen that light fades."""
 
@@ -53,22 +52,20 @@ def imported(film: Film, rig: Rig, settings: FilmSettings, account: FilmAccount)
 
     Raises `ImportingError` where the film does not fit the rig file.
     """
-    periods, notes = frame_times(film, rig, settings)
-    frame_ns = rig.timing.frame_period_steps * rig.timing.fast_step_ns
-    end = (int(periods[-1]) // settings.frames_per_exposure + 1) * frame_ns
-    start = settings.start_ns if settings.start_ns is not None else film.start_ns or 0
-    if not 0 <= start < _LATEST_NS - end:
-        raise ImportingError(f"{film.name} has a start or an end that is not from 1970 to 2262: give the right --start")
-    account.notes = (*film.notes, *notes, *(() if settings.invert else film.saturation_notes))
+    times = frame_times(film, rig, settings)
+    account.missing = times.missing
+    account.notes = (*film.notes, *times.notes, *(() if settings.invert else film.saturation_notes))
+    if film.start_ns is None and settings.start_ns is None:
+        account.notes += ("when the film was taken is not known: its times count from 1970 unless --start is given",)
     if film.nonlinear and settings.gamma == 1.0:
         account.notes += (nonlinear_note(film),)
     if film.slopes:
-        yield from _of_slopes(film, rig, settings, periods, account)
+        yield from _of_slopes(film, rig, settings, times, account)
         return
     if settings.track:
         from aolink.importing.tracking import tracked
 
-        yield from tracked(film, rig, settings, periods, account)
+        yield from tracked(film, rig, settings, times, account)
         return
     if settings.scale is not None and settings.scale < 0:
         raise ImportingError(f"--scale {settings.scale:g} must be above 0 for pictures: dark objects need --invert")
@@ -85,9 +82,9 @@ def imported(film: Film, rig: Rig, settings: FilmSettings, account: FilmAccount)
         light = FilmLight(film, settings, defects)
     offset = rig.sensor.black_level if settings.invert or settings.subtract_median else 0.0
     scale = settings.scale or default_scale(film, rig)
-    inputs = _Inputs(film, rig, settings, periods)
+    inputs = _Inputs(film, rig, settings, times)
     account.notes += inputs.notes
-    groups = grouped(film, settings.frames_per_exposure, periods, light.of)
+    groups = grouped(film, settings.frames_per_exposure, times.periods, light.of)
     shine = _brightness([_spot_light(offset + scale * group.mean, ~group.bad, rig) for group in groups])
     if len(shine) and (change := change_of(shine)):
         account.notes += (
@@ -95,7 +92,7 @@ def imported(film: Film, rig: Rig, settings: FilmSettings, account: FilmAccount)
             " exposures are scaled to the rig file's light",
         )
     black = rig.sensor.black_level
-    groups = grouped(film, settings.frames_per_exposure, periods, light.of)
+    groups = grouped(film, settings.frames_per_exposure, times.periods, light.of)
     for group, bright in zip(groups, shine.tolist(), strict=True):
         mean = group.mean
         if settings.scale is None and film.dtype.kind == "f" and mean.max() > 1.0:
@@ -109,7 +106,7 @@ def imported(film: Film, rig: Rig, settings: FilmSettings, account: FilmAccount)
         pixels, mask = counts_of(counts, ~group.bad, rig, account)
         account.frames += settings.frames_per_exposure
         account.exposures += 1
-        frame = rig_frame(film, rig, settings, group.first_period // settings.frames_per_exposure, pixels, mask)
+        frame = rig_frame(group, times, rig, settings.frames_per_exposure, pixels, mask)
         yield ImportedExposure(frame=frame, inputs=inputs.until(frame.last_step + 1))
 
 
@@ -151,7 +148,7 @@ def _brightness(light: list[FloatArray]) -> FloatArray:
 
 
 def _of_slopes(
-    film: Film, rig: Rig, settings: FilmSettings, periods: NDArray[np.int64], account: FilmAccount
+    film: Film, rig: Rig, settings: FilmSettings, times: FrameTimes, account: FilmAccount
 ) -> Iterator[ImportedExposure]:
     """The exposures of a film without pictures: all of their pixels are missing."""
     if settings.track or settings.invert or settings.subtract_median or settings.gamma != 1.0:
@@ -164,20 +161,22 @@ def _of_slopes(
             " [plant] and [sensor]"
         )
     pixels, mask = np.zeros(rig.sensor.shape, np.uint16), np.zeros(rig.sensor.shape, np.bool_)
-    inputs = _Inputs(film, rig, settings, periods)
+    inputs = _Inputs(film, rig, settings, times)
     account.notes += inputs.notes
-    for group in grouped(film, settings.frames_per_exposure, periods, lambda frame: (frame.astype(np.float64), ~mask)):
+    for group in grouped(
+        film, settings.frames_per_exposure, times.periods, lambda frame: (frame.astype(np.float64), ~mask)
+    ):
         slopes = group.mean[0] * (settings.scale or 1.0)
         account.frames += settings.frames_per_exposure
         account.exposures += 1
-        frame = rig_frame(film, rig, settings, group.first_period // settings.frames_per_exposure, pixels, mask)
+        frame = rig_frame(group, times, rig, settings.frames_per_exposure, pixels, mask)
         yield ImportedExposure(frame=replace(frame, slopes=slopes), inputs=inputs.until(frame.last_step + 1))
 
 
 class _Inputs:
     """The inputs that the mirror held; its parked input where the film has none."""
 
-    def __init__(self, film: Film, rig: Rig, settings: FilmSettings, periods: NDArray[np.int64]) -> None:
+    def __init__(self, film: Film, rig: Rig, settings: FilmSettings, times: FrameTimes) -> None:
         self._rows, self._park, self._next = film.inputs, rig.mirror.park, 0
         self.notes: tuple[str, ...] = ()
         """Notes for the user about steps whose inputs are not known."""
@@ -189,12 +188,12 @@ class _Inputs:
                 " change its [plant]"
             )
         timing, K = rig.timing, settings.frames_per_exposure
-        last = int(periods[-1]) * (timing.frame_period_steps // K)  # first step of the last frame
-        end = last + (timing.exposure_steps if K == 1 else 1)
+        firsts = times.periods * (timing.frame_period_steps // K)  # first step of each frame
+        end = int(firsts[-1]) + (timing.exposure_steps if K == 1 else 1)
         if film.input_times_ns is not None:
-            self._rows, self.notes = self._at_times(film.inputs, film.input_times_ns, film.name, rig, end)
+            self._rows, self.notes = self._at_times(film, firsts, times, rig, end)
         elif len(film.inputs) == film.count:  # one for each frame, held until the next
-            steps = np.diff(periods, append=periods[-1] + 1) * (timing.frame_period_steps // K)
+            steps = np.diff(firsts, append=firsts[-1] + timing.frame_period_steps // K)
             self._rows = np.repeat(film.inputs, steps, axis=0)
         elif len(film.inputs) < end:
             raise ImportingError(
@@ -203,10 +202,21 @@ class _Inputs:
             )
 
     def _at_times(
-        self, rows: FloatArray, times_ns: NDArray[np.int64], name: str, rig: Rig, end: int
+        self, film: Film, firsts: NDArray[np.int64], times: FrameTimes, rig: Rig, end: int
     ) -> tuple[FloatArray, tuple[str, ...]]:
-        """The rows in the steps 0 .. end - 1, each from the step nearest to its time until that of the next row."""
-        first = np.rint(times_ns / rig.timing.fast_step_ns).astype(np.int64)
+        """The rows in the steps 0 .. end - 1, each from the step nearest to its time until that of the next row.
+
+        The clock of the frames says which step a time is in, so that a rig file's rate that is not quite theirs does
+        not move commands against pictures.
+        """
+        assert film.inputs is not None
+        assert film.input_times_ns is not None
+        rows, times_ns, name = film.inputs, film.input_times_ns, film.name
+        starts = times.starts_ns - times.starts_ns[0]
+        step_ns = starts[-1] / firsts[-1] if firsts[-1] else rig.timing.fast_step_ns
+        at = np.interp(times_ns, starts, firsts)
+        at += (np.minimum(times_ns, 0) + np.maximum(times_ns - starts[-1], 0)) / step_ns
+        first = np.rint(at).astype(np.int64)
         period = float(np.median(np.diff(times_ns))) / 1e9 if len(rows) > 1 else np.inf
         if period < _FASTER * rig.timing.fast_step_s:
             raise ImportingError(

@@ -9,14 +9,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from aolink.errors import ImportingError
-from aolink.importing.film import Film
-from aolink.importing.frames import FilmSettings, film_rate, nonlinear_note
+from aolink.errors import ImportingError, RigError
+from aolink.films.film import Film
+from aolink.importing.frames import FilmSettings, film_times, nonlinear_note
 from aolink.importing.motion import Motion, fit_motion
 from aolink.importing.survey import Survey, reach, survey
 from aolink.importing.tracker import find_objects
 from aolink.importing.tracking import STRAY
 from aolink.numerics.arrays import FloatArray
+from aolink.rig import parse_rig
 
 _COUNTS = 62_000
 """Counts of the brightest pixel of a resting spot with its noise; there are 65,535."""
@@ -25,6 +26,8 @@ _NOISE_SDS = 6
 _LONGEST_NS = 10**15
 """Longest frame period, ns: a week and a half."""
 _LEAST_WINDOW = 12
+_ROUNDED = 1e-7
+"""Change of an eigenvalue's modulus that the file's rounding stays below."""
 _ANYWHERE = 0.1
 """Variance of the place of an object in its window before it is seen, slope units squared."""
 
@@ -48,7 +51,8 @@ def first_rig(film: Film, settings: FilmSettings, name: str, progress: Callable[
         raise ImportingError(f"{film.name} has slopes and no pictures: a first rig file is made from pictures")
     if not settings.track:
         raise ImportingError("a first rig file is about objects in the film: say how many with --track N")
-    periods, rate, said = film_rate(film, settings)
+    times = film_times(film, settings)
+    periods, rate, said = times.periods, times.rate_hz, list(times.notes)
     if rate is None:
         raise ImportingError(f"it is not known how many frames a second {film.name} has: give --rate")
     if not 1 <= round(1e9 / rate) <= _LONGEST_NS:
@@ -64,7 +68,12 @@ def first_rig(film: Film, settings: FilmSettings, name: str, progress: Callable[
     # The window moves before its object has strayed too far from the middle.
     side = max(_LEAST_WINDOW, 2 * math.ceil(reach(known, K) / (1 - 2 * STRAY)))
     notes = (*said, *(() if settings.invert else film.saturation_notes), *_notes(known, motion))
-    return FirstRig(_text(film, settings, name, known, motion, side, rate, notes), notes)
+    text = _text(film, settings, name, known, motion, side, rate, notes)
+    try:
+        parse_rig(text)
+    except RigError as error:
+        raise ImportingError(f"{film.name}: what its frames show makes no rig file ({error})") from None
+    return FirstRig(text, notes)
 
 
 def _notes(known: Survey, motion: Motion) -> Iterator[str]:
@@ -89,7 +98,8 @@ def _plant(motion: Motion, unit: float, copies: int) -> str:
     A place in a frame is the mean of the motion in it, which has not the whole last step of a random motion yet: the
     last state is that step.
     """
-    turning = np.exp(complex(0, motion.turn)) * motion.a
+    # The numbers of the file are rounded, and a vibration that lasts for ever must not grow by that.
+    turning = np.exp(complex(0, motion.turn)) * min(motion.a, 1 - _ROUNDED if motion.turn else 1.0)
     process = np.array([[turning.real, -turning.imag], [turning.imag, turning.real]])
     n = 0 if motion.a == 1 else 2 if motion.turn else 1
     drifts = int(motion.drift > 0)

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,12 +13,20 @@ from numpy.typing import NDArray
 from aolink.assembly import Frame
 from aolink.errors import ImportingError
 from aolink.exposure import Truth
-from aolink.importing.film import Film, FilmFrame
+from aolink.films.film import Film, FilmFrame
 from aolink.numerics.arrays import BoolArray, FloatArray
+from aolink.optics.maxima import mended
 from aolink.rig import Rig
 
 _CLOSE = 0.01
 """Rates and exposure times that differ by a smaller share are the same."""
+_EQUAL = 1e-4
+"""Rates that differ by a smaller share need no word."""
+_SHOWN = 10
+"""Gaps of which a note says the length."""
+_DAY_NS = 86_400_000_000_000
+_LATEST_NS = 2**63
+"""Nanoseconds since 1970 that a recording can hold."""
 _IRREGULAR = 0.25
 """Frame periods by which a frame may come too early or too late."""
 
@@ -69,11 +77,15 @@ class FilmAccount:
 
     frames: int = 0
     exposures: int = 0
+    missing: int = 0
+    """Frames that are missing between others, by their times."""
     saturated: int = 0
     """Pixels that are masked: at the end of their range in the film, hot or dead, no numbers, or with the light of two
     objects."""
     clipped: int = 0
     """Pixels whose counts do not fit into the rig's range, which are masked as well."""
+    below: int = 0
+    """Those of the clipped pixels that are below zero."""
     pixels: int = 0
     notes: tuple[str, ...] = ()
 
@@ -84,7 +96,7 @@ class FilmLight:
     def __init__(self, film: Film, settings: FilmSettings, defects: BoolArray | None = None) -> None:
         self._settings, self._defects = settings, defects
         kind = film.dtype.kind
-        self.full_scale = float(np.iinfo(film.dtype.name).max) if kind in "iu" else 1.0
+        self.full_scale = film.full_scale
         """The largest value that a pixel can hold."""
         self.step = settings.gamma if kind in "iub" else 0.0
         """Largest step of light from one value to the next; zero where it is not known."""
@@ -110,36 +122,92 @@ class FilmLight:
         return (-values if settings.invert else values), bad
 
 
-def mended(values: FloatArray, defects: BoolArray) -> FloatArray:
-    """A picture whose ``defects`` are interpolated from the pixels about them, (rows, columns).
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FrameTimes:
+    """The times of a film's frames, by their own clock."""
 
-    The weights of the neighbours are those of a product of parabolas along x and y; where another defect is among
-    them, their median is taken.
+    periods: NDArray[np.int64]
+    """Number of each frame in frame periods from the first on, (count,)."""
+    starts_ns: NDArray[np.int64]
+    """Start of each frame, ns since 1970, or from 0 where that is not known, (count,)."""
+    rate_hz: float | None
+    """Frames a second; None where they are not known."""
+    notes: tuple[str, ...]
+    """Notes for the user on what was taken, and on gaps."""
+
+    @property
+    def missing(self) -> int:
+        """Number of frames that are missing between the first and the last."""
+        return int(self.periods[-1]) + 1 - len(self.periods)
+
+
+def film_times(film: Film, settings: FilmSettings) -> FrameTimes:
+    """The times of a film's frames; without times of their own no frame is missing.
+
+    Raises `ImportingError` where the rate and the times contradict each other, or the times do not follow each other at
+    a steady rate.
     """
-    known = np.pad(np.where(defects, np.nan, values), 1, mode="reflect")
-    rows, columns = np.nonzero(defects)
-    around = np.array([[known[rows + i, columns + j] for j in range(3)] for i in range(3)])
-    if (lost := np.isnan(around).all(axis=(0, 1))).any():
-        around[1, 1, lost] = np.median(values)
-    beside = around[0, 1] + around[2, 1] + around[1, 0] + around[1, 2]
-    across = around[0, 0] + around[0, 2] + around[2, 0] + around[2, 2]
-    middle = np.nanmedian(around.reshape(9, -1), axis=0)
-    whole = values.copy()
-    whole[defects] = np.where(np.isfinite(beside + across), beside / 2 - across / 4, middle)
-    return whole
+    rate, notes = film.rate_hz, []
+    if settings.rate_hz is not None:
+        if rate is not None and abs(rate / settings.rate_hz - 1) > _CLOSE:
+            notes.append(f"the film says {rate:g} frames/s; {settings.rate_hz:g} frames/s as given are taken")
+        rate = settings.rate_hz
+    start = settings.start_ns if settings.start_ns is not None else film.start_ns or 0
+    if None not in (settings.start_ns, film.start_ns) and settings.start_ns != film.start_ns:
+        notes.append(f"the film says that it starts at {_date(film.start_ns)}; {_date(settings.start_ns)} is taken")
+    lasts = film.count * 1e9 / (rate or 1.0) if film.times_ns is None else int(film.times_ns[-1] - film.times_ns[0])
+    if not 0 <= start < _LATEST_NS - lasts - _DAY_NS:
+        raise ImportingError(f"{film.name} has a start or an end that is not from 1970 to 2262: give the right --start")
+    periods = np.arange(film.count, dtype=np.int64)
+    if film.times_ns is None or film.count < 2:
+        since = np.rint(periods * (1e9 / rate if rate else 0.0)).astype(np.int64)
+        return FrameTimes(periods=periods, starts_ns=start + since, rate_hz=rate, notes=tuple(notes))
+    gaps = np.diff(film.times_ns) / 1e9
+    usual = float(np.median(gaps))
+    if usual <= 0 or (gaps <= 0).any():
+        late = int(np.argmax(gaps <= 0)) + 1
+        raise ImportingError(
+            f"{film.name}: frame {late} is not later than the one before: frames are not in the order of their times,"
+            " or the times are damaged"
+        )
+    period = float(gaps[gaps < 1.5 * usual].mean())  # times may be rounded, so that the median is not exact
+    counts = np.rint(gaps / period).astype(np.int64)
+    off = np.abs(gaps / period - counts)
+    if (counts < 1).any() or (off > _IRREGULAR).any():
+        worst = int(np.argmax(np.where(counts < 1, np.inf, off)))
+        raise ImportingError(
+            f"{film.name}: frame {worst + 1} comes {gaps[worst]:.4g} s after the one before, at a frame period of"
+            f" {period:.4g} s: exposures must follow at a steady rate, only whole frames may be missing"
+        )
+    periods[1:] = np.cumsum(counts)
+    timed = 1 / period
+    if rate is not None and abs(rate / timed - 1) > _CLOSE:
+        raise ImportingError(
+            f"{film.name}: {rate:g} frames/s contradict its times, which say {timed:.6g}: give --rate {timed:.6g}, or a"
+            " file with the right times"
+        )
+    if (lost := np.flatnonzero(counts > 1)).size:
+        each = ", ".join(f"{counts[k] - 1} after frame {k + 1} ({gaps[k]:.6g} s)" for k in lost[:_SHOWN])
+        more = f", and {len(lost) - _SHOWN} gaps more" if len(lost) > _SHOWN else ""
+        notes.append(f"{int((counts - 1).sum())} frames are missing by the times of the others: {each}{more}")
+    starts = start + film.times_ns - film.times_ns[0]
+    return FrameTimes(periods=periods, starts_ns=starts, rate_hz=timed, notes=tuple(notes))
 
 
-def frame_times(film: Film, rig: Rig, settings: FilmSettings) -> tuple[NDArray[np.int64], list[str]]:
-    """Number of each frame in frame periods from the first on, (count,), and notes on what was assumed.
+def frame_times(film: Film, rig: Rig, settings: FilmSettings) -> FrameTimes:
+    """The times of a film's frames for a rig, and notes on what was assumed.
 
     Raises `ImportingError` where rate, times or exposure time contradict each other or the rig file; the message says
     what to change.
     """
     timing, K = rig.timing, settings.frames_per_exposure
-    periods, rate, notes = film_rate(film, settings)
+    times = film_times(film, settings)
+    rate, notes = times.rate_hz, list(times.notes)
     own = K / (timing.frame_period_steps * timing.fast_step_s)
     if rate is None:
         notes.append(f"the film does not state its frame rate: that of the rig file is assumed, {own:.6g} frames/s")
+        since = np.rint(times.periods * 1e9 / own).astype(np.int64)
+        times = replace(times, starts_ns=times.starts_ns + since, rate_hz=own)
     elif abs(rate / own - 1) > _CLOSE:
         each = f"{K} frames" if K > 1 else "a frame"
         whole = round(rate / own)
@@ -148,6 +216,11 @@ def frame_times(film: Film, rig: Rig, settings: FilmSettings) -> tuple[NDArray[n
             f"{film.name} has {rate:.6g} frames/s, and the rig file {rig.name} wants {each} every"
             f" {timing.frame_period_steps * timing.fast_step_s:.6g} s, {own:.6g} frames/s: {summed}change its"
             " [timing], or give the right --rate"
+        )
+    elif abs(rate / own - 1) > _EQUAL:
+        notes.append(
+            f"the frames came at {rate:.6g} a second, {rate / own - 1:+.2%} from the rig file's {own:.6g}: exposures"
+            " keep their own times"
         )
     if K > 1 and settings.exposure_s is not None:
         raise ImportingError(
@@ -171,9 +244,7 @@ def frame_times(film: Film, rig: Rig, settings: FilmSettings) -> tuple[NDArray[n
                 f"{film.name} was exposed for {exposure_s:.6g} s a frame, the rig file {rig.name} says {own_s:.6g} s:"
                 " change timing.exposure_steps, or give the right --exposure"
             )
-    if None not in (settings.start_ns, film.start_ns) and settings.start_ns != film.start_ns:
-        notes.append(f"the film says that it starts at {_date(film.start_ns)}; {_date(settings.start_ns)} is taken")
-    return periods, notes
+    return replace(times, notes=tuple(notes))
 
 
 def _date(time_ns: int | None) -> str:
@@ -183,54 +254,6 @@ def _date(time_ns: int | None) -> str:
 def nonlinear_note(film: Film) -> str:
     """A note for the user on a film that is `Film.nonlinear`, where no gamma curve is undone."""
     return f"light may not be linear: {film.nonlinear}; --gamma 2.2 undoes the usual curve"
-
-
-def film_rate(film: Film, settings: FilmSettings) -> tuple[NDArray[np.int64], float | None, list[str]]:
-    """`film_periods`, frames a second where they are known, and notes on what was taken.
-
-    Raises `ImportingError` where the rate and the times contradict each other, or the times are damaged.
-    """
-    rate, notes = film.rate_hz, []
-    if settings.rate_hz is not None:
-        if rate is not None and abs(rate / settings.rate_hz - 1) > _CLOSE:
-            notes.append(f"the film says {rate:g} frames/s; {settings.rate_hz:g} frames/s as given are taken")
-        rate = settings.rate_hz
-    periods, timed = film_periods(film)
-    if timed is not None and rate is not None and abs(rate / timed - 1) > _CLOSE:
-        raise ImportingError(
-            f"{film.name}: {rate:g} frames/s contradict its times, which say {timed:.6g}: give --rate {timed:.6g}, or a"
-            " file with the right times"
-        )
-    return periods, timed or rate, notes
-
-
-def film_periods(film: Film) -> tuple[NDArray[np.int64], float | None]:
-    """Number of each frame in frame periods from the first on, (count,), and frames a second, by the film's times;
-    without times no frame is missing, and the rate is None.
-
-    Raises `ImportingError` where the times do not follow each other at a steady rate.
-    """
-    periods = np.arange(film.count, dtype=np.int64)
-    if film.times_ns is None or film.count < 2:
-        return periods, None
-    gaps = np.diff(film.times_ns) / 1e9
-    period = float(np.median(gaps))
-    if period <= 0 or (gaps <= 0).any():
-        late = int(np.argmax(gaps <= 0)) + 1
-        raise ImportingError(
-            f"{film.name}: frame {late} is not later than the one before: frames are not in the order of their times,"
-            " or the times are damaged"
-        )
-    counts = np.rint(gaps / period).astype(np.int64)
-    off = np.abs(gaps / period - counts)
-    if (counts < 1).any() or (off > _IRREGULAR).any():
-        worst = int(np.argmax(np.where(counts < 1, np.inf, off)))
-        raise ImportingError(
-            f"{film.name}: frame {worst + 1} comes {gaps[worst]:.4g} s after the one before, at a frame period of"
-            f" {period:.4g} s: exposures must follow at a steady rate, only whole frames may be missing"
-        )
-    periods[1:] = np.cumsum(counts)
-    return periods, 1 / period
 
 
 def counts_of(
@@ -243,17 +266,14 @@ def counts_of(
     account.pixels += whole.size
     account.saturated += int(np.count_nonzero(~usable))
     account.clipped += int(np.count_nonzero(outside & usable))
+    account.below += int(np.count_nonzero((whole < 0) & usable))
     return np.clip(np.nan_to_num(whole), 0, rig.sensor.full_scale).astype(np.uint16), usable & ~outside
 
 
 def default_scale(film: Film, rig: Rig) -> float:
     """Counts for a pixel value of one: full scale becomes full scale, but numbers of 16 bits stay as they are."""
-    if film.dtype.kind in "iub" and film.dtype.itemsize > 1:
-        return 1.0
-    if film.dtype.kind == "b":
-        return float(rig.sensor.full_scale)
     if film.dtype.kind in "iu":
-        return float(2.0 ** (rig.sensor.bit_depth - 8))
+        return 1.0 if film.dtype.itemsize > 1 else (rig.sensor.full_scale + 1) / (film.full_scale + 1)
     return float(rig.sensor.full_scale)
 
 
@@ -295,18 +315,17 @@ def grouped(
 
 
 def rig_frame(
-    film: Film, rig: Rig, settings: FilmSettings, period: int, pixels: NDArray[np.uint16], mask: NDArray[np.bool_]
+    group: Group, times: FrameTimes, rig: Rig, frames: int, pixels: NDArray[np.uint16], mask: NDArray[np.bool_]
 ) -> Frame:
-    """The frame of an exposure that begins the given number of the rig's frame periods after the film."""
-    timing = rig.timing
+    """The frame of an exposure of ``frames`` frames of a film: its steps are the rig's, its times the film's."""
+    timing, period = rig.timing, group.first_period // frames
     first = period * timing.frame_period_steps
-    began_ns = settings.start_ns if settings.start_ns is not None else film.start_ns or 0
-    start_ns = began_ns + round(first * timing.fast_step_s * 1e9)
+    start_ns = int(times.starts_ns[group.first_frame])
     end_ns = start_ns + timing.exposure_steps * timing.fast_step_ns
+    since = start_ns - int(times.starts_ns[0])
     return Frame(
         frame_id=period + 1, first_step=first, last_step=first + timing.exposure_steps - 1, pixels=pixels, mask=mask,
-        chunks_lost=0, frames_lost_before=0, device_start_ns=first * timing.fast_step_ns,
-        device_end_ns=(first + timing.exposure_steps) * timing.fast_step_ns, host_first_byte_ns=end_ns,
-        host_receive_ns=end_ns, host_start_ns=start_ns, clock_sigma_ns=math.nan,
+        chunks_lost=0, frames_lost_before=0, device_start_ns=since, device_end_ns=since + end_ns - start_ns,
+        host_first_byte_ns=end_ns, host_receive_ns=end_ns, host_start_ns=start_ns, clock_sigma_ns=math.nan,
         exposure_offset_ns=timing.exposure_offset_ns,
     )  # fmt: skip

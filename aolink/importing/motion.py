@@ -257,7 +257,7 @@ def _correlation(left: FloatArray) -> float:
     pairs = (left[lag:] * left[:-lag] for lag in _LAGS)
     sums = [(float(np.nansum(each)), int(np.isfinite(each).sum())) for each in pairs]
     power = float(np.nanmean(left**2))
-    found = max((total / n / power for total, n in sums if n), key=abs, default=0.0)
+    found = max((total / n / power for total, n in sums if n and power), key=abs, default=0.0)
     return found if abs(found) > max(_CORRELATED, 4 / math.sqrt(count)) else 0.0
 
 

@@ -12,8 +12,8 @@ from google.protobuf.message import Message
 
 from aolink.errors import ImportingError, RecordingError
 from aolink.files import check_target, open_unfinished, writing
+from aolink.films.film import Film
 from aolink.importing.exposures import imported
-from aolink.importing.film import Film
 from aolink.importing.frames import FilmAccount, FilmSettings, ImportedExposure
 from aolink.recording import convert, topics
 from aolink.recording.mcap_file import McapFile, WriteOptions, schema_of

@@ -10,10 +10,10 @@ import numpy as np
 from scipy import ndimage, optimize
 
 from aolink.errors import ImportingError
+from aolink.films.film import Film
 from aolink.importing.accuracy import pixel_noise, tracker_errors
 from aolink.importing.brightness import brightness_of, change_of
 from aolink.importing.defects import FEWEST, defects_note
-from aolink.importing.film import Film
 from aolink.importing.frames import FilmLight, FilmSettings
 from aolink.importing.shapes import axis_ratios, motion_within
 from aolink.importing.tracker import FIRST_FRAMES, WEIGHT, Objects, Tracker, trackpy_locator

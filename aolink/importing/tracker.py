@@ -11,8 +11,8 @@ import numpy as np
 from scipy import ndimage, optimize
 
 from aolink.errors import FrameError, ImportingError
+from aolink.films.film import Film
 from aolink.importing.defects import find_defects
-from aolink.importing.film import Film
 from aolink.importing.frames import FilmLight, FilmSettings
 from aolink.numerics.arrays import BoolArray, FloatArray, IntArray
 from aolink.optics.centroid import weighted_centroid

@@ -16,11 +16,12 @@ from numpy.typing import NDArray
 
 from aolink.errors import ImportingError
 from aolink.exposure import Truth
-from aolink.importing.film import Film
+from aolink.films.film import Film
 from aolink.importing.frames import (
     FilmAccount,
     FilmLight,
     FilmSettings,
+    FrameTimes,
     ImportedExposure,
     counts_of,
     grouped,
@@ -40,7 +41,7 @@ STRAY = 1 / 8
 
 
 def tracked(
-    film: Film, rig: Rig, settings: FilmSettings, periods: NDArray[np.int64], account: FilmAccount
+    film: Film, rig: Rig, settings: FilmSettings, times: FrameTimes, account: FilmAccount
 ) -> Iterator[ImportedExposure]:
     """The exposures of a film's objects, each in a window of its own.
 
@@ -60,7 +61,7 @@ def tracked(
     windows = _Windows(rig, sensor, known)
     far, spread = windows.reach, spread_in(known, settings.frames_per_exposure)
     light, step, area = FilmLight(film, settings, known.defects), 0, sensor.pixel_size
-    for group in grouped(film, settings.frames_per_exposure, periods, light.of):
+    for group in grouped(film, settings.frames_per_exposure, times.periods, light.of):
         blurs = _blurs(group.mean, known.last[max(group.first_frame - 1, 0)], known.sd, far, spread)
         values, usable, own = windows.cut(group.mean, ~group.bad, blurs)
         end = group.first_frame + settings.frames_per_exposure
@@ -74,7 +75,7 @@ def tracked(
         pixels, mask = counts_of(counts, windows.as_frame(usable), rig, account)
         account.frames += settings.frames_per_exposure
         account.exposures += 1
-        frame = rig_frame(film, rig, settings, group.first_period // settings.frames_per_exposure, pixels, mask)
+        frame = rig_frame(group, times, rig, settings.frames_per_exposure, pixels, mask)
         whole = np.asarray(seen.all(axis=0))[:, None]
         path = windows.positions(np.where(whole, known.places[group.first_frame : end], np.nan))
         inputs = np.tile(rig.mirror.park, (frame.last_step + 1 - step, 1))
@@ -82,7 +83,7 @@ def tracked(
         inputs[-1] += windows.follow(known.places[end - 1])
         truth = None
         if len(path.T) == rig.timing.exposure_steps and np.isfinite(path).any():
-            follows = end < len(periods) and periods[end] == periods[end - 1] + 1
+            follows = end < film.count and times.periods[end] == times.periods[end - 1] + 1
             after = windows.positions(known.places[end : end + 1] if follows else known.places[:0])
             truth = Truth(
                 start_state=_state(rig, path[:, 0]), end_state=_state(rig, after[:, 0] if after.size else None),

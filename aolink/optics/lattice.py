@@ -24,6 +24,7 @@ from aolink.optics.maxima import (
     refine,
     smoothed_noise,
     spot_sd,
+    with_sharp_spots,
 )
 
 Kind = Literal["square", "hexagonal"]
@@ -162,6 +163,7 @@ def find_lattice(frame: NDArray[np.generic]) -> Lattice:
             " expose longer, or check whether the spots are in focus"
         )
     lattice = _look_again(best, flat)
+    flat = with_sharp_spots(frame, flat, background, lattice.spots, lattice.pitch)
     return _fit(lattice.kind, refine(flat, lattice.spots, lattice.pitch), lattice.nodes, lattice.background)
 
 

@@ -20,6 +20,12 @@ _SIGNIFICANCE = 8.0
 _FAINTEST = 2e-3
 # A pixel this many times as bright as its neighbours is hot: no pixel of a spot of sd 0.6 pixels or more is.
 _HOT = 4.0
+# Share of a frame's pixels that may be bad.
+_MOST_BAD = 0.5
+# Spots of a smaller standard deviation, pixels, may be taken for hot pixels.
+_COARSE = 0.8
+# The weight's width for the narrowest spots times theirs, pixels squared.
+_COARSE_WEIGHT = 0.875
 _TINY = float(np.finfo(np.float64).tiny)
 # The height of the brightest spots is that of the maximum with this rank: a few may be cosmic rays.
 _BRIGHT = 7
@@ -48,15 +54,17 @@ class Maxima:
 def flatten(frame: NDArray[np.generic]) -> tuple[FloatArray, FloatArray]:
     """A frame without its background and its isolated hot pixels, and that background, each (rows, columns).
 
-    Raises `FrameError` where the frame is not a picture, or has pixels that are not numbers.
+    Bad pixels are NaN, and interpolated. Raises `FrameError` where the frame is not a picture, or has no good pixels.
     """
     if frame.ndim != 2 or min(frame.shape) < _BLOCK or frame.dtype.kind not in "biuf":
         raise FrameError(
             f"a frame of {_BLOCK} x {_BLOCK} real numbers or more is needed, found {frame.shape} of {frame.dtype}"
         )
     counts = frame.astype(np.float64)
-    if not np.isfinite(counts).all():
-        raise FrameError(f"{int((~np.isfinite(counts)).sum())} pixels are not numbers")
+    if (bad := ~np.isfinite(counts)).any():
+        if bad.mean() > _MOST_BAD:
+            raise FrameError(f"{int(bad.sum())} of {bad.size} pixels are not numbers")
+        counts = mended(counts, bad)
     if counts.min() == counts.max():
         raise FrameError(
             f"no usable spots: every pixel is {counts.flat[0]:g}; check whether the camera is saturated or dark"
@@ -74,6 +82,25 @@ def flatten(frame: NDArray[np.generic]) -> tuple[FloatArray, FloatArray]:
     alone = flat - _HOT * np.maximum(second, 0) > 6 * spread(flat)
     around = ndimage.median_filter(flat, 3)
     return np.where(alone, around, flat), smooth
+
+
+def mended(values: FloatArray, defects: BoolArray) -> FloatArray:
+    """A picture whose ``defects`` are interpolated from the pixels about them, (rows, columns).
+
+    The weights of the neighbours are those of a product of parabolas along x and y; where another defect is among
+    them, their median is taken.
+    """
+    known = np.pad(np.where(defects, np.nan, values), 1, mode="reflect")
+    rows, columns = np.nonzero(defects)
+    around = np.array([[known[rows + i, columns + j] for j in range(3)] for i in range(3)])
+    if (lost := np.isnan(around).all(axis=(0, 1))).any():
+        around[1, 1, lost] = np.median(values[~defects])
+    beside = around[0, 1] + around[2, 1] + around[1, 0] + around[1, 2]
+    across = around[0, 0] + around[0, 2] + around[2, 0] + around[2, 2]
+    middle = np.nanmedian(around.reshape(9, -1), axis=0)
+    whole = values.copy()
+    whole[defects] = np.where(np.isfinite(beside + across), beside / 2 - across / 4, middle)
+    return whole
 
 
 def find_maxima(flat: FloatArray) -> Iterator[Maxima]:
@@ -145,11 +172,26 @@ def refine(flat: FloatArray, places: FloatArray, pitch: float) -> FloatArray:
     A centroid further than a quarter of the pitch from its maximum is not used.
     """
     windows, corners = cut_windows(flat, places, _half(pitch))
-    # A wider weight would include neighbouring spots.
-    weight_sd = min(1.5 * spot_sd(flat, places, pitch), pitch / 6)
+    # A wider weight would include neighbouring spots, and a narrower one than some pixels is no Gaussian on pixels.
+    sd = spot_sd(flat, places, pitch)
+    weight_sd = max(min(1.5 * sd, pitch / 6), min(_COARSE_WEIGHT / sd, pitch / 4))
     found = corners + weighted_centroid(windows, weight_sd, start=places - corners)
     moved = np.linalg.norm(found - places, axis=1) < pitch / 4
     return np.where(moved[:, None], found, places)
+
+
+def with_sharp_spots(
+    frame: NDArray[np.generic], flat: FloatArray, ground: FloatArray, places: FloatArray, pitch: float
+) -> FloatArray:
+    """A flattened frame with the middles of its spots, at ``places`` (n, 2), where these are undersampled: `flatten`
+    takes some of them for hot pixels."""
+    raw = frame.astype(np.float64) - ground
+    at = np.zeros(flat.shape, dtype=np.bool_)
+    columns, rows = np.clip(np.rint(places).astype(np.int64).T, 0, np.array(flat.shape[::-1])[:, None] - 1)
+    at[rows, columns] = True
+    at = ndimage.binary_dilation(at, np.ones((3, 3), dtype=np.bool_)) & np.isfinite(raw)
+    whole = np.where(at, raw, flat)
+    return whole if spot_sd(whole, places, pitch) < _COARSE else flat
 
 
 def likeness(flat: FloatArray, places: FloatArray, models: FloatArray, pitch: float) -> FloatArray:

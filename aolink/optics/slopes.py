@@ -11,8 +11,8 @@ from scipy.spatial import ConvexHull
 
 from aolink.errors import FrameError
 from aolink.files import writing
+from aolink.films.pictures import read_frame
 from aolink.numerics.arrays import FloatArray, IntArray
-from aolink.optics.frame_file import read_frame
 from aolink.optics.lattice import Lattice, find_lattice, match
 from aolink.optics.wavefront import SpotReconstructor, modal_reconstructor, wavefront_rms, zernike_slopes
 from aolink.optics.zernike import zernike
@@ -92,7 +92,7 @@ def measure_slopes(
     Parameters
     ----------
     frame, reference:
-        Counts of any real type and scale, (rows, columns), of the same camera.
+        Counts of any real type and scale, (rows, columns), of the same camera; NaN where a pixel is bad.
     pitch_m, focal_m:
         Distance from a lenslet's middle to the next one's, and focal length, m; the pitch in pixels is the reference's
         own. Where both are None, slopes are left in pixels.
@@ -174,10 +174,18 @@ def _found(frame: NDArray[np.generic], name: str) -> Lattice:
 
 
 def measure_files(
-    frame: str | Path, reference: str | Path, *, pitch_m: float | None = None, focal_m: float | None = None
-) -> FrameSlopes:
-    """The result of `measure_slopes` for two files, .fits, .fits.gz or .npy. Raises `FrameError`."""
-    return measure_slopes(read_frame(frame), read_frame(reference), pitch_m=pitch_m, focal_m=focal_m)
+    frame: str | Path, reference: str | Path, *, pitch_m: float | None = None, focal_m: float | None = None,
+    bad: str | Path | None = None,
+) -> FrameSlopes:  # fmt: skip
+    """The result of `measure_slopes` for the files of two pictures; the picture in ``bad`` is not zero where the
+    camera's pixels are bad. Raises `FrameError`."""
+    pictures = [read_frame(path, FrameError) for path in (frame, reference)]
+    if bad is not None:
+        wrong = read_frame(bad, FrameError) != 0
+        if wrong.shape != pictures[0].shape:
+            raise FrameError(f"{bad} has {wrong.shape} pixels, the frame {pictures[0].shape}: take one camera's")
+        pictures = [np.where(wrong, np.nan, picture) for picture in pictures]
+    return measure_slopes(*pictures, pitch_m=pitch_m, focal_m=focal_m)
 
 
 def save(result: FrameSlopes, path: Path, *, overwrite: bool = False) -> None:

@@ -167,7 +167,7 @@ def _read(root: Table, text: str, folder: Path | None) -> Rig:
     seen = (optics.field, optics.light) if optics else (None, None)
     sensor = root.read("sensor", read_sensor, plant.axes, plant.n_outputs, *seen)
     n_inputs = plant.axes * plant.n_inputs
-    mirror = root.read("mirror", read_mirror, n_inputs)
+    mirror = root.read("mirror", read_mirror, n_inputs, root.has("mirror"), optional=True)
     drive = root.read("drive", read_drive, n_inputs, mirror, optional=True)
     control = root.read("control", read_control, timing, optional=True)
     disturbance = root.read_any("disturbance", read_disturbance, plant.n_outputs, timing.fast_step_s)

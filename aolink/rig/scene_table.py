@@ -8,7 +8,6 @@ import numpy as np
 
 from aolink.errors import RestorationError, RigError
 from aolink.numerics.arrays import FloatArray
-from aolink.optics.pictures import read_picture
 from aolink.optics.scene import SceneSensor
 from aolink.rig.sensor_tables import read_kernel
 from aolink.rig.toml_table import Table, named_file
@@ -56,9 +55,11 @@ def read_scene_picture(sensor: SceneSensor, folder: Path | None) -> FloatArray:
         raise RigError("scene.picture is missing: a simulated rig needs a picture to show")
     shipped = _SHIPPED / sensor.picture
     comes_along = shipped.parent == _SHIPPED and shipped.is_file()
+    from aolink.films.pictures import read_picture  # it loads packages that a rig file alone does not need
+
     beside = shipped if comes_along and folder is None else named_file(folder, sensor.picture, "scene.picture")
     try:
-        found = read_picture(shipped if comes_along and not beside.is_file() else beside)
+        found = read_picture(shipped if comes_along and not beside.is_file() else beside, RestorationError)
     except RestorationError as error:
         raise RigError(f"scene.picture: {error}") from None
     if found.ndim == 3 and found.shape[2] in (3, 4):

@@ -21,6 +21,8 @@ from aolink.rig.sensor_tables import read_grid
 from aolink.rig.toml_table import Table
 
 # One row of inputs, and their limits, must fit into a message of the protocol.
+_STILL = 1e-9
+"""Range of a mirror that the rig file does not describe: it stays where it is."""
 _MOST_INPUTS = 10_000
 # Each output has a coefficient of its own for the slopes that the model leaves out, and estimators keep the covariance
 # of all coefficients: for 512 it is 2 MB an exposure.
@@ -161,13 +163,15 @@ def read_timing(table: Table) -> Timing:
     )  # fmt: skip
 
 
-def read_mirror(table: Table, n_inputs: int) -> MirrorDriver:
-    """Read the table ``[mirror]``. Raises `RigError`."""
+def read_mirror(table: Table, n_inputs: int, given: bool) -> MirrorDriver:
+    """Read the table ``[mirror]``; one that is not ``given`` is that of a film or a camera alone, whose mirror may not
+    move. Raises `RigError`."""
     law = table.read_any("voltage", read_voltage)
     if law and (table.has("input_min") or table.has("input_max")):
         raise RigError("mirror.input_min and mirror.input_max follow from [mirror.voltage]: leave them out")
-    low = np.full(n_inputs, law.input_range[0]) if law else table.vector("input_min", n_inputs, "inputs")
-    high = np.full(n_inputs, law.input_range[1]) if law else table.vector("input_max", n_inputs, "inputs")
+    least, most = (None, None) if given else (-_STILL, _STILL)
+    low = np.full(n_inputs, law.input_range[0]) if law else table.vector("input_min", n_inputs, "inputs", least)
+    high = np.full(n_inputs, law.input_range[1]) if law else table.vector("input_max", n_inputs, "inputs", most)
     if (low >= high).any():
         raise RigError("mirror.input_min must be below mirror.input_max for every input")
     park = table.vector("park", n_inputs, "inputs", 0.0)

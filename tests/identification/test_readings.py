@@ -9,9 +9,9 @@ import pytest
 
 import aolink
 from aolink.errors import IdentificationError
+from aolink.films.film import array_film
 from aolink.identification import Process, ProcessSum, readings
 from aolink.identification.likelihood import Likelihood
-from aolink.importing.film import array_film
 from aolink.importing.first_rig import first_rig
 from aolink.importing.frames import FilmSettings
 from aolink.importing.recording import import_film

@@ -5,11 +5,12 @@ from __future__ import annotations
 import io
 from collections.abc import Callable, Mapping, Sequence
 from datetime import UTC, datetime
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
 import aotpy
-import imageio.v3 as iio
+import av
 import numpy as np
 import pytest
 import tifffile
@@ -25,7 +26,7 @@ from rosbags import rosbag1, rosbag2
 from rosbags.typesys import Stores, get_typestore
 
 from aolink.errors import ImportingError
-from aolink.importing.readers import open_film
+from aolink.films.formats import open_film
 
 START_NS = 1_790_000_000_123_456_789
 PERIOD_NS = 20_000_000
@@ -224,8 +225,25 @@ def write_pictures(folder: Path, frames: NDArray[Any], kind: str = "png") -> Pat
 
 
 def write_video(path: Path, frames: NDArray[Any], rate_hz: float = 20.0) -> Path:
-    """A video by ffmpeg, frames (count, rows, columns, 3) with sides that are multiples of 16."""
-    iio.imwrite(path, frames, fps=rate_hz, macro_block_size=16)
+    """A video by FFmpeg with a codec that loses little, frames (count, rows, columns, 3)."""
+    return write_stream(path, frames, "mpeg4" if path.suffix == ".avi" else "libx264", "yuv420p", rate_hz)
+
+
+def write_stream(
+    path: Path, frames: NDArray[Any], codec: str, kind: str, rate_hz: float = 20.0, at: Sequence[int] | None = None,
+) -> Path:  # fmt: skip
+    """A video of a codec and a pixel format of FFmpeg's; frame k is the one numbered ``at[k]`` in time."""
+    rate = Fraction(rate_hz).limit_denominator(10_000)
+    with av.open(str(path), "w") as file:
+        stream: Any = file.add_stream(codec, rate=rate)
+        stream.width, stream.height, stream.pix_fmt = frames.shape[2], frames.shape[1], kind
+        stream.options = {"crf": "10", "qmin": "1", "qmax": "2"} if codec in ("libx264", "mpeg4") else {}
+        plain = "rgb24" if frames.ndim == 4 and frames.dtype == np.uint8 else kind
+        for k, each in enumerate(frames):
+            frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(each), plain)
+            frame.pts, frame.time_base = (k if at is None else at[k]), 1 / rate
+            file.mux(stream.encode(frame))
+        file.mux(stream.encode())
     return path
 
 

@@ -12,8 +12,8 @@ import pytest
 import aolink
 from aolink.estimation import run
 from aolink.exposure import Exposures
+from aolink.films.film import array_film
 from aolink.importing.brightness import brightness_of
-from aolink.importing.film import array_film
 from aolink.importing.first_rig import first_rig
 from aolink.importing.frames import FilmSettings
 from aolink.importing.recording import import_film
@@ -89,7 +89,7 @@ def test_a_film_of_the_rigs_own_camera_that_fades_is_scaled_to_its_light(
     simulated, frames = spots(rig, change)
     inputs = np.concatenate([part for each in simulated for part in (each.lead_inputs, each.inputs)])
     film = array_film(frames, "film", inputs=inputs)
-    (note,) = import_film(film, rig, FilmSettings(rate_hz=rate(rig)), tmp_path / "a.mcap").notes
+    (note,) = import_film(film, rig, FilmSettings(rate_hz=rate(rig), start_ns=0), tmp_path / "a.mcap").notes
     assert re.search(said, note)
     found = aolink.estimate(Recording(tmp_path / "a.mcap"), estimator)
     as_they_came = aolink.estimate(aolink.exposures(frames, rig, inputs, starts(simulated)), estimator)
@@ -112,7 +112,11 @@ def test_a_film_whose_light_is_constant_is_left_as_it_is(tmp_path: Path, name: s
     half = np.rint(rig.sensor.black_level + (frames - rig.sensor.black_level) / 2).astype(np.uint16)
     for some in (frames, half):
         account = import_film(
-            array_film(some, "film"), rig, FilmSettings(rate_hz=rate(rig)), tmp_path / "a.mcap", overwrite=True
+            array_film(some, "film"),
+            rig,
+            FilmSettings(rate_hz=rate(rig), start_ns=0),
+            tmp_path / "a.mcap",
+            overwrite=True,
         )
         assert account.notes == ()
         for each, frame in zip(Recording(tmp_path / "a.mcap").exposures(), some, strict=True):

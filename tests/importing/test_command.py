@@ -55,6 +55,7 @@ def test_notes_and_warnings_are_printed(aolink, rig, tmp_path):
     made = aolink("import", source, "-o", "a.mcap", "--rig", rig)
     assert made.stdout.splitlines() == [
         "note: the film does not state its frame rate: that of the rig file is assumed, 50 frames/s",
+        "note: when the film was taken is not known: its times count from 1970 unless --start is given",
         "warning: 4 pixels (0.89%) are saturated in the film, hot or dead, no numbers, or shared by two objects: they"
         " are masked",
         "a.mcap: 7 exposures of 7 frames",
@@ -66,10 +67,28 @@ def test_notes_and_warnings_are_printed(aolink, rig, tmp_path):
     assert said["clipped"] == np.count_nonzero((frames > 65_535 / 300) & (frames < 255))
 
 
+def test_a_film_without_its_dark_level_is_told_of_the_option(aolink, rig, tmp_path):
+    frames = np.random.default_rng(1).normal(0, 20, (7, 8, 8)).round().astype(np.int16)
+    source = others.written_npy(tmp_path, frames)
+    made = aolink("import", source, "-o", "a.mcap", "--rig", rig, "--rate", "50")
+    assert "of the pixels are below zero" in made.stdout
+    assert "--background" in made.stdout
+    made = aolink("import", source, "-o", "b.mcap", "--rig", rig, "--rate", "50", "--background")
+    assert "below zero" not in made.stdout
+
+
+def test_missing_frames_are_counted(aolink, rig, tmp_path):
+    np.savez(tmp_path / "film.npz", frames=FRAMES, times_s=np.array([0, 1, 2, 5, 6, 7, 9]) / 50)
+    made = aolink("import", "film.npz", "-o", "a.mcap", "--rig", rig)
+    assert made.stdout.endswith("a.mcap: 7 exposures of 7 frames, 3 frames are missing\n")
+
+
 def test_frames_are_summed(aolink, tmp_path):
     (tmp_path / "rig.toml").write_text(small_rig(3, 3).toml)
     source = others.written_npy(tmp_path, FRAMES)
-    made = aolink("import", source, "-o", "a.mcap", "--rig", "rig.toml", "--sum", "3", "--rate", "1000")
+    made = aolink(
+        "import", source, "-o", "a.mcap", "--rig", "rig.toml", "--sum", "3", "--rate", "1000", "--start", "2026-11-22"
+    )
     assert made.stdout == "a.mcap: 2 exposures of 6 frames\n"
     first = next(iter(Recording(tmp_path / "a.mcap")))
     np.testing.assert_array_equal(first.pixels, np.rint(FRAMES[:3].mean(axis=0) * 256))

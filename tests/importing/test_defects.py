@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from aolink.estimation import run
-from aolink.importing.film import array_film
+from aolink.films.film import array_film
 from aolink.importing.first_rig import first_rig
 from aolink.importing.frames import FilmSettings
 from aolink.importing.recording import import_film

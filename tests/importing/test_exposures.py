@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 import aolink
 from aolink.errors import AolinkError, EstimatorError, ImportingError, RecordingError
-from aolink.importing.film import array_film
+from aolink.films.film import array_film
+from aolink.films.formats import open_film
 from aolink.importing.frames import FilmAccount, FilmSettings
-from aolink.importing.readers import open_film
 from aolink.importing.recording import import_film
 from aolink.recording.reader import Recording
 from aolink.rig import Rig, load_rig

@@ -18,7 +18,7 @@ from aolink.cli.tables.scores import scores
 from aolink.estimation import run, score
 from aolink.exporting.files import export
 from aolink.exposure import Exposure
-from aolink.importing.film import array_film
+from aolink.films.film import array_film
 from aolink.importing.first_rig import first_rig
 from aolink.importing.frames import FilmSettings
 from aolink.importing.recording import import_film

@@ -6,7 +6,6 @@ import warnings
 from typing import Any
 
 import aotpy
-import imageio.v3 as iio
 import numpy as np
 import pytest
 import tifffile
@@ -20,8 +19,8 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from aolink.errors import ImportingError
-from aolink.importing.film import Film
-from aolink.importing.readers import open_film
+from aolink.films.film import Film
+from aolink.films.formats import open_film
 from aolink.recording import topics
 from aolink.recording.reader import Recording
 from tests.importing import others
@@ -111,7 +110,7 @@ def test_of_several_stacks_the_one_called_frames_is_the_film(tmp_path):
         ({"rate_hz": 0}, "rate_hz is 0, expected a number above 0"),
         ({"exposure_s": "long"}, "exposure_s is <U4"),
         ({"inputs": np.zeros((7, 1, 1))}, "inputs is float64 of shape (7, 1, 1)"),
-        ({"frames": np.zeros((3, 4))}, "shape (3, 4), expected numbers as (frames, rows, columns)"),
+        ({"frames": np.zeros(4)}, "shape (4,), expected numbers as (frames, rows, columns)"),
         ({"frames": np.zeros((0, 4, 4))}, "shape (0, 4, 4)"),
         ({"frames": np.zeros((3, 4, 4), complex)}, "complex128"),
         ({"frames": np.array([None])}, "it holds objects of Python's"),
@@ -319,12 +318,13 @@ def test_a_whole_cube_is_read_whatever_follows_it(tmp_path, kept):
     (tmp_path / "a.fits").write_bytes(whole + bytes(kept) if kept > 0 else two[: len(whole) + 2880 + 100])
     film = open_film(tmp_path / "a.fits")
     check(film, frames)
-    assert "what follows the first cube cannot be read" in film.notes[0]
+    assert kept > 0 or "what follows the first cube cannot be read" in film.notes[0]
 
 
-def test_a_fits_cube_compressed_in_tiles_is_refused_with_what_to_do(tmp_path):
-    fits.HDUList([fits.PrimaryHDU(), fits.CompImageHDU(numbers(np.int16))]).writeto(tmp_path / "a.fits.fz")
-    assert "unpack it first, with funpack" in refused(tmp_path / "a.fits.fz")
+def test_a_fits_cube_compressed_in_tiles(tmp_path):
+    frames = numbers(np.int16)
+    fits.HDUList([fits.PrimaryHDU(), fits.CompImageHDU(frames)]).writeto(tmp_path / "a.fits.fz")
+    check(open_film(tmp_path / "a.fits.fz"), frames)
 
 
 def test_fits_numbers_with_a_scale(tmp_path):
@@ -336,7 +336,7 @@ def test_fits_numbers_with_a_scale(tmp_path):
     (tmp_path / "a.fits").write_bytes(
         primary.header.tostring().encode() + data + bytes(-len(data) % 2880)
     )  # fmt: skip
-    check(open_film(tmp_path / "a.fits"), frames * 0.5 + 100)
+    check(open_film(tmp_path / "a.fits"), (frames * 0.5 + 100).astype(np.float32))
 
 
 def test_a_fits_header_says_times(tmp_path):
@@ -358,14 +358,13 @@ def test_fits_without_a_cube_is_refused(tmp_path):
     assert "holds 7 arrays of shape (6, 9), and which of them are frames is not known" in refused(tmp_path / "c.fits")
 
 
-# imageio-ffmpeg leaves the ends of its pipes to the collection of garbage.
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 @pytest.mark.parametrize("name", ["a.mp4", "a.avi"])
 def test_a_video(name, tmp_path):
     frames = smooth(9, 48, 64)
     film = open_film(others.write_video(tmp_path / name, np.repeat(frames[..., None], 3, axis=3)))
     assert (film.count, film.shape, film.dtype.name) == (9, (48, 64), "uint8")
-    assert film.rate_hz == pytest.approx(20, rel=1e-3)
+    assert film.times_ns is not None
+    np.testing.assert_array_equal(np.diff(film.times_ns), 50_000_000)
     assert "video" in film.nonlinear
     read = np.array(list(film.frames()))
     assert abs(read.mean(axis=(1, 2)) - frames.mean(axis=(1, 2))).max() < 2
@@ -374,9 +373,11 @@ def test_a_video(name, tmp_path):
 
 def test_a_gif(tmp_path):
     frames = smooth(5, 24, 32) // 10 * 10
-    iio.imwrite(tmp_path / "a.GIF", frames, duration=40, loop=0, plugin="pillow", extension=".gif")
+    first, *rest = (Image.fromarray(frame) for frame in frames)
+    first.save(tmp_path / "a.GIF", format="gif", save_all=True, append_images=rest, duration=[40, 10, 20, 500, 40])
     film = open_film(tmp_path / "a.GIF")
-    assert (film.count, film.shape, film.rate_hz) == (5, (24, 32), 25)
+    assert (film.count, film.shape) == (5, (24, 32))
+    np.testing.assert_array_equal(film.times_ns, np.array([0, 40, 50, 70, 570]) * 10**6)
     read = np.array(list(film.frames()))
     assert abs(read - frames).max() <= 2
 
@@ -429,10 +430,8 @@ def test_foxglove_compressed_images_as_jpeg(tmp_path):
 
 
 def test_an_encoding_that_is_not_known_is_refused(tmp_path):
-    path = others.write_mcap(
-        tmp_path / "a.mcap", {"/camera": [others.foxglove_raw(numbers(np.uint8)[0], "bayer_rggb8")]}
-    )
-    assert "'bayer_rggb8': mono8" in refused(path)
+    path = others.write_mcap(tmp_path / "a.mcap", {"/camera": [others.foxglove_raw(numbers(np.uint8)[0], "yuv422")]})
+    assert "'yuv422': mono8" in refused(path)
 
 
 def test_pictures_that_change_their_size_are_refused(tmp_path):

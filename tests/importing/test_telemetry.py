@@ -12,8 +12,8 @@ from aolink.errors import EstimatorError, ImportingError
 from aolink.estimation import run
 from aolink.exporting.files import export
 from aolink.exposure import Exposure, Exposures
+from aolink.films.formats import open_film
 from aolink.importing.frames import FilmAccount, FilmSettings
-from aolink.importing.readers import open_film
 from aolink.importing.recording import import_film
 from aolink.recording.reader import Recording
 from aolink.rig import Rig, load_rig

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from aolink.errors import ImportingError
 from aolink.estimation import run, smooth
+from aolink.films.film import array_film
 from aolink.importing.exposures import imported
-from aolink.importing.film import array_film
 from aolink.importing.first_rig import first_rig
 from aolink.importing.frames import FilmAccount, FilmLight, FilmSettings
 from aolink.importing.motion import Motion, fit_motion, vibration_mean
@@ -67,7 +67,7 @@ def test_light_beside_an_object_is_said_with_its_frames(tmp_path: Path) -> None:
             light=brightness * 20_000.0,
         )  # fmt: skip
         film.frames[80:] += other.frames
-    source = array_film(film.frames, "film")
+    source = array_film(film.frames, "film", start_ns=0)
     known = survey(source, SETTINGS, find_objects(source, SETTINGS))
     assert known.alone(0, 80).tolist() == [True, True]
     assert known.alone(72, 88).tolist() == known.alone(80, 160).tolist() == [False, True]

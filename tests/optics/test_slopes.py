@@ -4,10 +4,13 @@ import json
 
 import numpy as np
 import pytest
+from astropy.io import fits
+from PIL import Image
 from scipy import ndimage
+from scipy.special import ndtr
 
 from aolink.errors import FrameError
-from aolink.optics.frame_file import read_frame
+from aolink.films.pictures import read_frame
 from aolink.optics.lattice import find_lattice
 from aolink.optics.maxima import cut_windows, flatten
 from aolink.optics.slopes import measure_files, measure_slopes
@@ -31,7 +34,7 @@ def test_the_reference_has_its_lenslets(measured):
 
 def test_the_pitch_is_the_period_of_the_frame(mmirs, measured):
     # Independent of spots: the spectrum of the frame's sums has its line at one over the pitch.
-    flat = np.clip(flatten(read_frame(mmirs / "mmirs_wfs_0150.fits.gz"))[0], 0, 300)
+    flat = np.clip(flatten(read_frame(mmirs / "mmirs_wfs_0150.fits.gz", FrameError))[0], 0, 300)
     for axis, step in ((0, measured.lattice.column_step[0]), (1, measured.lattice.row_step[1])):
         periods = np.linspace(18, 28, 1001)
         profile = flat.sum(axis=axis) - flat.sum(axis=axis).mean()
@@ -40,7 +43,7 @@ def test_the_pitch_is_the_period_of_the_frame(mmirs, measured):
 
 
 def test_spots_are_where_another_library_sees_them(mmirs, measured):
-    flat, _ = flatten(read_frame(mmirs / "mmirs_wfs_0150.fits.gz"))
+    flat, _ = flatten(read_frame(mmirs / "mmirs_wfs_0150.fits.gz", FrameError))
     windows, corners = cut_windows(flat, measured.lattice.spots, 5)
     windows = np.where(windows > 0.3 * windows.max(axis=(1, 2), keepdims=True), windows, 0)
     theirs = corners + [ndimage.center_of_mass(w)[::-1] for w in windows]
@@ -96,7 +99,7 @@ def test_frames_of_two_cameras_are_refused():
 
 @pytest.mark.slow
 def test_a_frame_against_itself_is_flat(mmirs):
-    frame = read_frame(mmirs / "mmirs_camera2_ref.fits.gz")
+    frame = read_frame(mmirs / "mmirs_camera2_ref.fits.gz", FrameError)
     same = measure_slopes(frame, frame)
     assert np.nanmax(np.abs(same.wavefront)) < 1e-9
     moved = measure_slopes(np.roll(frame, (2, 3), (0, 1)), frame)
@@ -204,8 +207,8 @@ def test_the_command_takes_a_hexagonal_sensor(aolink, tmp_path):
         assert file["zernike_coefficients"].shape == file["zernike_indices"].shape == (14,)
     assert (tmp_path / "out.rrd").stat().st_size > 10_000
     np.save(tmp_path / "noise.npy", np.random.default_rng(0).normal(0.5, 0.01, frame.shape).astype(np.float32))
-    np.save(tmp_path / "colour.npy", np.zeros((*frame.shape, 3), dtype=np.uint8))
-    for name, says in (("noise", "no usable spots"), ("colour", "rows and columns")):
+    np.save(tmp_path / "stack.npy", np.zeros((2, *frame.shape), dtype=np.uint8))
+    for name, says in (("noise", "no usable spots"), ("stack", "holds 2 pictures, expected one")):
         refused = aolink("slopes", f"{name}.npy", "--reference", "flat.npy")
         assert refused.returncode == 9
         assert refused.stderr.count("\n") == 1
@@ -229,3 +232,46 @@ def test_the_command_prints_and_writes(aolink, mmirs, tmp_path):
     assert refused.returncode == 9
     assert refused.stderr.count("\n") == 1
     assert "no grid" in refused.stderr
+
+
+def sharp_spots(sd: float, moves: np.ndarray, pitch: int = 20) -> np.ndarray:
+    """Spots of a square grid, integrated over pixels, moved by (n, n, 2) as (x, y)."""
+    n = len(moves)
+    edges = np.arange(n * pitch + 17) - 0.5
+
+    def along(middle: float) -> np.ndarray:
+        return np.diff(ndtr((edges - middle) / sd))
+
+    light = np.full((len(edges) - 1,) * 2, 100.0)
+    for j, i in np.ndindex(n, n):
+        x, y = moves[j, i]
+        light += 20_000 * np.outer(along(14 + j * pitch + y), along(14 + i * pitch + x))
+    return light + np.random.default_rng(3).normal(0, 3, light.shape)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("sd", "most"), [(0.4, 0.03), (0.55, 0.01), (0.7, 0.004), (1.0, 0.004)])
+def test_undersampled_spots_are_measured(sd, most):
+    moves = np.random.default_rng(9).uniform(-1, 1, (8, 8, 2))
+    found = measure_slopes(sharp_spots(sd, moves), sharp_spots(sd, np.full((8, 8, 2), 0.3)))
+    error = found.displacements_px - (moves - moves.mean(axis=(0, 1)))
+    assert np.sqrt(np.mean(error**2)) < most
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["tif", "png", "bmp", "fits"])
+def test_frames_of_other_formats_and_bad_pixels(kind, tmp_path):
+    moves = np.random.default_rng(9).uniform(-1, 1, (8, 8, 2))
+    pictures = [np.rint(sharp_spots(1.2, each) / 16).astype(np.uint8) for each in (moves, 0 * moves)]
+    bad = np.random.default_rng(2).uniform(size=pictures[0].shape) < 1e-3
+    paths = [tmp_path / f"{name}.{kind}" for name in ("frame", "flat", "bad")]
+    for path, picture in zip(paths, [*(np.where(bad, 200, each) for each in pictures), bad], strict=True):
+        if kind == "fits":
+            fits.PrimaryHDU(picture[None].astype(np.int16)).writeto(path)
+        else:
+            Image.fromarray(picture.astype(np.uint8)).save(path)
+    found = measure_files(paths[0], paths[1], bad=paths[2])
+    error = found.displacements_px - (moves - moves.mean(axis=(0, 1)))
+    assert np.sqrt(np.mean(error**2)) < 0.03
+    holes = [np.where(bad, np.nan, each) for each in pictures]
+    np.testing.assert_array_equal(measure_slopes(*holes).displacements_px, found.displacements_px)

@@ -5,16 +5,23 @@ from __future__ import annotations
 import json
 import subprocess
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+import tifffile
+from astropy.io import fits
+from numpy.typing import NDArray
 from PIL import Image
 from typer.testing import CliRunner
 
 from aolink.cli.common import app
 from aolink.errors import RestorationError
-from aolink.optics.pictures import read_picture, read_psf, write_picture
+from aolink.films.film import array_film
+from aolink.films.formats import open_film
+from aolink.films.pictures import read_picture, read_psf, write_pictures
 from aolink.restoration import restore
 from tests.restoration.scenes import UNIFORM, blocks, blurred
 
@@ -36,7 +43,7 @@ def test_a_picture_is_deblurred(aolink: Run, tmp_path: Path, picture: np.ndarray
     assert done.returncode == 0, done.stderr
     printed, expected = json.loads(done.stdout), restore(picture, np.full(7, 2.0))
     assert printed["noise_sd"] == pytest.approx(expected.noise_sd)
-    assert (read_picture(tmp_path / "out.png") == expected.image).all()
+    assert (read_picture(tmp_path / "out.png", RestorationError) == expected.image).all()
     again = aolink("deblur", "--image", "in.png", "--psf", "psf.csv", "-o", "out.png")
     assert again.returncode == 10
     assert again.stderr == (
@@ -61,7 +68,7 @@ def test_what_is_not_a_number_is_filled_in(aolink: Run, tmp_path: Path, picture:
     assert done.returncode == 0, done.stderr
     assert done.stdout.endswith(", 12 pixels that are not numbers filled in\n")
     whole = restore(picture.astype(np.float32), UNIFORM).image
-    assert abs(read_picture(tmp_path / "out.npy") - whole).max() < 0.2 * np.ptp(whole)
+    assert abs(read_picture(tmp_path / "out.npy", RestorationError) - whole).max() < 0.2 * np.ptp(whole)
     np.save(tmp_path / "in.npy", np.full_like(holed, np.nan))
     none = aolink("deblur", "--image", "in.npy", "--psf", "psf.csv", "-o", "b.npy")
     assert none.returncode == 10
@@ -79,7 +86,7 @@ def test_transparency_is_no_light(tmp_path: Path, picture: np.ndarray) -> None:
         app, ["deblur", "--image", str(tmp_path / "in.png"), "--psf", str(tmp_path / "psf.csv"), "-o", str(out)]
     )
     assert printed.exit_code == 0, printed.output
-    found = read_picture(out)
+    found = read_picture(out, RestorationError)
     assert (found[..., 3] == alpha).all()
     assert (found[..., :3] == restore(colours, np.ones(7)).image).all()
 
@@ -91,9 +98,13 @@ def test_the_inverse_says_how_it_scanned(tmp_path: Path, picture: np.ndarray) ->
     assert printed.output.endswith(": inverse, scanned backwards\n")
 
 
+def write(path: Path, picture: NDArray[Any]) -> None:
+    write_pictures(path, [picture], array_film(picture, "a"))
+
+
 def test_a_folder_that_is_not_there(tmp_path: Path) -> None:
     with pytest.raises(RestorationError, match=r"there is no folder .*none; make it first"):
-        write_picture(tmp_path / "none" / "a.png", np.zeros((4, 4), np.uint8))
+        write(tmp_path / "none" / "a.png", np.zeros((4, 4), np.uint8))
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32])
@@ -103,29 +114,41 @@ def test_what_is_written_is_read_back(tmp_path: Path, dtype: type, suffix: str) 
     path = tmp_path / f"a{suffix}"
     if dtype is np.float32 and suffix == ".png":
         with pytest.raises(RestorationError, match=r"type float32 fits in a \.npy"):
-            write_picture(path, image)
+            write(path, image)
         return
-    write_picture(path, image)
-    assert read_picture(path).dtype == dtype
-    assert (read_picture(path) == image).all()
+    write(path, image)
+    assert read_picture(path, RestorationError).dtype == dtype
+    assert (read_picture(path, RestorationError) == image).all()
 
 
 def test_colours_and_palettes_are_read_as_colours(tmp_path: Path) -> None:
     colours = np.random.default_rng(1).integers(0, 255, (6, 7, 3), dtype=np.uint8)
-    write_picture(tmp_path / "a.png", colours)
-    assert (read_picture(tmp_path / "a.png") == colours).all()
+    write(tmp_path / "a.png", colours)
+    assert (read_picture(tmp_path / "a.png", RestorationError) == colours).all()
     Image.fromarray(colours).convert("P").save(tmp_path / "p.png")
-    assert read_picture(tmp_path / "p.png").shape == (6, 7, 3)
+    assert read_picture(tmp_path / "p.png", RestorationError).shape == (6, 7, 3)
 
 
-def test_psfs_as_text_and_numbers(tmp_path: Path) -> None:
-    for text in ("1,2,3", "1\n2\n3\n", " 1 2  3\n"):
-        (tmp_path / "a.csv").write_text(text)
-        assert read_psf(tmp_path / "a.csv").tolist() == [1, 2, 3]
-    (tmp_path / "a.csv").write_text("0 1\n2 3\n")
-    assert read_psf(tmp_path / "a.csv").tolist() == [[0, 1], [2, 3]]
-    np.save(tmp_path / "a.npy", np.arange(3))
-    assert read_psf(tmp_path / "a.npy").tolist() == [0, 1, 2]
+@pytest.mark.parametrize(
+    ("text", "psf"),
+    [("1,2,3", [1, 2, 3]), (" 1 2  3\n", [1, 2, 3]), ("1\n2\n3\n", [[1], [2], [3]]), ("0 1\n2 3\n", [[0, 1], [2, 3]])],
+)
+def test_a_column_of_text_is_a_psf_along_the_columns(text: str, psf: list[Any], tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text(text)
+    assert read_psf(tmp_path / "a.csv")[0].tolist() == psf
+    np.save(tmp_path / "a.npy", np.array(psf))
+    assert read_psf(tmp_path / "a.npy")[0].tolist() == psf
+
+
+def test_a_picture_is_a_psf_and_its_pedestal_is_said(tmp_path: Path) -> None:
+    picture = np.zeros((15, 15), np.uint16)
+    picture[7, 4:11] = 900
+    tifffile.imwrite(tmp_path / "a.tif", picture)
+    psf, notes = read_psf(tmp_path / "a.tif")
+    assert (psf == picture).all()
+    assert notes == ()
+    tifffile.imwrite(tmp_path / "b.tif", picture + 100)
+    assert "of the PSF's sum is an even ground of 100" in read_psf(tmp_path / "b.tif")[1][0]
 
 
 @pytest.mark.parametrize(("name", "content"), [("a.csv", "1 2\n3\n"), ("a.npy", "junk"), ("a.csv", None)])
@@ -139,5 +162,81 @@ def test_a_file_that_is_no_psf_is_refused(tmp_path: Path, name: str, content: st
 @pytest.mark.parametrize("name", ["a.png", "a.npy"])
 def test_a_file_that_is_no_picture_is_refused(tmp_path: Path, name: str) -> None:
     (tmp_path / name).write_text("junk")
-    with pytest.raises(RestorationError, match="cannot be read as a picture"):
-        read_picture(tmp_path / name)
+    with pytest.raises(RestorationError, match=name):
+        read_picture(tmp_path / name, RestorationError)
+
+
+def moved(count: int, top: float, dtype: type, channels: int = 0) -> NDArray[Any]:
+    """Pictures of a scene blurred along the rows, (count, rows, columns, any channels)."""
+    rng = np.random.default_rng(2)
+    shape = (24, 40, channels) if channels else (24, 40)
+    sharp = np.repeat(np.repeat(rng.uniform(0.2, 0.8, (count, 4, 5, *shape[2:])), 6, axis=1), 8, axis=2)
+    return np.rint(top * sum(np.roll(sharp, k, axis=2) for k in (-1, 0, 1)) / 3).astype(dtype)
+
+
+@pytest.mark.parametrize("kind", ["stack", "white is zero", "colours", "12 bits", "FITS"])
+def test_what_is_written_is_what_was_read(kind: str, tmp_path: Path) -> None:
+    """Its type, channels and pictures, and its meaning of black and white."""
+    channels, top = (3 if kind == "colours" else 0), 4095 if kind == "12 bits" else 60_000
+    frames = moved(1 if kind in ("colours", "12 bits") else 3, top, np.uint16, channels)
+    name = {"colours": "a.png", "12 bits": "a.pgm", "FITS": "a.fits"}.get(kind, "a.tif")
+    if kind in ("colours", "12 bits"):
+        write_pictures(tmp_path / name, [frames[0]], replace(array_film(frames, "a"), top=top if top == 4095 else None))
+    elif kind == "FITS":
+        fits.PrimaryHDU(frames).writeto(tmp_path / name)
+    else:
+        stored, meaning = (65535 - frames, "miniswhite") if kind == "white is zero" else (frames, "minisblack")
+        tifffile.imwrite(tmp_path / name, stored, photometric=meaning)
+    np.save(tmp_path / "psf.npy", np.ones((1, 3)))
+    files = ["--image", str(tmp_path / name), "--psf", str(tmp_path / "psf.npy")]
+    done = CliRunner().invoke(app, ["deblur", *files, "-o", str(tmp_path / f"out-{name}")])
+    assert done.exit_code == 0, done.output
+    before, after = open_film(tmp_path / name), open_film(tmp_path / f"out-{name}")
+    for field in ("count", "shape", "dtype", "top", "white_is_zero"):
+        assert getattr(before, field) == getattr(after, field)
+    expected = [restore(each, np.ones(3)).image for each in frames]
+    np.testing.assert_array_equal(list(after.pictures()), expected)
+
+
+def test_a_stack_does_not_become_one_picture(tmp_path: Path) -> None:
+    np.save(tmp_path / "a.npy", moved(2, 200, np.uint8))
+    (tmp_path / "psf.csv").write_text("1 1 1")
+    files = ["--image", str(tmp_path / "a.npy"), "--psf", str(tmp_path / "psf.csv")]
+    done = CliRunner().invoke(app, ["deblur", *files, "-o", str(tmp_path / "b.png")])
+    assert isinstance(done.exception, RestorationError)
+    assert "it holds one picture, and there are 2" in str(done.exception)
+
+
+@pytest.mark.parametrize(("top", "dtype"), [(255, np.uint8), (1023, np.uint16), (16383, np.uint16), (65535, np.uint16)])
+def test_saturated_pixels_are_left_out(top: int, dtype: type, tmp_path: Path) -> None:
+    scene = np.full((40, 60), 0.02 * top)
+    scene[20, 30] = 40.0 * top
+    blurred = sum(np.roll(scene, k, axis=1) for k in range(-3, 4)) / 7 + np.random.default_rng(1).normal(
+        0, 2e-3 * top, scene.shape
+    )
+    np.save(tmp_path / "a.npy", np.clip(np.rint(blurred), 0, top).astype(dtype))
+    np.save(tmp_path / "psf.npy", np.ones((1, 7)))
+    files = ["--image", str(tmp_path / "a.npy"), "--psf", str(tmp_path / "psf.npy")]
+    done = CliRunner().invoke(app, ["deblur", *files, "-o", str(tmp_path / "b.npy")])
+    assert "7 saturated pixels left out" in done.output
+    assert abs(np.load(tmp_path / "b.npy")[20, :20] / top - 0.02).max() < 0.02
+
+
+def test_a_motion_that_a_log_has_restores_as_its_psf_does(tmp_path: Path) -> None:
+    """The log's clock is 2.5 s behind; the exposure is a part of it."""
+    picture = moved(1, 200, np.float64)[0]
+    t = np.linspace(0, 10, 1001)
+    x = np.where(t < 4, 50.0, np.where(t < 6, 50.0 + 1.5 * (t - 5), 80.0))
+    rows = "".join(f"{time - 2.5 + 1_790_000_000:.6f},{place:.6f},0\n" for time, place in zip(t, x, strict=True))
+    (tmp_path / "log.csv").write_text("time,x,y\n" + rows)
+    fits.PrimaryHDU(picture, fits.Header({"DATE-OBS": "2026-09-21T14:13:24", "EXPTIME": 2.0})).writeto(
+        tmp_path / "a.fits"
+    )
+    files = ["--image", str(tmp_path / "a.fits"), "--path", str(tmp_path / "log.csv"), "-o", str(tmp_path / "b.npy")]
+    done = CliRunner().invoke(app, ["deblur", *files, "--offset", "2.5"])
+    assert done.exit_code == 0, done.output
+    psf = np.ones(3)  # a motion of three pixels at a steady velocity
+    expected = restore(picture, psf).image
+    assert np.sqrt(np.mean((np.load(tmp_path / "b.npy") - expected)[:, 4:-4] ** 2)) < 0.3 * np.std(picture - expected)
+    wrong = CliRunner().invoke(app, ["deblur", *files, "--overwrite", "--offset", "20"])
+    assert "give the right --offset or --exposure" in str(wrong.exception)

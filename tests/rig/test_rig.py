@@ -420,3 +420,11 @@ def test_a_disturbance_model_that_cannot_work_is_refused(text: str, message: str
 def test_a_control_table_that_cannot_work_is_refused(text: str, message: str) -> None:
     with pytest.raises(RigError, match=message):
         parse_rig(f"{TEXT}\n[control]\n{text}\n")
+
+
+def test_a_film_needs_no_mirror_in_its_rig_file():
+    text = load_rig("single-lenslet").toml
+    rig = parse_rig(text[: text.index("[mirror]")] + text[text.index("[simulation]") :])
+    assert rig.drive.kind == "none"
+    np.testing.assert_allclose(rig.mirror.input_max - rig.mirror.input_min, 0, atol=1e-8)
+    assert (rig.mirror.park == 0).all()

@@ -16,7 +16,7 @@ import numpy as np
 
 from aolink.estimation import make_estimator, smooth
 from aolink.exposure import Exposure
-from aolink.importing.film import array_film
+from aolink.films.film import array_film
 from aolink.importing.first_rig import first_rig
 from aolink.importing.frames import FilmSettings
 from aolink.importing.recording import import_film

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from aolink.devices.cameras.pictures import FrameThread, ThreadCamera, as_counts, checked_corner, sensor_part
 from aolink.devices.simple import Lacks, SimpleFrame
 from aolink.errors import DeviceError, ImportingError
-from aolink.importing.readers import open_film
+from aolink.films.formats import open_film
 from aolink.rig import Rig
 
 

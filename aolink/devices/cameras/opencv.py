@@ -14,7 +14,7 @@ from aolink.devices.cameras.pictures import FrameThread, ThreadCamera, check_wit
 from aolink.devices.simple import Lacks, SimpleFrame
 from aolink.errors import DeviceError
 from aolink.extensions import needs_extra
-from aolink.importing.film import grey
+from aolink.films.film import grey
 from aolink.rig import Rig
 
 _RATE_MARGIN = 0.05

@@ -11,7 +11,7 @@ import numpy as np
 
 from aolink.errors import ImportingError
 from aolink.extensions import needs_extra
-from aolink.importing.film import Film, array_film
+from aolink.films.film import Film, array_film
 from aolink.numerics.arrays import FloatArray
 
 _NOT_APPLIED = ("dark", "flat_field", "sky_background", "bad_pixel_map", "weight_map")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cache
@@ -14,21 +15,19 @@ from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from mcap.reader import McapReader, NonSeekingReader, make_reader
 from mcap.records import Channel, Schema
-from PIL import UnidentifiedImageError
 
 from aolink.errors import ImportingError
 from aolink.extensions import needs_extra
-from aolink.importing.film import Film, FilmFrame, grey
-from aolink.optics.pictures import image_pixels, opened_image
+from aolink.films.film import Film, FilmFrame
+from aolink.films.stills import COMPRESSED, decoded
 
-_ENCODINGS = {
-    "mono8": "u1", "8uc1": "u1", "mono16": "<u2", "16uc1": "<u2", "32fc1": "<f4", "64fc1": "<f8",
-    "rgb8": "u1", "bgr8": "u1", "8uc3": "u1", "rgba8": "u1", "bgra8": "u1",
-}  # fmt: skip
-_COLOURS = {"rgb8": 3, "bgr8": 3, "8uc3": 3, "rgba8": 4, "bgra8": 4}
+_NAMES = {"mono8": "8UC1", "mono16": "16UC1", "rgb8": "8UC3", "bgr8": "8UC3", "rgba8": "8UC4", "bgra8": "8UC4",
+          "rgb16": "16UC3", "bgr16": "16UC3", "rgba16": "16UC4", "bgra16": "16UC4"}  # fmt: skip
+_BAYER = re.compile(r"bayer_([rgb]{4})(8|16)$")
+_OPENCV = re.compile(r"(8|16|32|64)([usf])c([1234]?)$")
 _MAGIC = b"\x89MCAP0\r\n"
-_LOSSLESS = ("PNG", "BMP", "TIFF", "PPM")
-_LOSSY = "the pictures are compressed with JPEG, after a gamma curve"
+_JUMP_NS = 10**9
+"""Change of the time from a picture's stamp to its arrival that is a jump of a clock."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +37,9 @@ class _Stamped:
     arrival_ns: int
     picture: FilmFrame
     """(rows, columns) or (rows, columns, 3 or 4)."""
-    lossy: bool
+    lossy: bool = False
+    top: float | None = None
+    mosaic: str = ""
 
 
 def mcap_film(path: Path, topic: str | None) -> Film:
@@ -138,72 +139,94 @@ def _chosen(types: dict[str, str], topic: str | None, path: Path) -> str:
 
 
 def _film(path: Path, topic: str, messages: Callable[[], Iterator[_Stamped]]) -> Film:
-    first: FilmFrame | None = None
+    first: _Stamped | None = None
     stamps, arrivals, lossy = [], [], False
     for each in messages():
-        first = each.picture if first is None else first
-        if each.picture.shape != first.shape or each.picture.dtype != first.dtype:
+        first = each if first is None else first
+        one, other = first.picture, each.picture
+        if (one.shape, one.dtype, first.mosaic) != (other.shape, other.dtype, each.mosaic):
             raise ImportingError(
-                f"{path}: pictures on {topic} change from {first.dtype} of shape {first.shape} to {each.picture.dtype}"
-                f" of shape {each.picture.shape}: a film has frames of one size and type"
+                f"{path}: pictures on {topic} change from {one.dtype} of shape {one.shape} to {other.dtype} of shape"
+                f" {other.shape}: a film has frames of one size and type"
             )
         stamps.append(each.time_ns)
         arrivals.append(each.arrival_ns)
         lossy |= each.lossy
     if first is None:
         raise ImportingError(f"{path} has no picture on {topic}")
-    stamped = all(stamps) and len(set(stamps)) == len(stamps)
-    why = "the pictures have no times of their own"
-    if any(stamps):
+    stamped, notes = all(stamps) and len(set(stamps)) == len(stamps), []
+    if not stamped:
         why = "some pictures have no time of their own" if not all(stamps) else "pictures share a time of their own"
+        why = why if any(stamps) else "the pictures have no times of their own"
+        notes.append(f"{why}: those of their arrival are used")
+    else:
+        jumps = np.diff(np.array(stamps, np.int64) - np.array(arrivals, np.int64))
+        notes += [
+            f"the clock of the stamps jumps by {jumps[k] / 1e9:.6g} s at frame {k + 2}, by the times of arrival"
+            for k in np.flatnonzero(np.abs(jumps) > _JUMP_NS)[:3]
+        ]
     times = np.array(stamps if stamped else arrivals, dtype=np.int64)
+    rows, columns = first.picture.shape[:2]
     return Film(
-        name=f"{path.name}:{topic}", shape=(int(first.shape[0]), int(first.shape[1])), dtype=first.dtype,
-        count=len(times), frames=lambda: (grey(each.picture, path) for each in messages()), start_ns=int(times[0]),
-        times_ns=times, nonlinear=_LOSSY if lossy else "",
-        notes=() if stamped else (f"{why}: those of their arrival are used",),
+        name=f"{path.name}:{topic}", shape=(int(rows), int(columns)), dtype=first.picture.dtype, count=len(times),
+        pictures=lambda: (each.picture for each in messages()), start_ns=int(times[0]), times_ns=times,
+        nonlinear=COMPRESSED if lossy else "", top=first.top, mosaic=first.mosaic, notes=tuple(notes),
     )  # fmt: skip
 
 
 def raw_picture(data: bytes, encoding: str, height: int, width: int, step: int, big_endian: bool = False) -> FilmFrame:
-    """Pixels of a raw picture, (rows, columns) or (rows, columns, 3 or 4). Raises ImportingError."""
-    encoding = encoding.lower()
-    if encoding not in _ENCODINGS:
-        raise ImportingError(f"pictures are encoded as {encoding!r}: {', '.join(_ENCODINGS)} can be read")
-    kind = np.dtype(_ENCODINGS[encoding]).newbyteorder(">" if big_endian else "<")
-    row = width * kind.itemsize * _COLOURS.get(encoding, 1)
+    """Pixels of a raw picture, (rows, columns) or (rows, columns, 2 to 4). Raises ImportingError."""
+    name = encoding.lower()
+    bayer = _BAYER.match(name)
+    found = _OPENCV.match(f"{bayer[2]}uc1" if bayer else _NAMES.get(name, name).lower())
+    if found is None or (found[2] == "f") != (int(found[1]) >= 32 and found[2] != "s"):
+        raise ImportingError(f"pictures are encoded as {encoding!r}: {', '.join(_NAMES)}, bayer_rggb8 (and the like)"
+                             " and OpenCV's such as 16SC1 can be read")  # fmt: skip
+    channels = int(found[3] or 1)
+    kind = np.dtype(f"{found[2]}{int(found[1]) // 8}".replace("s", "i")).newbyteorder(">" if big_endian else "<")
+    row = width * kind.itemsize * channels
     step = step or row
     if not height or not width or step < row or len(data) < step * (height - 1) + row:
         raise ImportingError(f"a picture of {height} x {width} pixels has {len(data)} bytes only: the file is damaged")
     rows = np.lib.stride_tricks.as_strided(np.frombuffer(data, np.uint8), (height, row), (step, 1))
-    pixels = np.ascontiguousarray(rows).view(kind)
-    if encoding in _COLOURS:
-        return pixels.reshape(height, width, -1)
-    return np.asarray(pixels.astype(kind.newbyteorder("=")))
+    pixels = np.ascontiguousarray(rows).view(kind).astype(kind.newbyteorder("="))
+    return pixels.reshape(height, width, channels) if channels > 1 else pixels
 
 
-def compressed_picture(data: bytes) -> tuple[FilmFrame, bool]:
-    """Pixels of a JPEG or PNG, (rows, columns) or (rows, columns, 3 or 4), and whether it is lossy.
+def compressed_picture(data: bytes, kind: str = "") -> tuple[FilmFrame, bool, float | None]:
+    """Pixels of a JPEG, PNG or another picture, (rows, columns) or (rows, columns, 2 to 4), whether it is lossy, and
+    the largest value of a pixel where it is not that of the type.
 
-    Raises ImportingError.
+    Depths of ROS's compressedDepth, whose ``kind`` says so, are a PNG after a header of 12 bytes; depths that it keeps
+    as floating-point numbers become these. Raises ImportingError.
     """
+    depth = "compresseddepth" in kind.lower()
     try:
-        with opened_image(io.BytesIO(data), ImportingError) as image:
-            return image_pixels(image), image.format not in _LOSSLESS
+        pixels, top, lossy = decoded(data[12:] if depth else data)
     except OSError as error:
-        said = "their format is not known" if isinstance(error, UnidentifiedImageError) else str(error)
+        said = "their format is not known" if "identify" in str(error) else str(error)
         raise ImportingError(f"compressed pictures cannot be read ({said}): JPEG and PNG can") from None
+    if depth and kind.lower().startswith("32fc1"):
+        a, b = np.frombuffer(data, "<f4", 2, 4)
+        with np.errstate(divide="ignore"):
+            pixels = np.where(pixels > 0, a / (pixels.astype(np.float32) - b), np.float32(np.nan))
+    return pixels, lossy, top
+
+
+def _mosaic(encoding: str) -> str:
+    found = _BAYER.match(encoding.lower())
+    return found[1].upper() if found else ""
 
 
 def _foxglove_raw(data: bytes, arrival_ns: int) -> _Stamped:
     image = RawImage.FromString(data)
     picture = raw_picture(image.data, image.encoding, image.height, image.width, image.step)
-    return _Stamped(image.timestamp.ToNanoseconds(), arrival_ns, picture, False)
+    return _Stamped(image.timestamp.ToNanoseconds(), arrival_ns, picture, mosaic=_mosaic(image.encoding))
 
 
 def _foxglove_compressed(data: bytes, arrival_ns: int) -> _Stamped:
     image = CompressedImage.FromString(data)
-    return _Stamped(image.timestamp.ToNanoseconds(), arrival_ns, *compressed_picture(image.data))
+    return _Stamped(image.timestamp.ToNanoseconds(), arrival_ns, *compressed_picture(image.data, image.format))
 
 
 def _ros_reader(kind: str, store: str, encoding: str) -> Callable[[bytes, int], _Stamped]:
@@ -225,10 +248,10 @@ def _ros(image: Any, arrival_ns: int) -> _Stamped:
     stamp = image.header.stamp
     time_ns = stamp.sec * 1_000_000_000 + stamp.nanosec
     if hasattr(image, "format"):
-        return _Stamped(time_ns, arrival_ns, *compressed_picture(image.data.tobytes()))
+        return _Stamped(time_ns, arrival_ns, *compressed_picture(image.data.tobytes(), image.format))
     big = bool(image.is_bigendian)
     picture = raw_picture(image.data.tobytes(), image.encoding, image.height, image.width, image.step, big)
-    return _Stamped(time_ns, arrival_ns, picture, False)
+    return _Stamped(time_ns, arrival_ns, picture, mosaic=_mosaic(image.encoding))
 
 
 _DECODERS: dict[str, Callable[[bytes, int], _Stamped]] = {

@@ -1,0 +1,143 @@
+"""Films from FITS files."""
+
+from __future__ import annotations
+
+import io
+import math
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from aolink.errors import ImportingError
+from aolink.extensions import needs_extra
+from aolink.films.film import Film, FilmFrame
+from aolink.limits import check_picture, unpacked
+
+_MOSAICS = ("RGGB", "BGGR", "GRBG", "GBRG")
+
+
+def fits_film(path: Path, topic: str | None) -> Film:
+    """The cube or picture of a FITS file, the first of several, compressed or not; AO telemetry where it is that."""
+    with _opened(path) as (file, size):
+        header = file[0].header
+        if "AOT-VERS" in header:
+            from aolink.films.telemetry import aot_film
+
+            return aot_film(path, topic)
+        if topic is not None:
+            raise ImportingError(no_topic(path, topic))
+        arrays: list[tuple[int, Any]] = []
+        damaged = ""
+        try:
+            for k, each in enumerate(file):
+                shape = each.shape if each.is_image else ()
+                if len(shape) < 2 or not math.prod(shape):
+                    continue
+                place = each.fileinfo()
+                if place and place["datLoc"] + math.prod(shape) * abs(each.header["BITPIX"]) // 8 > size:
+                    raise ImportingError(f"it is cut off: {' x '.join(map(str, shape))} pixels are announced")
+                arrays.append((k, each))
+        except Exception as error:
+            if not arrays or arrays[0][1].shape[:-2] in ((), (1,)):
+                raise
+            damaged = f"{path.name}: what follows the first cube cannot be read ({error})"
+        if not arrays:
+            raise ImportingError(f"{path} has no array of pixels, neither a primary one nor in an image extension")
+        number, chosen = arrays[0]
+        shape, own = chosen.shape, header.copy() if chosen is file[0] else header + chosen.header
+        own = {**header, **chosen.header}
+        cubes = len(shape) > 2
+        more = [each for _, each in arrays[1:] if (len(each.shape) > 2 if cubes else each.shape == shape)]
+        if more and not cubes:
+            raise ImportingError(
+                f"{path} holds {len(more) + 1} arrays of shape {shape}, and which of them are frames is not known:"
+                " stack the frames in one array (frames, rows, columns)"
+            )
+        # As cameras with several windows write it, there may be axes of length one.
+        if math.prod(shape[:-2]) != max(shape[:-2], default=1):
+            raise ImportingError(f"{path} holds an array of shape {shape}, expected (frames, rows, columns)")
+        check_picture(shape[-1], shape[-2], ImportingError)
+        count = math.prod(shape[:-2])
+        along = next((k for k, n in enumerate(shape[:-2]) if n > 1), None)
+        at = [tuple(k if axis == along else 0 for axis in range(len(shape) - 2)) for k in range(count)]
+        first = chosen.section[(*at[0], slice(0, 1), slice(0, 1))]
+        dtype = np.dtype(first.dtype)
+        if "BLANK" in own and (own.get("BSCALE", 1), own.get("BZERO", 0)) == (1, 0):
+            dtype = np.dtype(f"i{own['BITPIX'] // 8}") if own["BITPIX"] > 8 else np.dtype("u1")
+
+    def pictures() -> Iterator[FilmFrame]:
+        with _opened(path) as (file, _):
+            for each in at:
+                frame = np.asarray(file[number].section[(*each, slice(None), slice(None))])
+                yield frame.astype(frame.dtype.newbyteorder("="), copy=False)
+
+    numbers = {key: _number(own.get(key)) for key in ("EXPTIME", "EXPOSURE", "FRATE", "FRAMRATE", "KINTIME")}
+    cycle = numbers["KINTIME"]
+    odd = [f"{key} = {own[key]!r} is no time or rate: not used" for key in numbers if key in own and not numbers[key]]
+    several = f"{path.name} holds {len(more) + 1} cubes: the first is taken" if more else ""
+    start_ns, unknown = start_of(own)
+    mosaic = str(own.get("BAYERPAT", own.get("COLORTYP", ""))).strip()
+    return Film(
+        name=path.name, shape=(shape[-2], shape[-1]), dtype=dtype.newbyteorder("="), count=count, pictures=pictures,
+        rate_hz=numbers["FRATE"] or numbers["FRAMRATE"] or (1 / cycle if cycle else None),
+        exposure_s=numbers["EXPTIME"] or numbers["EXPOSURE"], start_ns=start_ns,
+        mosaic=mosaic if mosaic in _MOSAICS else "", notes=tuple(filter(None, (several, damaged, unknown, *odd))),
+    )  # fmt: skip
+
+
+def no_topic(path: Path, topic: str) -> str:
+    """The error for a topic of a source that has one film only."""
+    return (
+        f"{path} has no topics: --topic {topic} says which channel of an MCAP file or a bag, which dataset of an HDF5"
+        " file, or which wavefront sensor of AO telemetry, is imported; leave it out"
+    )
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[tuple[Any, int]]:
+    """The open file, and its size in bytes without compression by gzip."""
+    with needs_extra("films", ImportingError):
+        from astropy.io import fits
+    with path.open("rb") as file, warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # about headers that are not as the standard says
+        packed = file.read(2) == b"\x1f\x8b"
+        file.seek(0)
+        source: Any = io.BytesIO(unpacked(file, ImportingError)) if packed else file
+        size = source.seek(0, io.SEEK_END)
+        source.seek(0)
+        with fits.open(source, lazy_load_hdus=True) as opened:
+            yield opened, size
+
+
+def _number(value: Any) -> float | None:
+    try:
+        number = float(str(value).strip().upper().replace("D", "E"))
+    except (TypeError, ValueError):
+        return None
+    return number if math.isfinite(number) and number > 0 else None
+
+
+def start_of(header: dict[str, Any]) -> tuple[int | None, str]:
+    """Start of the exposure by DATE-OBS, which may have its time of day in TIME-OBS, ns since 1970, and a note where it
+    is not known."""
+    text = str(header.get("DATE-OBS", "")).strip().removesuffix("Z")
+    beside = str(header.get("TIME-OBS", "")).strip()
+    if not text:
+        return None, ""
+    if "T" not in text and beside:
+        text = f"{text}T{beside}"
+    scale = str(header.get("TIMESYS", "UTC")).strip().lower()
+    try:
+        if "T" not in text:
+            raise ValueError("it has no time of day")
+        if scale not in ("utc", "gmt"):
+            from astropy.time import Time
+
+            text = str(Time(text, scale=scale, precision=9).utc.isot)
+        return int(np.datetime64(text, "ns").astype(np.int64)), ""
+    except ValueError as error:
+        return None, f"its start is not known: DATE-OBS is {text!r} ({error})"

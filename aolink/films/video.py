@@ -1,0 +1,84 @@
+"""Films from videos, animated pictures and all else that FFmpeg reads, with the time of each frame."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aolink.errors import ImportingError
+from aolink.extensions import needs_extra
+from aolink.films.film import Film
+from aolink.films.stills import COMPRESSED
+
+_LINEAR = ("ffv1", "huffyuv", "rawvideo", "utvideo", "png", "tiff", "ffvhuff")
+"""Codecs that lose nothing."""
+
+
+def video_film(path: Path) -> Film:
+    """The frames of a video, and when each is shown."""
+    with needs_extra("films", ImportingError):
+        import av
+
+    def decoded() -> Iterator[Any]:
+        with av.open(str(path), options={"min_delay": "0"}) as file:  # of a GIF: it is not slowed down
+            for frame in file.decode(file.streams.video[0]):
+                if frame.is_corrupt:
+                    raise ImportingError(f"{path} is damaged: a frame cannot be decoded")
+                yield frame
+
+    if path.suffix.lower() == ".gif" and not path.read_bytes().rstrip(b"\0").endswith(b";"):
+        raise ImportingError(f"{path} is cut off: it has no end")
+    with av.open(str(path)) as file:
+        if not file.streams.video:
+            raise ImportingError(f"{path} has no pictures")
+        stream = file.streams.video[0]
+        tick, codec, rate = stream.time_base, stream.codec_context.name, stream.guessed_rate
+    shown: list[int | None] = []
+    first = None
+    for frame in decoded():
+        shown.append(frame.pts)
+        first = frame if first is None else first
+    if first is None:
+        raise ImportingError(f"{path} has no pictures")
+    pixels = _pixels(first)
+    bits = _bits(first)
+    known: dict[str, Any] = {}
+    times = [each * tick for each in shown if each is not None and tick is not None]
+    if tick is not None and len(times) == len(shown):
+        if rate:  # what a container has rounded to its ticks is meant to be at whole frames
+            numbers = [round((each - times[0]) * rate) for each in times]
+            if all(abs(each - times[0] - k / rate) <= tick for each, k in zip(times, numbers, strict=True)):
+                times = [k / rate for k in numbers]
+        known["times_ns"] = np.array([round(each * 10**9) for each in times], np.int64)
+    elif rate:
+        known["rate_hz"] = float(rate)
+    linear = codec in _LINEAR and not first.format.name.startswith("yuv")
+    mosaic = first.format.name.removeprefix("bayer_")[:4].upper() if first.format.name.startswith("bayer") else ""
+    return Film(
+        name=path.name, shape=(int(pixels.shape[0]), int(pixels.shape[1])), dtype=pixels.dtype, count=len(shown),
+        pictures=lambda: map(_pixels, decoded()), nonlinear="" if linear else COMPRESSED,
+        mosaic=mosaic, top=float((1 << bits) - 1) if bits not in (8, 16, 32) else None, **known,
+    )  # fmt: skip
+
+
+def _bits(frame: Any) -> int:
+    if frame.format.name.startswith("bayer"):
+        return int(frame.format.bits_per_pixel)
+    return int(max(each.bits for each in frame.format.components))
+
+
+def _pixels(frame: Any) -> NDArray[Any]:
+    """A frame's numbers as they are; colours that are no red, green and blue are made these, of as many bits."""
+    name, bits = frame.format.name, _bits(frame)
+    if name.startswith(("gray", "bayer", "gbrp", "rgb24", "rgb48")) and not name.startswith(("gray8a", "grayf")):
+        pixels = frame.to_ndarray()
+        return np.asarray(pixels.astype(pixels.dtype.newbyteorder("=")))
+    if name.startswith("mono"):
+        return np.asarray(frame.to_ndarray(format="gray"))
+    if bits <= 8:
+        return np.asarray(frame.to_ndarray(format="rgb24"))
+    return np.asarray(frame.to_ndarray(format="rgb48le") >> (16 - min(bits, 16)))
