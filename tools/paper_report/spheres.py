@@ -15,9 +15,9 @@ import numpy as np
 
 from aolink.estimation import ESTIMATOR_NAMES, make_estimator, smooth
 from aolink.exposure import Exposure
+from aolink.films.formats import open_film
 from aolink.importing.first_rig import first_rig
 from aolink.importing.frames import FilmSettings
-from aolink.films.formats import open_film
 from aolink.importing.recording import import_film
 from aolink.importing.survey import survey
 from aolink.importing.tracker import find_objects
