@@ -426,7 +426,9 @@ def test_the_command_deblurs_a_recording(aolink: Run, session: Path, tmp_path: P
 def test_the_command_takes_a_recording_or_a_picture(wrong: list[str]) -> None:
     refused = CliRunner().invoke(app, ["deblur", *wrong, "-o", "c.mcap"])
     assert refused.exit_code == 2
-    assert "give a recording alone, or --image with --psf or --path" in " ".join(refused.stderr.replace("│", " ").split())
+    assert "give a recording alone, or --image with --psf or --path" in " ".join(
+        refused.stderr.replace("│", " ").split()
+    )
 
 
 def test_a_method_that_does_not_exist(session: Path, tmp_path: Path) -> None:
