@@ -27,6 +27,7 @@ from aolink.viewing.process import WEB_PORT, free_port, is_free
 from aolink.viewing.save import save_rrd
 from aolink.viewing.viewer import headless_viewer, settled_picture
 from aolink.viewing.vulkan import has_vulkan
+from tests.commands import command_server
 from tests.viewing.stand_in import StandIn, as_recording
 
 TEXTS = ("Session", "Warnings", "Log")
@@ -42,6 +43,7 @@ def rrd(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(autouse=True)
 def _no_viewer_left_behind() -> Iterator[None]:
+    command_server()  # which stays for the tests that come after
     before = set(psutil.Process().children(recursive=True))
     yield
     assert set(psutil.Process().children(recursive=True)) <= before
@@ -297,6 +299,7 @@ def test_a_page_moves_where_its_usual_port_is_taken(rrd: Path) -> None:
         raise KeyboardInterrupt
 
     with socket.socket() as other:
+        other.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # an earlier test may just have left it
         with contextlib.suppress(OSError):  # then somebody else has it
             other.bind(("127.0.0.1", WEB_PORT))
             other.listen()
