@@ -63,11 +63,6 @@ class Modes(NamedTuple):
         """Index of the mode of least objective, (axes,)."""
         return np.asarray(np.argmin(self.objective, axis=1))
 
-    @property
-    def best_mean(self) -> FloatArray:
-        """That mode, (axes, 1, n)."""
-        return np.asarray(self.mean[np.arange(len(self.mean)), self.best][:, None])
-
 
 def find_modes(
     view: PixelView, prior: Gaussian, starts: FloatArray, of_axis: Indices | None = None, *, reversals: bool = False

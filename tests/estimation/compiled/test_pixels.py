@@ -180,27 +180,6 @@ def test_every_start_leads_to_the_same_mode(pair):
         assert np.quantile(np.abs(scaled[settled]), 0.95) < 0.1
 
 
-def test_reversals_of_the_best_are_those_of_the_twin(pair):
-    """With no pass of the search modes are where it starts, and after them the reversals of the best."""
-    view, in_numpy, state = pair
-    prior = view.reduced.prior(state)
-    starts, _ = plain.spread_starts(in_numpy, prior, broad(in_numpy, prior))
-    starts = np.ascontiguousarray(starts[:, :3])
-    found = Modes.none(AXES, 6, starts.shape[2])
-    compiled_modes.find_modes(
-        view.seen, prior.mean, prior.covariance, starts, np.full(AXES, 3), view.whole_nodes,
-        modes.precision_of_reversal(view), 0, FIRST_DAMPING, LARGEST_DAMPING, FREE_DAMPING, 0.0, *found,
-    )  # fmt: skip
-    ends = prior.mean[:, None] + batched.matmul(starts, batched.transpose(cholesky(prior.covariance)))
-    best = ends[np.arange(AXES), np.argmin(found.objective[:, :3], axis=1)]
-    expected = plain.reversed_starts(in_numpy, prior, best[:, None])
-    ours = whitened(prior, found.mean[:, 3:])
-    there = np.isfinite(found.log_evidence[:, 3:])
-    assert there.mean() > 0.3
-    assert len(set(np.argmin(found.objective[1:, :3], axis=1))) > 1
-    np.testing.assert_allclose(ours[there], expected[there], atol=1e-4 * np.abs(expected[there]).max())
-
-
 def test_searches_that_end_early_find_the_modes_that_matter(pair):
     """With searches that end next to a mode that is known: the same modes that matter."""
     view, in_numpy, state = pair
@@ -423,6 +402,31 @@ def test_the_information_of_the_pixels_is_the_twins(kind):
         assert view.gain or square == pytest.approx((score[0, k][lit] ** 2 / information[0, k][lit]).sum(), rel=1e-4)
 
 
+@pytest.mark.parametrize("kind", [*KINDS, *PLANES])
+def test_reversals_of_the_best_are_those_of_the_twin(kind):
+    """With no pass of the search modes are where it starts, and after them the reversals of the best."""
+    view, in_numpy, state = looked_at_plane(kind, 0) if kind in PLANES else looked_at(kind)
+    axes = len(view.y)
+    if kind in PLANES:  # a start state that hardly anything is known of: its path may well be the reverse
+        state = Gaussian(state.mean, 100 * state.covariance)
+    prior = view.reduced.prior(state)
+    starts, _ = plain.spread_starts(in_numpy, prior, broad(in_numpy, prior))
+    starts = np.ascontiguousarray(starts[:, :3])
+    found = Modes.none(axes, 6, starts.shape[2])
+    compiled_modes.find_modes(
+        view.seen, prior.mean, prior.covariance, starts, np.full(axes, 3), view.whole_nodes,
+        modes.precision_of_reversal(view), 0, FIRST_DAMPING, LARGEST_DAMPING, FREE_DAMPING, 0.0, *found,
+    )  # fmt: skip
+    ends = prior.mean[:, None] + batched.matmul(starts, batched.transpose(cholesky(prior.covariance)))
+    best = ends[np.arange(axes), np.argmin(found.objective[:, :3], axis=1)]
+    expected = plain.reversed_starts(in_numpy, prior, best[:, None])
+    ours = whitened(prior, found.mean[:, 3:])
+    there = np.isfinite(found.log_evidence[:, 3:])
+    assert there.mean() > 0.3
+    assert axes == 1 or len(set(np.argmin(found.objective[1:, :3], axis=1))) > 1
+    np.testing.assert_allclose(ours[there], expected[there], atol=1e-4 * np.abs(expected[there]).max())
+
+
 @pytest.mark.parametrize("kind", PLANES)
 def test_the_modes_of_a_spot_on_a_plane_are_those_of_the_twin(kind):
     view, in_numpy, state = looked_at_plane(kind, 0)
@@ -434,7 +438,8 @@ def test_the_modes_of_a_spot_on_a_plane_are_those_of_the_twin(kind):
     )
     assert ours.objective.min() == pytest.approx(theirs.objective.min(), abs=0.05)
     sd = np.sqrt(np.diag(theirs.covariance[0, theirs.best[0]]))
-    np.testing.assert_allclose(ours.best_mean[0, 0] / sd, theirs.best_mean[0, 0] / sd, atol=0.2)
+    best = (each.mean[0, each.best[0]] / sd for each in (ours, theirs))
+    np.testing.assert_allclose(*best, atol=0.2)
 
 
 @pytest.mark.parametrize("kind", ["round", "aslant"])

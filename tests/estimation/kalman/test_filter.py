@@ -296,11 +296,12 @@ def test_innovations_of_a_linear_world_are_consistent():
 @pytest.mark.parametrize("which", ["paper", "coupled"])
 def test_an_axis_does_not_depend_on_those_beside_it(orders, axes, which, mimo, with_axes):
     plant = PLANT if which == "paper" else mimo
+    plant = dataclasses.replace(plant, initial_covariance=plant.initial_covariance / 9)  # it grows without a camera
     rng = np.random.default_rng(6)
     count = plant.n_outputs * len(orders)
     u = 0.01 * rng.standard_normal((10, 50, 64 * plant.n_inputs))
     y = 0.3 * rng.standard_normal((10, 64, count))
-    y[5, ::3] = 1e6  # some are gated
+    y[4:8, ::3] = 1e6  # some are gated, and start again
 
     def steps(n_axes):
         filter_ = PathFilter(with_axes(plant, n_axes), PathMoments(plant, orders))

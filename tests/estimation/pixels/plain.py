@@ -161,7 +161,8 @@ def modes_of(view, prior, wide, at_length):
         if len(rows := np.flatnonzero(which)):
             found = with_more(found, rows, find_modes(view.part(rows), prior.part(rows), some[rows]))
     if len(rows := np.flatnonzero(at_length)):
-        back = reversed_starts(view.part(rows), prior.part(rows), found.best_mean[rows])
+        best = found.mean[rows, found.best[rows]][:, None]
+        back = reversed_starts(view.part(rows), prior.part(rows), best)
         found = with_more(found, rows, find_modes(view.part(rows), prior.part(rows), back))
     return found
 
