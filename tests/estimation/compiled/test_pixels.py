@@ -438,8 +438,8 @@ def test_the_modes_of_a_spot_on_a_plane_are_those_of_the_twin(kind):
     )
     assert ours.objective.min() == pytest.approx(theirs.objective.min(), abs=0.05)
     sd = np.sqrt(np.diag(theirs.covariance[0, theirs.best[0]]))
-    best = (each.mean[0, each.best[0]] / sd for each in (ours, theirs))
-    np.testing.assert_allclose(*best, atol=0.2)
+    found, expected = (each.mean[0, each.best[0]] / sd for each in (ours, theirs))
+    np.testing.assert_allclose(found, expected, atol=0.2)
 
 
 @pytest.mark.parametrize("kind", ["round", "aslant"])
