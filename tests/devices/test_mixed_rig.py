@@ -89,12 +89,16 @@ def test_a_session_is_aligned_by_the_clocks_recorded_estimated_and_replayed(tmp_
     assert max(np.abs(each.inputs).max() for each in exposures) > 0.25
 
     estimates = list(estimate(recording, "moments"))
+    for (_, (again,)), found in zip(replay(recording, ["moments"]), estimates, strict=True):
+        assert np.array_equal(again.path, found.path)
+    # Where this machine held up the fake camera, an exposure overlaps the one before it; its estimate says so.
+    plain = [(exposure, found) for exposure, found in zip(exposures, estimates, strict=True) if not found.reason]
+    assert len(plain) > 8
+    exposures, estimates = map(list, zip(*plain, strict=True))
     assert 0.5 < errors(exposures, estimates, truth) < 1.5
     # This camera runs freely: the mirror may have moved before its first exposure.
     assert max(errors([a], [b], truth) for a, b in zip(exposures[:2], estimates[:2], strict=True)) < 3
     assert errors(exposures, estimates, truth, late=1.0) > 2.5  # a step of misalignment would show
-    for (_, (again,)), found in zip(replay(recording, ["moments"]), estimates, strict=True):
-        assert np.array_equal(again.path, found.path)
 
 
 @pytest.mark.slow
