@@ -1,15 +1,14 @@
 """aolink: a logged hardware-in-the-loop pipeline for adaptive optics and any loop closed through a slow camera.
 
 >>> import aolink
->>> exposures = aolink.simulate("section-vi", n_exposures=3, seed=1)
->>> estimates = aolink.estimate(exposures, "moments")
->>> estimates[0].path.shape
+>>> series = aolink.estimate(aolink.simulate("section-vi", n_exposures=3, seed=1), "moments")
+>>> series.estimates()[0].path.shape
 (1, 200)
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,25 +18,35 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from aolink.estimation import Estimate
-    from aolink.exposure import Exposure, Exposures
-    from aolink.notebook import NotebookRecording
+    from aolink.recording.compare import compare
+    from aolink.recording.reader import Recording
     from aolink.rig import Rig, load_rig
     from aolink.series import Series
+    from aolink.session import record
+    from aolink.session.replay import replay
+    from aolink.viewing.feed import show as view
 
     __version__: str
 
-__all__ = ["AolinkError", "Rig", "estimate", "exposures", "load_rig", "read", "simulate", "smooth"]
+__all__ = [
+    "AolinkError", "Rig", "compare", "estimate", "exposures", "load_rig", "read", "record", "replay", "simulate",
+    "smooth", "view",
+]  # fmt: skip
 
 
 if not TYPE_CHECKING:  # the type checker would accept any name
+    _AT_FIRST_USE = {
+        "Rig": "rig", "load_rig": "rig", "record": "session", "replay": "session.replay",
+        "compare": "recording.compare", "view": "viewing.feed",
+    }  # fmt: skip
 
     def __getattr__(name: str) -> Any:
         """Load names that need SciPy, and the version, at their first use, so that a command handles signals before
         that."""
-        if name in ("Rig", "load_rig"):
-            import aolink.rig
+        if name in _AT_FIRST_USE:
+            from importlib import import_module
 
-            return getattr(aolink.rig, name)
+            return getattr(import_module(f"aolink.{_AT_FIRST_USE[name]}"), "show" if name == "view" else name)
         if name == "__version__":
             from importlib.metadata import version
 
@@ -45,11 +54,15 @@ if not TYPE_CHECKING:  # the type checker would accept any name
         raise AttributeError(f"module 'aolink' has no attribute {name!r}")
 
 
-def read(path: str | Path, side: Sequence[str | Path] = ()) -> NotebookRecording:
+def __dir__() -> list[str]:
+    return [*__all__, "__version__"]
+
+
+def read(path: str | Path, side: Sequence[str | Path] = (), *, rig: Rig | str | Path | None = None) -> Recording:
     """Open a recording: a series of exposures, read when they are used.
 
-    ``len(recording)``, ``recording[7]``, ``recording[-10:]`` and a loop give exposures; ``to_pandas()``,
-    ``to_xarray()`` and ``plot()`` are for notebooks, and include the estimates in the file.
+    ``len(recording)``, ``recording[7]`` and a loop give exposures, ``recording[-10:]`` a part, ``recording.walk()`` the
+    exposures with their estimates; ``to_pandas()``, ``to_xarray()`` and ``plot()`` are for notebooks.
 
     Parameters
     ----------
@@ -57,23 +70,26 @@ def read(path: str | Path, side: Sequence[str | Path] = ()) -> NotebookRecording
         A file, or a URL that fsspec knows (``pip install 'aolink[remote]'``).
     side:
         Side files of the recording, whose estimates replace its own by the same names.
+    rig:
+        A rig, a rig file or the name of one that comes with aolink, instead of the recording's own for new estimates.
 
     Returns
     -------
-    A `Recording`, which is an `aolink.series.Series` of exposures; `aolink.exposure.Exposure` states the shape and unit
-    of each field.
+    An `aolink.series.Series` of exposures; `aolink.exposure.Exposure` states the shape and unit of each field.
 
     Raises
     ------
     RecordingError
         The file cannot be read, or is not a recording of aolink; or a side file is not of this recording.
+    RigError
+        The rig file cannot be read, or cannot stand in for the recording's own.
     """
-    from aolink.notebook import NotebookRecording
+    from aolink.recording.reader import Recording
 
-    return NotebookRecording(path, side=side)
+    return Recording(path, side=side, rig=None if rig is None else _rig(rig))
 
 
-def simulate(rig: Rig | str | Path, n_exposures: int, seed: int | None = None) -> Exposures:
+def simulate(rig: Rig | str | Path, n_exposures: int, seed: int | None = None) -> Series:
     """Exposures of a simulated rig with their truth, in memory: the model behind `aolink rig`, without a wire.
 
     Parameters
@@ -87,25 +103,24 @@ def simulate(rig: Rig | str | Path, n_exposures: int, seed: int | None = None) -
 
     Returns
     -------
-    A sequence of `aolink.exposure.Exposure`, each with its ``truth``, and with ``rig``, the rig that they are from.
+    An `aolink.series.Series` of exposures, each with its ``truth``.
 
     Raises
     ------
     RigError
         The rig file cannot be read or cannot work.
     """
-    from aolink.exposure import Exposures
-    from aolink.rig import Rig, load_rig
+    from aolink.series import in_memory
     from aolink.simulation.model import simulate as simulate_exposures
 
-    rig = rig if isinstance(rig, Rig) else load_rig(rig)
-    return Exposures(rig, tuple(simulate_exposures(rig, n_exposures, seed)))
+    rig = _rig(rig)
+    return in_memory(rig, simulate_exposures(rig, n_exposures, seed))
 
 
 def exposures(
     frames: NDArray[Any], rig: Rig | str | Path, inputs: NDArray[Any] | None = None,
     start_steps: Sequence[int] | None = None,
-) -> Exposures:  # fmt: skip
+) -> Series:  # fmt: skip
     """Exposures of frames in memory, to `estimate` and `smooth` them.
 
     Parameters
@@ -123,7 +138,7 @@ def exposures(
 
     Returns
     -------
-    A sequence of `aolink.exposure.Exposure` without truth, whose ``frame_id`` counts from 1.
+    An `aolink.series.Series` of exposures without truth, whose ``frame_id`` counts from 1.
 
     Raises
     ------
@@ -133,24 +148,24 @@ def exposures(
         The rig file cannot be read or cannot work.
     """
     from aolink.importing.exposures import exposures as made
-    from aolink.rig import Rig, load_rig
 
-    return made(frames, rig if isinstance(rig, Rig) else load_rig(rig), inputs, start_steps)
+    return made(frames, _rig(rig), inputs, start_steps)
 
 
-def estimate(exposures: Exposures | Series | str | Path, estimator: str) -> list[Estimate]:
-    """Estimates of the motion inside each exposure, in their order.
+def estimate(exposures: Series | str | Path, estimators: str | Sequence[str]) -> Series:
+    """Estimates of the motion inside each exposure.
 
     Parameters
     ----------
     exposures:
-        The result of `simulate` or `exposures`, or a recording, a slice of one, or its path.
-    estimator:
-        One of `aolink.estimation.ESTIMATOR_NAMES`, which options may follow: ``"moments:orders=012"``.
+        The result of `simulate`, `exposures` or `read`, a part of it, or the path of a recording.
+    estimators:
+        One or several of `aolink.estimation.ESTIMATOR_NAMES`, which options may follow: ``"moments:orders=012"``.
 
     Returns
     -------
-    One estimate for each exposure. Paths are in slope units and states in the plant's units;
+    The same series with the new estimates beside, or instead of, its own: ``estimates(name)`` lists them, ``walk()``
+    gives them with their exposures. Paths are in slope units and states in the plant's units;
     `aolink.estimation.Estimate` states the shape of each field. An exposure that cannot be used has a prediction, whose
     ``status`` and ``reason`` say so.
 
@@ -161,58 +176,74 @@ def estimate(exposures: Exposures | Series | str | Path, estimator: str) -> list
     RecordingError
         ``exposures`` is a path, and no recording can be read from it.
     """
-    from aolink.estimation import Driver
+    from aolink.estimation import run
+    from aolink.series import with_estimates
 
-    rig, series = _opened(exposures)
-    return [result for _, (result,) in Driver(rig, [estimator]).steps(series)]
+    series = _opened(exposures)
+    names = [estimators] if isinstance(estimators, str) else list(dict.fromkeys(estimators))
+    return with_estimates(series, run(series.rig, series, names))
 
 
-def smooth(
-    exposures: Exposures | Series | str | Path, estimates: list[Estimate], lag: int | None = None
-) -> list[Estimate]:
-    """Estimates of `estimate`, each corrected by later exposures. It works offline only.
+def smooth(series: Series | str | Path, lag: int | None = None, *, estimators: str | Sequence[str] = ()) -> Series:
+    """The same series with estimates that are each corrected by later exposures. It works offline only.
 
     It is the Rauch-Tung-Striebel smoother, or backward simulation for estimators that carry a Gaussian mixture.
 
     Parameters
     ----------
-    exposures:
-        The exposures that `estimate` was given.
-    estimates:
-        Its result for them.
+    series:
+        The result of `estimate`, or a recording with estimates.
     lag:
         Number of later exposures that correct each; None: all of them.
+    estimators:
+        The estimators whose estimates are smoothed; all by default.
 
     Returns
     -------
-    One estimate for each given one, with other states, paths and covariances; status, innovation and NIS are kept.
+    The series with other states, paths and covariances; status, innovation and NIS are kept.
 
     Raises
     ------
     EstimatorError
-        The estimates are not those of the exposures, the lag is negative, or ``exposures`` are none of these.
+        An exposure has no estimate, the lag is negative, or ``series`` is none of these.
     RecordingError
-        ``exposures`` is a path, and no recording can be read from it.
+        There are no such estimates, or no recording can be read from the path.
     """
-    from aolink.estimation import smooth as smooth_estimates
-
-    rig, series = _opened(exposures)
-    return smooth_estimates(rig.plant, list(series), estimates, lag)
-
-
-def _opened(exposures: Exposures | Series | str | Path) -> tuple[Rig, Iterable[Exposure]]:
-    """The rig of exposures, and the exposures one after the other."""
     from aolink.errors import EstimatorError
-    from aolink.exposure import Exposures
+    from aolink.estimation import smooth as smooth_estimates
+    from aolink.series import with_estimates
+
+    if isinstance(lag, Sequence):
+        raise EstimatorError(
+            "smooth takes a series with its estimates, as estimate gives it: aolink.smooth(series, lag=3)"
+        )
+    opened = _opened(series)
+    names = opened.named(([estimators] if isinstance(estimators, str) else list(estimators)) or None)
+    walked = list(opened.walk(names))
+    of_each = {name: [found[name] for _, found in walked if name in found] for name in names}
+    plant, all_exposures = opened.rig.plant, [exposure for exposure, _ in walked]
+    made: dict[str, list[Estimate]] = {
+        name: smooth_estimates(plant, all_exposures, estimates, lag) for name, estimates in of_each.items()
+    }
+    return with_estimates(opened, made)
+
+
+def _rig(rig: Rig | str | Path) -> Rig:
+    from aolink.rig import Rig, load_rig
+
+    return rig if isinstance(rig, Rig) else load_rig(rig)
+
+
+def _opened(exposures: Series | str | Path) -> Series:
+    """A series that is given, or read from a path."""
+    from aolink.errors import EstimatorError
     from aolink.series import Series
 
     if isinstance(exposures, str | Path):
         exposures = read(exposures)
-    if isinstance(exposures, Exposures):
-        return exposures.rig, exposures
-    if isinstance(exposures, Series):
-        return exposures.rig, exposures.exposures()
-    raise EstimatorError(
-        "exposures must know their rig, as those of aolink.simulate, aolink.exposures and aolink.read do, or be the"
-        f" path of a recording, found {type(exposures).__name__}: give aolink.exposures(frames, rig) for arrays"
-    )
+    if not isinstance(exposures, Series):
+        raise EstimatorError(
+            "exposures must know their rig, as those of aolink.simulate, aolink.exposures and aolink.read do, or be the"
+            f" path of a recording, found {type(exposures).__name__}: give aolink.exposures(frames, rig) for arrays"
+        )
+    return exposures

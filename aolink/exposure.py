@@ -7,15 +7,14 @@ origin.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import overload
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from aolink.plain import plain_data
-from aolink.rig import Rig
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -114,28 +113,17 @@ class Exposure:
     truth: Truth | None = None
     """The true states and path, where they are known."""
 
+    if not TYPE_CHECKING:  # the type checker would accept any name
+
+        def __getattr__(self, name: str) -> Any:
+            of = "it is an estimate's, and aolink.estimate gives a series: its estimates() have it"
+            more = f": {of}" if name in ("path", "path_sd", "status", "start_state", "end_state", "nis") else ""
+            raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}{more}")
+
     @property
     def complete(self) -> bool:
         """Whether every pixel arrived."""
         return bool(self.mask.all())
-
-
-@dataclass(frozen=True, eq=False)
-class Exposures(Sequence[Exposure]):
-    """A series of exposures of one rig, in order."""
-
-    rig: Rig
-    items: tuple[Exposure, ...]
-
-    @overload
-    def __getitem__(self, index: int) -> Exposure: ...
-    @overload
-    def __getitem__(self, index: slice) -> Exposures: ...
-    def __getitem__(self, index: int | slice) -> Exposure | Exposures:
-        return Exposures(self.rig, self.items[index]) if isinstance(index, slice) else self.items[index]
-
-    def __len__(self) -> int:
-        return len(self.items)
 
 
 def step_shares(n_steps: int, offset: float) -> NDArray[np.float64]:

@@ -15,8 +15,6 @@ from aolink.files import check_target, writing
 from aolink.signals import StopRequest
 
 if TYPE_CHECKING:
-    from aolink.estimation import Estimate
-    from aolink.exposure import Exposure
     from aolink.jobs.batch import Done, Job, SideJob
     from aolink.jobs.unit import Model
 
@@ -243,14 +241,14 @@ def _estimate_one(
 ) -> None:  # fmt: skip
     from aolink.cli.tables import scores as tables
     from aolink.estimation.registry import DEFAULT_ESTIMATOR
-    from aolink.recording import reestimate, topics
+    from aolink.recording import topics
     from aolink.recording.reader import Recording
     from aolink.recording.reestimate import (
         check_has_exposures,
         kept_estimators,
         own_estimators,
-        reestimated,
         scored_and_compared,
+        write_reestimated,
     )
 
     recording = common.say_damage(model.applied_to(Recording(file)))
@@ -260,16 +258,12 @@ def _estimate_one(
         common.get_ready(recording.rig, names)
         with progress("estimate", recording.n_frames) as tell:
             if output is not None:
-                reestimate.write_reestimated(
+                scores, differences = write_reestimated(
                     recording, names, output,
                     only=only, overwrite=overwrite, progress=tell, engine=engine.value,
                 )  # fmt: skip
-                written = Recording(output)
-                each = zip(*(written.iter_estimates(name) for name in names), strict=True)
-                series: Iterable[tuple[Exposure, Sequence[Estimate]]] = zip(recording.exposures(), each, strict=True)
             else:
-                series = reestimated(recording, names, tell, engine.value)
-            scores, differences = scored_and_compared(recording, series, names)
+                scores, differences = scored_and_compared(recording, names, tell, engine.value)
     except (ArithmeticError, ValueError) as error:
         if recording.rig_is_recorded:
             raise

@@ -32,6 +32,11 @@ class SkippedInputs:
         self._rows: deque[FloatArray] = deque()
         self._steps = 0
 
+    @property
+    def empty(self) -> bool:
+        """Whether no exposure was skipped since the last that was not."""
+        return not self._rows
+
     def skip(self, exposure: Exposure) -> None:
         """Keep the inputs of an exposure that the estimator does not get."""
         for rows in (exposure.lead_inputs, exposure.inputs):
@@ -61,7 +66,8 @@ class Driver:
         As in `Options`.
     skipped:
         Frame ids of the exposures that an estimator does not get, by its name: those that it had no time for in a
-        session. Its estimates of the others are those of that session, bit for bit.
+        session. Its estimates of the others are those of that session, bit for bit. An exposure's id may be added
+        until it is given.
 
     Raises
     ------
@@ -101,6 +107,8 @@ class Driver:
         if estimator.name not in self._skipped:
             return estimator.steps(batch)
         skipped, inputs = self._skipped[estimator.name], self._inputs[estimator.name]
+        if inputs.empty and not any(exposure.frame_id in skipped for exposure in batch.exposures):
+            return estimator.steps(batch)
         given: list[Exposure | None] = []
         for exposure in batch.exposures:
             if exposure.frame_id in skipped:

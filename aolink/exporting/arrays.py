@@ -122,8 +122,8 @@ def arrays(
         for name, row in TRUTH.items():
             columns[name].append(None if exposure.truth is None else row.of(name, exposure.truth))
         for name, row in ESTIMATE.items():
-            for column, estimate in zip(by_estimator[name], estimates, strict=True):
-                column.append(None if estimate is None else row.of(name, estimate))
+            for column, of in zip(by_estimator[name], names, strict=True):
+                column.append(row.of(name, estimates[of]) if of in estimates else None)
     times, leads, scenes, slopes = zip(*rest, strict=True)
     found = {
         "time": Variable(

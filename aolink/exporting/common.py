@@ -33,10 +33,10 @@ def needed(module: str, extra: str, what: str) -> Any:
 
 def together(
     series: Series, names: Sequence[str], progress: Progress = no_progress
-) -> Iterator[tuple[Exposure, list[Estimate | None]]]:
-    """The exposures and estimates of `Series.with_estimates`. Raises ExportError where there is no exposure."""
+) -> Iterator[tuple[Exposure, dict[str, Estimate]]]:
+    """The exposures and estimates of `Series.walk`. Raises ExportError where there is no exposure."""
     number = 0
-    for number, both in enumerate(series.with_estimates(names), 1):
+    for number, both in enumerate(series.walk(names), 1):
         yield both
         progress(number)
     if not number:

@@ -82,8 +82,7 @@ def rows(
         } | {name: getattr(exposure, name) for name in _OF_EXPOSURE}  # fmt: skip
         inputs = exposure.inputs.reshape(exposure.n_steps, plant.axes, -1).swapaxes(0, 1)
         truth = {} if exposure.truth is None else _of_truth(exposure.truth, plant.axes, lists)
-        made = zip(names, estimates, strict=True)
-        of_each = [(name, _of_estimate(each, exposure, lists)) for name, each in made if each is not None]
+        of_each = [(name, _of_estimate(each, exposure, lists)) for name, each in estimates.items()]
         for axis in range(plant.axes):
             row = shared | {"axis": axis}
             row |= {f"input_{j}_mean": mean for j, mean in enumerate(inputs[axis].mean(axis=0).tolist(), 1)}
@@ -136,7 +135,7 @@ def _of_path(path: FloatArray, axes: int, lists: bool) -> dict[str, ByAxis]:
 
 
 def to_pandas(series: Series, estimators: Sequence[str] | None = None) -> pd.DataFrame:
-    """The result of `aolink.notebook.NotebookSeries.to_pandas`. Raises RecordingError and ExportError as that does."""
+    """The result of `aolink.series.Series.to_pandas`. Raises RecordingError and ExportError as that does."""
     pandas = needed("pandas", "tables", "a data frame")
     names = series.named(estimators)
     known = columns(series, names)
@@ -148,4 +147,29 @@ def to_pandas(series: Series, estimators: Sequence[str] | None = None) -> pd.Dat
     frame: pd.DataFrame = pandas.DataFrame(
         {column.name: np.array(values[column.name], dtype=types[column.kind]) for column in known}
     )
+    return frame.set_index("time").tz_localize("UTC")
+
+
+def paths_to_pandas(series: Series, estimators: Sequence[str] | None = None) -> pd.DataFrame:
+    """The long table of `aolink.series.Series.to_pandas`: a row for each fast step, output and name."""
+    pandas = needed("pandas", "tables", "a data frame")
+    names, clock, parts = series.named(estimators), None, []
+    ns, outputs = series.rig.timing.fast_step_ns, series.rig.n_outputs
+    for exposure, estimates in together(series, names):
+        clock = clock_of(exposure) if clock is None else clock
+        begun = time_ns(series, exposure, clock) + (round(exposure.start_offset * ns) if not clock else 0)
+        steps = begun + ns * np.arange(exposure.n_steps)
+        paths = {} if exposure.truth is None else {"truth": (exposure.truth.path, np.zeros_like(exposure.truth.path))}
+        paths |= {name: (estimates[name].path, estimates[name].path_sd) for name in names if name in estimates}
+        for name, (value, sd) in paths.items():
+            parts.append(
+                {
+                    "time": np.tile(steps, outputs), "frame_id": np.full(value.size, exposure.frame_id),
+                    "name": np.full(value.size, name, dtype=object),
+                    "axis": np.repeat(np.arange(outputs), exposure.n_steps), "value": value.ravel(), "sd": sd.ravel(),
+                }
+            )  # fmt: skip
+    keys = ("time", "frame_id", "name", "axis", "value", "sd")
+    columns = {key: np.concatenate([part[key] for part in parts]) if parts else np.zeros(0) for key in keys}
+    frame: pd.DataFrame = pandas.DataFrame(columns | {"time": columns["time"].astype("datetime64[ns]")})
     return frame.set_index("time").tz_localize("UTC")

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from aolink.assembly import Assembler, Frame
 from aolink.errors import ImportingError
-from aolink.exposure import Exposure, Exposures
+from aolink.exposure import Exposure
 from aolink.films.film import Film
 from aolink.importing.brightness import brightness_of, change_of
 from aolink.importing.defects import defects_note, find_defects
@@ -37,6 +37,7 @@ from aolink.numerics.arrays import BoolArray, FloatArray
 from aolink.optics.camera import to_density
 from aolink.optics.centroid import weighted_centroid
 from aolink.rig import Rig
+from aolink.series import Series, in_memory
 from aolink.wire.messages_pb2 import Applied
 
 _FASTER = 0.75
@@ -247,7 +248,7 @@ class _Inputs:
 
 def exposures(
     frames: NDArray[Any], rig: Rig, inputs: NDArray[Any] | None = None, start_steps: Sequence[int] | None = None
-) -> Exposures:
+) -> Series:
     """Exposures of frames in memory, as `aolink.exposures` gives them."""
     values = np.asarray(frames)
     if values.ndim != 3 or values.dtype.kind not in "biuf" or values.shape[1:] != rig.sensor.shape or not len(values):
@@ -289,4 +290,4 @@ def exposures(
             exposure_offset_ns=rig.timing.exposure_offset_ns,
         )  # fmt: skip
         made += [*assembler.add_frame(frame), *assembler.add_applied(applied)]
-    return Exposures(rig, tuple(made + assembler.flush()))
+    return in_memory(rig, made + assembler.flush())

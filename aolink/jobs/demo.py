@@ -166,7 +166,7 @@ def run_demo(
         differences = {
             name: difference
             for name, again in offline.items()
-            if (difference := first_difference(list(recording.iter_estimates(name)), again))
+            if (difference := first_difference(recording.estimates(name), again))
         }
         ranked = by_rank(list(estimators))
         scores = scored(recording, ranked)

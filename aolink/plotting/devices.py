@@ -12,21 +12,9 @@ from aolink.numerics.arrays import FloatArray
 from aolink.plotting.overview import Overview, need_exposures
 from aolink.plotting.session import thinned, time_label
 from aolink.plotting.style import TimeUnit, axes_or_new, legend_above
-from aolink.recording import topics
-from aolink.recording.reader import Recording
-from aolink.recording.schemas_pb2 import Estimation, Latency
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-
-LATENCY_STEPS = (
-    ("first_byte_ns", "first byte"),
-    ("complete_ns", "frame complete"),
-    ("estimated_ns", "estimated"),
-    ("command_sent_ns", "command sent"),
-    ("command_acknowledged_ns", "acknowledged"),
-)
-"""Fields of a Latency in the order in which they happen, and their names."""
 
 _LANES = {
     Status.GATED: ("gated", "tab:orange"),
@@ -52,11 +40,8 @@ def incidents(view: Overview) -> dict[str, FloatArray]:
     for name, status in view.status.items():
         for kind, (text, _) in _LANES.items():
             found[f"{name}: {text}"] = steps[status == kind]
-    if isinstance(view.series, Recording):
-        by_frame = dict(zip(view.frame_ids.tolist(), steps.tolist(), strict=True))
-        for name in view.names:
-            skipped = sorted(by_frame[k] for k in view.series.skipped(name) if k in by_frame)
-            found[f"{name}: no time for it"] = np.array(skipped)
+    for name, first in view.skipped.items():
+        found[f"{name}: no time for it"] = (first - view.first_steps[:1]).astype(np.float64)
     return {name: at for name, at in found.items() if len(at)}
 
 
@@ -93,24 +78,14 @@ def plot_latency(view: Overview, axes: Axes | None = None, *, unit: TimeUnit = "
         The series holds no latencies, or matplotlib is missing.
     """
     need_exposures(view)
-    series = view.series
-    wanted = [topics.LATENCY, *map(topics.estimation_topic, view.names)]
-    there = [name for name in wanted if isinstance(series, Recording) and name in series.counts]
-    lines: dict[str, list[tuple[float, float]]] = {name: [] for _, name in LATENCY_STEPS}
     by_frame = dict(zip(view.frame_ids.tolist(), view.steps.tolist(), strict=True))
-    for recorded in series.messages(*there) if isinstance(series, Recording) and there else ():
-        message = recorded.message
-        if isinstance(message, Latency) and message.frame_id in by_frame:
-            at = by_frame[message.frame_id]
-            for key, name in LATENCY_STEPS:
-                if (done := getattr(message, key)) > 0:
-                    lines[name].append((at, (done - message.exposure_end_ns) / 1e6))
-        elif isinstance(message, Estimation) and not message.skipped and message.frame_id in by_frame:
-            name = f"{message.estimator} takes"
-            lines.setdefault(name, []).append((by_frame[message.frame_id], message.took_ns / 1e6))
+    lines = {
+        name: [(by_frame[frame], took_ms) for frame, took_ms in points if frame in by_frame]
+        for name, points in view.timings.items()
+    }
     known = {name: np.array(points).T for name, points in lines.items() if points}
     if not known:
-        raise ExportError(f"{series.path} holds no latencies: it was recorded on virtual time, or imported")
+        raise ExportError(f"{view.series.path} holds no latencies: it was recorded on virtual time, or imported")
     axes = axes_or_new(axes)
     for name, (at, took) in known.items():
         style = "--" if name.endswith(" takes") else "-"

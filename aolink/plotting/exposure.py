@@ -46,12 +46,11 @@ def exposure_with_estimates(
     ranked = by_rank(list(series.named(None)))
     usual = [name for name in dict.fromkeys((BASELINE_ESTIMATOR, *ranked[-1:])) if name in ranked]
     names = series.named(usual if estimators is None else estimators)
-    one = series[number : number + 1]
-    exposure, estimates = next(iter(one.with_estimates(names)), (None, []))
+    exposure, estimates = next(series[number : number + 1].walk(names), (None, {}))
     if exposure is None:
         raise ExportError(f"exposure {number} of {series.path} cannot be read; `aolink info --check` says why")
     check_frame(series, exposure)
-    return exposure, {name: each for name, each in zip(names, estimates, strict=True) if each is not None}
+    return exposure, estimates
 
 
 def plot_exposure(

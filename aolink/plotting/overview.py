@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from functools import lru_cache
+from functools import lru_cache, partial
+from typing import Any
 
 import numpy as np
 
 from aolink.colours import by_rank
 from aolink.errors import ExportError
-from aolink.estimation.estimate import Estimate, Status
+from aolink.estimation.estimate import Status
 from aolink.estimation.frames.measure import profiles_of
 from aolink.estimation.score import Score, Scorer
 from aolink.exporting.common import Progress, check_frame, no_progress
@@ -21,7 +22,9 @@ from aolink.numerics.rms import rms
 from aolink.optics.camera import to_density
 from aolink.optics.sensor import BaseSensor, Sensor
 from aolink.plotting.style import TimeUnit, extremes, hides_swings
-from aolink.series import Series
+from aolink.recording import topics
+from aolink.recording.schemas_pb2 import Estimation, Latency
+from aolink.series import NOTHING, Also, Series, Step
 
 NIS_COVERAGE = 0.95
 """Probability that a consistent estimator's NIS lies inside the bounds drawn."""
@@ -31,6 +34,14 @@ _POINTS = 17
 """Points of a path within its exposure."""
 _KERNELS = 4.0
 """The drawn field reaches this many of the kernel's standard deviations beyond the paths."""
+LATENCY_STEPS = (
+    ("first_byte_ns", "first byte"),
+    ("complete_ns", "frame complete"),
+    ("estimated_ns", "estimated"),
+    ("command_sent_ns", "command sent"),
+    ("command_acknowledged_ns", "acknowledged"),
+)
+"""Fields of a Latency in the order in which they happen, and their names."""
 _NONE = -1
 """The number instead of a status where there is no estimate."""
 
@@ -83,6 +94,11 @@ class Overview:
     measurements: dict[str, int]
     """Number of measurements of an estimator for an axis."""
     scores: dict[str, Score]
+    skipped: dict[str, IntArray]
+    """First steps of the exposures that an estimator had no time for in the session, by estimator."""
+    timings: dict[str, list[tuple[int, float]]]
+    """When each step of the loop was done, after the end of its exposure, and how long estimates took: frame ids and
+    ms, by name."""
     spans: FloatArray
     """First step and end of each column of the blur, from the first exposure on, (columns, 2)."""
     blur: FloatArray
@@ -134,8 +150,9 @@ class Overview:
 
 
 def overview(
-    series: Series, estimators: Sequence[str] | None = None, *, output: int = 0, progress: Progress = no_progress
-) -> Overview:
+    series: Series, estimators: Sequence[str] | None = None, *, output: int = 0, progress: Progress = no_progress,
+    also: Also = NOTHING,
+) -> Overview:  # fmt: skip
     """Read a series once, for any of the figures.
 
     Parameters
@@ -146,6 +163,8 @@ def overview(
         Number of the output (a row of a path) whose blur and paths are drawn.
     progress:
         Called with the number of exposures read.
+    also:
+        Functions that get the messages of other topics, as `aolink.series.Series.steps` takes them.
 
     Raises
     ------
@@ -158,10 +177,9 @@ def overview(
     if not 0 <= output < series.rig.n_outputs:
         raise ExportError(f"there is no output {output}: {series.path} has {series.rig.n_outputs}, counted from 0")
     gathered = _Gathered(series, names, output)
-    number = 0
-    for number, (exposure, estimates) in enumerate(series.with_estimates(names), 1):
-        check_frame(series, exposure)
-        gathered.add(exposure, estimates)
+    for number, step in enumerate(series.steps(names, also=gathered.beside(also)), 1):
+        check_frame(series, step.exposure)
+        gathered.add(step)
         progress(number)
     return gathered.result()
 
@@ -187,18 +205,42 @@ class _Gathered:
         self.nis: dict[str, list[tuple[float, float]]] = {name: [] for name in names}
         self.measurements: dict[str, int] = {}
         self.scorers = {name: Scorer() for name in names}
+        self.skipped: dict[str, list[int]] = {name: [] for name in names}
+        self.timings: dict[str, list[tuple[int, float]]] = {}
         self.column: list[tuple[Exposure, dict[str, FloatArray]]] = []
         self.spans: list[tuple[int, int]] = []
         self.blur: list[FloatArray] = []
         self.paths: dict[str, list[tuple[FloatArray, FloatArray, FloatArray, bool]]] = {}
 
-    def add(self, exposure: Exposure, estimates: Sequence[Estimate | None]) -> None:
+    def beside(self, also: Also) -> Also:
+        """``also``, with the function that takes the messages about times."""
+        timed = [topics.LATENCY, *map(topics.estimation_topic, self.names)]
+        return {**also, **{topic: partial(self._see, also.get(topic)) for topic in timed}}
+
+    def _see(self, before: Callable[[Any], None] | None, recorded: Any) -> None:
+        if before is not None:
+            before(recorded)
+        message = recorded.message
+        if isinstance(message, Latency):
+            for key, name in LATENCY_STEPS:
+                if (done := getattr(message, key)) > 0:
+                    took_ms = (done - message.exposure_end_ns) / 1e6
+                    self.timings.setdefault(name, []).append((message.frame_id, took_ms))
+        elif isinstance(message, Estimation) and not message.skipped:
+            taken = self.timings.setdefault(f"{message.estimator} takes", [])
+            taken.append((message.frame_id, message.took_ns / 1e6))
+
+    def add(self, step: Step) -> None:
+        exposure, estimates = step.exposure, step.estimates
+        for name in step.skipped:
+            self.skipped[name].append(exposure.first_step)
         missing = 0.0 if exposure.slopes is not None else 1 - float(np.mean(exposure.mask))
         self.facts.append((exposure.frame_id, exposure.first_step, exposure.n_steps, missing, exposure.inputs_assumed))
         truth = None if exposure.truth is None else exposure.truth.path
         known = slice(None) if exposure.truth is None else exposure.truth.known
         found = {"truth": truth} if truth is not None else {}
-        for name, estimate in zip(self.names, estimates, strict=True):
+        for name in self.names:
+            estimate = estimates.get(name)
             self.status[name].append(_NONE if estimate is None else int(estimate.status))
             nis, error = (np.nan, np.nan), np.nan
             if estimate is not None:
@@ -274,6 +316,8 @@ class _Gathered:
             mean_nis={name: nis[name][1] for name in self.measurements},
             measurements=self.measurements,
             scores={name: scorer.result() for name, scorer in self.scorers.items()},
+            skipped={name: np.array(steps, dtype=np.int64) for name, steps in self.skipped.items()},
+            timings=self.timings,
             spans=spans - (spans[0, 0] if len(spans) else 0), blur=np.array(self.blur), paths=paths,
         )  # fmt: skip
 

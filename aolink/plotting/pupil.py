@@ -118,11 +118,11 @@ def spot_values(rig: Rig, exposure: Exposure, estimate: Estimate | None) -> dict
 def _maps(series: Series, names: Sequence[str]) -> dict[str, tuple[str, FloatArray, str]]:
     """Each map by its title: the meaning of its colours, a value for each spot, a colour map."""
     seen: dict[str, list[FloatArray]] = {}
-    for number in np.unique(np.linspace(0, max(len(series) - 1, 0), _EXPOSURES).astype(int)):
-        for exposure, estimates in series[int(number) : int(number) + 1].with_estimates(names):
-            check_frame(series, exposure)
-            for name, values in spot_values(series.rig, exposure, next(iter(estimates), None)).items():
-                seen.setdefault(name, []).append(values)
+    spread = np.unique(np.linspace(0, len(series) - 1, min(_EXPOSURES, len(series))).astype(int))
+    for exposure, estimates in series[spread].walk(names):
+        check_frame(series, exposure)
+        for name, values in spot_values(series.rig, exposure, estimates.get(names[0]) if names else None).items():
+            seen.setdefault(name, []).append(values)
     if not seen:
         raise ExportError(f"{series.path} holds no exposure to draw; `aolink info` says what it holds")
     by = names[0] if names else "centroid"

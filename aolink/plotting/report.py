@@ -24,7 +24,7 @@ from aolink.plotting.session import plot_blur, plot_errors, plot_nis
 from aolink.plotting.style import TimeUnit, new_figure, paper
 from aolink.recording import topics
 from aolink.recording.answers import Answers
-from aolink.recording.facts import recording_facts
+from aolink.recording.facts import Counted, recording_facts
 from aolink.recording.reader import Recording
 from aolink.units import duration, with_unit
 
@@ -101,12 +101,14 @@ class _Session:
         self.recording, self.unit = recording, unit
         self.name = recording.path.name
         self.view: Overview | None = None
-        self.problem = ""
+        self.problem, counted = "", Counted(recording)
         try:
-            self.view = overview(recording, progress=lambda done: progress(self.name, done))
+            also = dict.fromkeys(recording.counts, counted.see)
+            self.view = overview(recording, progress=lambda done: progress(self.name, done), also=also)
         except (AolinkError, ValueError, ArithmeticError) as error:
             self.problem = str(error)
-        self.facts = recording_facts(recording)  # damage is known after all of it was read
+        # Damage is known after all of it was read.
+        self.facts = recording_facts(recording, None if self.view is None else counted)
 
     def title(self) -> str:
         return f"<h3>{escape(self.name)}</h3>"

@@ -11,18 +11,36 @@ from numpy.typing import NDArray
 from aolink.errors import ExportError
 from aolink.estimation.estimate import Status
 from aolink.numerics.arrays import FloatArray
-from aolink.plotting.overview import NIS_COVERAGE, Overview, limits_of, need_exposures, nis_bounds
-from aolink.plotting.style import TimeUnit, axes_or_new, colour, colour_bar, legend_above
+from aolink.plotting.overview import NIS_COVERAGE, Overview, limits_of, need_exposures, nis_bounds, overview
+from aolink.plotting.style import TimeUnit, axes_or_new, colour, colour_bar, figure_or_new, legend_above
+from aolink.series import Series
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+_SIZE_IN = (10.0, 6.0)
 _BRIGHTEST = 98.0
 """Percentile of the columns' brightest pixels that is drawn black."""
 _RUNNING = 20
 """The errors are averaged over one part in this many of the session."""
 _MOST_POINTS = 3000
 """Most points of a curve: a longer one is drawn as the range of its values."""
+
+
+def plot_series(
+    series: Series, estimators: Sequence[str] | None = None, *, output: int = 0, axes: tuple[Axes, Axes] | None = None
+) -> tuple[Axes, Axes]:
+    """The blur with the paths and, below it, the NIS: `aolink.series.Series.plot`."""
+    view = overview(series, estimators, output=output)
+    need_exposures(view)
+    if axes is None:
+        axes = figure_or_new(None, _SIZE_IN).subplots(2, 1, sharex=True, height_ratios=(3, 1))
+    above, below = axes
+    plot_blur(view, above, names=["truth", *view.names])
+    if view.nis:
+        plot_nis(view, below, one_axis=True)
+    above.set_xlabel("")
+    return above, below
 
 
 def plot_blur(

@@ -73,7 +73,8 @@ def write_deblurred(
     check_has_exposures(recording)
     find_method(method)
     check_target(path, overwrite=overwrite, sources=recording.files, error=RecordingError)
-    made = _deblurred(recording.rig, _estimated(recording, estimator), method, workers)
+    summary = RestoredCounts()
+    made = _deblurred(recording.rig, _estimated(recording, estimator, summary), method, workers)
     held = next(made, None)  # an estimator that cannot work shows before the file is made
     notes = {
         "aolink_version": version("aolink"),
@@ -85,20 +86,19 @@ def write_deblurred(
         writing(path, overwrite=overwrite, sources=recording.files, error=RecordingError) as partial,
         RecordingCopy(recording, partial, recording.metadata | notes) as copy,
     ):
-        return _written(recording, copy, made, held, estimator, progress)
+        _written(recording, copy, made, held, estimator, summary, progress)
+    return summary
 
 
 def _written(
     recording: Recording, copy: RecordingCopy, made: Iterator[tuple[Exposure, Estimate, RestoredPictures]],
-    held: tuple[Exposure, Estimate, RestoredPictures] | None, estimator: str, progress: Progress,
-) -> RestoredCounts:  # fmt: skip
-    true_scene = recording.true_scene
-    summary, log_times = RestoredCounts(), dict[int, int]()
+    held: tuple[Exposure, Estimate, RestoredPictures] | None, estimator: str, summary: RestoredCounts,
+    progress: Progress,
+) -> None:  # fmt: skip
+    true_scene, log_times = recording.true_scene, dict[int, int]()
     left_out: tuple[str, ...] = (topics.RESTORED,)
     if estimator not in recording.estimators:
         left_out += (topics.estimation_topic(estimator),)  # the estimates are new, and belong to all exposures
-    elif skipped := len(recording.skipped(estimator)):
-        summary.reasons["the session had no time to estimate it: `aolink estimate -o` does"] = skipped
 
     def emit(exposure: Exposure, estimate: Estimate, done: RestoredPictures) -> None:
         log_time_ns = log_times.pop(exposure.frame_id, recording.end_ns)
@@ -123,18 +123,19 @@ def _written(
         emit(*held)
         held = next(made, None)
     copy.finish(recording.losses)
-    return summary
 
 
-def _estimated(recording: Recording, name: str) -> Iterator[tuple[Exposure, Estimate]]:
+def _estimated(recording: Recording, name: str, summary: RestoredCounts) -> Iterator[tuple[Exposure, Estimate]]:
     """Exposures with their recorded estimates, or with new ones where the recording has none of that name."""
     if name not in recording.estimators:
         for exposure, (estimate,) in reestimated(recording, [name]):
             yield replace(exposure, truth=None), estimate
         return
-    for exposure, (recorded,) in recording.with_estimates([name]):
-        if recorded is not None:
-            yield replace(exposure, truth=None), recorded
+    for step in recording.steps([name]):
+        if name in step.estimates:
+            yield replace(step.exposure, truth=None), step.estimates[name]
+        elif name in step.skipped:
+            summary.reasons["the session had no time to estimate it: `aolink estimate -o` does"] += 1
 
 
 def _deblurred(

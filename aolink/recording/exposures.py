@@ -1,22 +1,28 @@
-"""The assembly of exposures from a recording's messages, with the truth and the scene that were recorded beside
-them."""
+"""One pass over a recording's messages: exposures with their truth, their scene and their estimates."""
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Container
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import Any
 
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from google.protobuf.message import Message
 
 from aolink.assembly import Assembler
+from aolink.estimation import ExposureModel
 from aolink.exposure import Exposure, Picture, Truth
 from aolink.recording import convert, schemas_pb2, topics
+from aolink.recording.messages import RawMessage
 from aolink.rig import Rig
+from aolink.series import Step
 from aolink.wire import messages_pb2 as wire
 from aolink.wire.runs_pb2 import Run
+
+ASSEMBLED = (topics.COMMAND, topics.APPLIED, topics.EXPOSURE, topics.IMAGE)
+"""Topics that exposures are made of."""
+BESIDE = (topics.TRUTH, topics.SCENE_EXPOSURE, topics.SCENE)
+"""Topics of what belongs to an exposure."""
 
 
 class ExposureAssembly:
@@ -63,50 +69,109 @@ class ExposureAssembly:
         return self._assembler.flush()
 
 
-class Companions:
-    """Exposures that wait for their truth and scene, which are recorded beside them."""
+class Walk:
+    """Assembles a recording's exposures, each with its truth, scene and estimates, from all its messages in order.
 
-    def __init__(self, counts: Container[str]) -> None:
-        self._waiting: deque[Exposure] = deque()
+    Truth and scene come with their exposure, before the next one. An estimate comes before or after its exposure, in
+    the order of the exposures; some exposures have none.
+
+    Parameters
+    ----------
+    names:
+        The estimators whose estimates are wanted.
+    counts:
+        Number of messages by topic that will come; a topic that is missing has none. Where a number is not right,
+        exposures only wait for longer.
+    model:
+        Gives the model that expands recorded coefficients into paths.
+    before:
+        Number of frames before the first message that it will take.
+    """
+
+    def __init__(
+        self, rig: Rig, names: Sequence[str], counts: Mapping[str, int], model: Callable[[], ExposureModel],
+        before: int = 0,
+    ) -> None:  # fmt: skip
+        self._assembly, self._model, self._names = ExposureAssembly(rig, before), model, names
+        self._waiting: deque[Step] = deque()
         self._truths: dict[int, Truth] = {}
         self._scenes: dict[int, Picture] = {}
-        kept: list[tuple[str, dict[int, Any]]] = [(topics.TRUTH, self._truths), (topics.SCENE, self._scenes)]
-        self._expected = [found for topic, found in kept if topic in counts]
-        self._info: schemas_pb2.ExposureInfo | None = None
+        beside: list[tuple[str, Collection[int]]] = [(topics.TRUTH, self._truths), (topics.SCENE, self._scenes)]
+        self._expected = [found for topic, found in beside if topic in counts]
+        self._scene_info: schemas_pb2.ExposureInfo | None = None
+        self._found: dict[str, dict[int, schemas_pb2.Estimate | None]] = {name: {} for name in names}
+        """Messages of estimates by estimator and frame id, None where it skipped the exposure."""
+        self._reached = dict.fromkeys(names, -1)
+        """Frame id of an estimator's last estimate."""
+        of_names = {name: (topics.estimate_topic(name), topics.estimation_topic(name)) for name in names}
+        self._left = {name: sum(counts.get(topic, 0) for topic in both) for name, both in of_names.items()}
+        """Messages of an estimator that are still to come."""
+        self.completed: list[Exposure] = []
+        """The exposures that the last message completed, without what belongs to them."""
 
-    def add(self, exposures: list[Exposure]) -> list[Exposure]:
-        """Take the next exposures; gives those that wait for nothing more."""
-        if not self._expected:
-            return exposures
-        self._waiting.extend(exposures)
-        return self._ready()
-
-    def take(self, topic: str, message: Message | None) -> list[Exposure]:
-        """Take a message that belongs to an exposure, None for one that cannot be used; gives exposures as `add`
-        does."""
-        if isinstance(message, wire.Truth):
+    def take(self, raw: RawMessage, message: Message | None) -> Iterator[Step]:
+        """Take the next message, None for one that cannot be used; gives the exposures that wait for nothing more."""
+        topic, self.completed = raw.topic, []
+        if topic in ASSEMBLED:
+            self.completed = self._assembly.take(topic, message)
+            self._wait(raw.log_time_ns)
+        elif topic.startswith((topics.ESTIMATE, topics.ESTIMATION)):
+            self._note(topic, message)
+        elif isinstance(message, wire.Truth):
             self._truths[message.frame_id] = convert.truth_from_message(message)
         elif topic == topics.SCENE_EXPOSURE:
-            self._info = message if isinstance(message, schemas_pb2.ExposureInfo) else None
+            self._scene_info = message if isinstance(message, schemas_pb2.ExposureInfo) else None
         elif topic == topics.SCENE:
-            info, self._info = self._info, None
+            info, self._scene_info = self._scene_info, None
             if isinstance(message, RawImage) and info is not None:
                 frame = convert.frame_from_messages(info, message)
                 self._scenes[frame.frame_id] = Picture(pixels=frame.pixels, mask=frame.mask)
-        return self._ready()
+        while self._waiting and self._is_whole(self._waiting[0].exposure.frame_id):
+            yield self._next()
 
-    def flush(self) -> list[Exposure]:
-        """The exposures that still wait, with the messages that came for them."""
-        return [self._next() for _ in range(len(self._waiting))]
+    def flush(self, time_ns: int) -> Iterator[Step]:
+        """The exposures that were still incomplete when the recording ended, at a log time in ns, or still wait."""
+        self.completed = self._assembly.flush()
+        self._wait(time_ns)
+        while self._waiting:
+            yield self._next()
 
-    def _ready(self) -> list[Exposure]:
-        # Truth and scene may come after their exposure, but not after the next one.
-        ready, waiting = [], self._waiting
-        while len(waiting) > 1 or (waiting and all(waiting[0].frame_id in found for found in self._expected)):
-            ready.append(self._next())
-        return ready
+    def _wait(self, time_ns: int) -> None:
+        self._waiting.extend(Step(self._assembly.number(each), each, time_ns=time_ns) for each in self.completed)
 
-    def _next(self) -> Exposure:
-        exposure = self._waiting.popleft()
-        truth, scene = self._truths.pop(exposure.frame_id, None), self._scenes.pop(exposure.frame_id, None)
-        return replace(exposure, truth=truth, scene=scene) if truth or scene else exposure
+    def _note(self, topic: str, message: Message | None) -> None:
+        """Take what an estimator tells of an exposure."""
+        name = topic.removeprefix(topics.ESTIMATE).removeprefix(topics.ESTIMATION)
+        if name not in self._found:
+            return
+        self._left[name] -= 1
+        if isinstance(message, schemas_pb2.Estimate):
+            self._found[name][message.frame_id] = message
+            self._reached[name] = message.frame_id
+        elif isinstance(message, schemas_pb2.Estimation) and message.skipped:
+            self._found[name][message.frame_id] = None
+
+    def _is_whole(self, frame_id: int) -> bool:
+        if len(self._waiting) == 1 and not all(frame_id in found for found in self._expected):
+            return False
+        return all(
+            frame_id in self._found[name] or self._reached[name] >= frame_id or self._left[name] <= 0
+            for name in self._names
+        )
+
+    def _next(self) -> Step:
+        step = self._waiting.popleft()
+        exposure, frame_id = step.exposure, step.exposure.frame_id
+        truth, scene = self._truths.pop(frame_id, None), self._scenes.pop(frame_id, None)
+        if truth or scene:
+            step.exposure = replace(exposure, truth=truth, scene=scene)
+        for name, found in self._found.items():
+            for earlier in [key for key in found if key < frame_id]:  # their exposures are lost
+                del found[earlier]
+            if frame_id in found:
+                message = found.pop(frame_id)
+                if message is None:
+                    step.skipped.add(name)
+                else:
+                    step.estimates[name] = convert.estimate_from_message(message, self._model(), exposure)
+        return step

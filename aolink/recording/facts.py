@@ -12,6 +12,7 @@ from aolink.estimation import Status
 from aolink.estimation.score import UnusedCounter
 from aolink.recording import topics
 from aolink.recording.answers import AnswerCounter, Answers
+from aolink.recording.messages import RecordedMessage
 from aolink.recording.reader import Recording
 from aolink.recording.schemas_pb2 import CommandAnswer, ExposureInfo
 from aolink.recording.schemas_pb2 import Estimate as EstimateMessage
@@ -35,10 +36,57 @@ _ENDS = ("commanded", "applied", "superseded", "late", "refused", "not_reported"
 """Steps that a session commanded, and how they ended: the first is the sum of the others."""
 
 
-def recording_facts(recording: Recording) -> dict[str, Any]:
-    """The summary of a recording as plain data, which `aolink info --json` prints."""
+class Counted:
+    """What a pass over all messages counts: gaps between frames, estimates, answers of the mirror."""
+
+    def __init__(self, recording: Recording) -> None:
+        self._period = recording.rig.timing.frame_period_steps
+        self._last: int | None = None
+        self._gaps: list[int] = []
+        names = recording.estimators
+        self._counts, self._unused = dict.fromkeys(names, 0), {name: UnusedCounter() for name in names}
+        self._answers = AnswerCounter()
+
+    def see(self, recorded: RecordedMessage) -> None:
+        """Take the next message."""
+        message: Any = recorded.message
+        if isinstance(message, CommandAnswer):
+            self._answers.answered(message)
+        elif isinstance(message, Applied):
+            self._answers.applied(message)
+        elif isinstance(message, ExposureInfo) and recorded.topic == topics.EXPOSURE:
+            if self._last is not None and message.first_step - self._last != self._period:
+                self._gaps.append(message.first_step - self._last - self._period)
+            self._last = message.first_step
+        elif isinstance(message, EstimateMessage):
+            name = recorded.topic.removeprefix(topics.ESTIMATE)
+            self._counts[name] += 1
+            with contextlib.suppress(ValueError):  # a status of a later aolink
+                self._unused[name].add(Status(message.status), message.reason, message.frame_id)
+
+    def result(self) -> tuple[dict[str, int], dict[str, Any], Answers]:
+        """Number and longest length of the gaps between the camera's frames, in fast steps; the number of estimates of
+        each estimator, and why some could not use their exposure; what the mirror answered to its commands, and why
+        some had no effect."""
+        estimates: dict[str, Any] = {
+            name: {"count": count, "unused": [asdict(each) for each in self._unused[name].result()]}
+            for name, count in self._counts.items()
+        }
+        gaps = {"count": len(self._gaps), "longest_steps": max(self._gaps, default=0)}
+        return gaps, estimates, self._answers.result()
+
+
+def recording_facts(recording: Recording, counted: Counted | None = None) -> dict[str, Any]:
+    """The summary of a recording as plain data, which `aolink info --json` prints.
+
+    ``counted`` has the counts of a pass over the recording that was made already; without it one is made.
+    """
     duration_s = (recording.end_ns - recording.start_ns) / 1e9
-    gaps, estimates, answers = _gaps_estimates_answers(recording)
+    if counted is None:
+        counted = Counted(recording)
+        for recorded in recording.messages():  # all of them, because one that cannot be used is found when it is read
+            counted.see(recorded)
+    gaps, estimates, answers = counted.result()
     return {
         "file": str(recording.path),
         "bytes": recording.size,
@@ -73,35 +121,6 @@ def _date(time_ns: int) -> str | None:
         return datetime.fromtimestamp(time_ns / 1e9, UTC).isoformat(timespec="seconds")
     except (OverflowError, ValueError, OSError):
         return None
-
-
-def _gaps_estimates_answers(recording: Recording) -> tuple[dict[str, float], dict[str, Any], Answers]:
-    """Number and longest length of the gaps between the camera's frames, in fast steps.
-
-    Also the number of estimates of each estimator, and the reasons why some could not use their exposure; and what the
-    mirror answered to its commands, and why some had no effect.
-    """
-    period, last, gaps = recording.rig.timing.frame_period_steps, None, []
-    names = recording.estimators
-    counts, unused = dict.fromkeys(names, 0), {name: UnusedCounter() for name in names}
-    answers = AnswerCounter()
-    for recorded in recording.messages():  # all of them, because one that cannot be used is found when it is read
-        message = recorded.message
-        if isinstance(message, CommandAnswer):
-            answers.answered(message)
-        elif isinstance(message, Applied):
-            answers.applied(message)
-        elif isinstance(message, ExposureInfo):
-            if last is not None and message.first_step - last != period:
-                gaps.append(message.first_step - last - period)
-            last = message.first_step
-        elif isinstance(message, EstimateMessage):
-            name = recorded.topic.removeprefix(topics.ESTIMATE)
-            counts[name] += 1
-            with contextlib.suppress(ValueError):  # a status of a later aolink
-                unused[name].add(Status(message.status), message.reason, message.frame_id)
-    estimates = {name: {"count": n, "unused": [asdict(u) for u in unused[name].result()]} for name, n in counts.items()}
-    return {"count": len(gaps), "longest_steps": max(gaps, default=0)}, estimates, answers.result()
 
 
 def _losses(recording: Recording) -> dict[str, int]:

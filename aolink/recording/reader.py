@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from functools import cached_property, lru_cache
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, overload
+from typing import TYPE_CHECKING
 
 import numpy as np
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
@@ -16,20 +16,19 @@ from google.protobuf.message import DecodeError, Message
 from numpy.typing import NDArray
 
 from aolink.errors import RecordingError, RigError
-from aolink.estimation import Estimate, ExposureModel, exposure_model
+from aolink.estimation import ExposureModel, exposure_model
 from aolink.exposure import Exposure
 from aolink.limits import load_array
 from aolink.recording import convert, schemas_pb2, topics
-from aolink.recording.estimate_pairs import EstimatePairs
-from aolink.recording.exposures import Companions, ExposureAssembly
+from aolink.recording.exposures import ASSEMBLED, BESIDE, Walk
 from aolink.recording.frame_index import FrameIndex, StepRun
 from aolink.recording.messages import END_OF_TIME, RawMessage, RecordedMessage, RecordedMessages, in_time
 from aolink.recording.remote import Url, only_paths
 from aolink.recording.scan import Loss
 from aolink.recording.side_files import check_is_side_of
-from aolink.recording.slices import NumberedSeries, RecordingSlice
 from aolink.recording.sound import what_is_wrong
 from aolink.rig import Rig, parse_rig
+from aolink.series import NOTHING, Also, Series, Step
 from aolink.wire.messages_pb2 import Applied, CommandBlock
 from aolink.wire.runs_pb2 import Run
 
@@ -37,7 +36,7 @@ if TYPE_CHECKING:
     from aolink.restoration import RestoredPictures
 
 
-class Recording(RecordedMessages, NumberedSeries):
+class Recording(RecordedMessages, Series):
     """A recording on disk, read piece by piece, so files may be larger than the memory.
 
     It is a series of exposures: a loop over it gives them, and so do its length, numbers and slices. The numbers are
@@ -93,6 +92,7 @@ class Recording(RecordedMessages, NumberedSeries):
         self._side = [Recording(each, check=check) for each in side]
         if self._side:
             self._take_side(rig)
+        Series.__init__(self, self)
 
     @property
     def losses(self) -> list[Loss]:
@@ -124,12 +124,6 @@ class Recording(RecordedMessages, NumberedSeries):
     def n_frames(self) -> int:
         """Number of the camera's frames in the file."""
         return self.counts.get(topics.IMAGE, 0)
-
-    def skipped(self, estimator: str) -> frozenset[int]:
-        """Frame ids of the exposures that an estimator had no time for in the session."""
-        topic = topics.estimation_topic(estimator)
-        found = (each.message for each in self.messages(topic)) if topic in self.counts else ()
-        return frozenset(each.frame_id for each in found if isinstance(each, schemas_pb2.Estimation) and each.skipped)
 
     @cached_property
     def model(self) -> ExposureModel:
@@ -195,67 +189,49 @@ class Recording(RecordedMessages, NumberedSeries):
     def __len__(self) -> int:
         return self.n_frames
 
-    @overload
-    def __getitem__(self, index: int) -> Exposure: ...
-    @overload
-    def __getitem__(self, index: slice) -> RecordingSlice: ...
-    def __getitem__(self, index: int | slice) -> Exposure | RecordingSlice:
-        """An exposure by its number, or a slice, which reads nothing before it is used.
-
-        Raises RecordingError for an exposure that is damaged.
-        """
-        if isinstance(index, slice):
-            return RecordingSlice(self, range(len(self))[index])
-        number = range(len(self))[index]
-        if (exposure := next(self.exposures(number, number + 1), None)) is None:
-            raise RecordingError(f"exposure {number} of {self.path} cannot be read: {self.damage or 'it is not whole'}")
-        return exposure
-
     def facts(self) -> dict[str, str]:
         """The summary of the recording, in words."""
         return super().facts() | ({"damage": self.damage} if self.damage else {})
 
-    def exposures(self, start: int = 0, stop: int | None = None) -> Iterator[Exposure]:
-        """The exposures in order, with their truth and their scene where the file has them.
+    def timed_exposures(self) -> Iterator[tuple[int, Exposure]]:
+        """The exposures, each after the log time of the message that completed it, ns."""
+        return ((step.time_ns, step.exposure) for step in self.steps())
 
-        With ``start`` and ``stop``, those whose numbers, counted from 0, are from the former to below the latter.
+    def steps(
+        self, names: Sequence[str] = (), start: int = 0, stop: int | None = None, *, also: Also = NOTHING
+    ) -> Iterator[Step]:
+        """One pass over the file: the exposures in order, with their truth, their scene and their estimates.
+
+        Parameters
+        ----------
+        names:
+            The estimators whose estimates are wanted.
+        start, stop:
+            Numbers of the exposures that are wanted, counted from 0, from the former to below the latter; None: to the
+            last.
+        also:
+            Functions that get the messages of other topics as they are read, by topic.
         """
         if stop is not None and stop <= start:
-            return iter(())
-        return self._between(start, END_OF_TIME if stop is None else stop)
-
-    def _between(self, start: int, stop: int) -> Iterator[Exposure]:
-        for number, _, exposure in self._numbered(*self._beginning(start)):
-            if start <= number < stop:
-                yield exposure
-            if number >= stop - 1:
+            return
+        for step in self._walk(names, *self._beginning(start), also):
+            if step.number >= start and (stop is None or step.number < stop):
+                yield step
+            if stop is not None and step.number >= stop - 1:
                 return
 
-    def timed_exposures(self) -> Iterator[tuple[int, Exposure]]:
-        """The exposures as by `exposures`, each after the log time of the message that completed it, ns."""
-        return ((time_ns, exposure) for _, time_ns, exposure in self._numbered())
-
-    def _numbered(self, first_chunk: int = 0, before: int = 0) -> Iterator[tuple[int, int, Exposure]]:
-        """The exposures, each after its number and the log time of the message that completed it, ns.
-
-        With ``first_chunk``, only those that the messages of that chunk and of later ones complete, in a file with an
-        index; ``before`` is the number of frames before that chunk.
-        """
-        now = 0
-        assembly, beside = ExposureAssembly(self.rig, before), Companions(self.counts)
-        for raw in self.raw_messages(*_ASSEMBLED, *_BESIDE, first_chunk=first_chunk):
-            message = self.decoded_run(raw) or self.decoded(raw)
-            now = raw.log_time_ns
-            if raw.topic in _BESIDE:
-                whole = beside.take(raw.topic, message)
-            elif completed := assembly.take(raw.topic, message):
-                whole = beside.add(completed)
-            else:
-                continue
-            for exposure in whole:
-                yield assembly.number(exposure), now, exposure
-        for exposure in (*beside.add(assembly.flush()), *beside.flush()):
-            yield assembly.number(exposure), now, exposure
+    def _walk(self, names: Sequence[str], first_chunk: int, before: int, also: Also = NOTHING) -> Iterator[Step]:
+        """The steps that the messages of a chunk and of later ones complete, in a file with an index; ``before`` is the
+        number of frames before that chunk."""
+        now, walk = 0, Walk(self.rig, names, self.counts, lambda: self.model, before)
+        of_names = [topic for name in names for topic in (topics.estimate_topic(name), topics.estimation_topic(name))]
+        for raw in self.raw_messages(*{*ASSEMBLED, *BESIDE, *of_names, *also}, first_chunk=first_chunk):
+            now, see = raw.log_time_ns, also.get(raw.topic)
+            message = (None if see else self.decoded_run(raw)) or self.decoded(raw)
+            if see and message is not None:
+                see(RecordedMessage(raw.topic, now, raw.sequence, message))
+            yield from walk.take(raw, message)
+        yield from walk.flush(now)
 
     def _beginning(self, number: int) -> tuple[int, int]:
         """The chunk to read from so that an exposure is the same as if read from the file's start, and the number of
@@ -277,11 +253,11 @@ class Recording(RecordedMessages, NumberedSeries):
             reach = {topics.APPLIED: info.first_step, topics.COMMAND: info.first_step - self.rig.mirror.queue_steps}
             reach = {topic: step for topic, step in reach.items() if self.counts.get(topic)}
             chunk = index.first_chunk(first, reach, self._runs_in)
-            found = self._numbered(chunk, index.before[chunk])
-            known = next((each for each in found if each[0] >= first), None)
+            found = self._walk((), chunk, index.before[chunk])
+            known = next((each for each in found if each.number >= first), None)
             if known is None:
                 break
-            if known[0] == first and not known[2].inputs_assumed:
+            if known.number == first and not known.exposure.inputs_assumed:
                 return chunk, index.before[chunk]
             back *= 2
         return 0, 0
@@ -321,48 +297,11 @@ class Recording(RecordedMessages, NumberedSeries):
 
     def restored(self) -> Iterator[RestoredPictures]:
         """The restored pictures that `aolink deblur` wrote, exposure by exposure."""
-        info: schemas_pb2.Restoration | None = None
-        pictures: dict[str, RawImage] = {}
-        for recorded in self.messages(topics.RESTORATION, topics.RESTORED_SCENE, topics.RESTORED_SPOTS):
-            if isinstance(recorded.message, schemas_pb2.Restoration):
-                if info is not None:
-                    yield _restored(info, pictures)
-                info, pictures = recorded.message, {}
-            elif isinstance(recorded.message, RawImage):
-                pictures[recorded.topic] = recorded.message
-        if info is not None:
-            yield _restored(info, pictures)
-
-    def iter_estimates(self, name: str, start: int = 0, stop: int | None = None) -> Iterator[Estimate]:
-        """The estimates as by `estimates`, one by one: the file is read only as far as they are needed. A recording
-        without estimates is no error here.
-
-        With ``start`` and ``stop``, those of the exposures that `exposures` gives for them.
-        """
-        if stop is not None and stop <= start:
-            return
-        pairs = EstimatePairs(start, stop)
-        for received, completed in self._beside_exposures(name, *self._beginning(start)):
-            for message, exposure in pairs.take(received, completed):
-                yield convert.estimate_from_message(message, self.model, exposure)
-            if pairs.complete:
-                return
-
-    def _beside_exposures(
-        self, name: str, first_chunk: int, before: int
-    ) -> Iterator[tuple[Message | None, list[tuple[int, Exposure]]]]:
-        """Messages of exposures and of an estimator, each with the exposures that it completes and their numbers.
-
-        The exposures that were incomplete when the recording ended come last, with None.
-        """
-        assembly = ExposureAssembly(self.rig, before)
-        wanted = (topics.estimate_topic(name), topics.estimation_topic(name), *_ASSEMBLED)
-        for raw in self.raw_messages(*wanted, first_chunk=first_chunk):
-            message = self.decoded(raw)
-            completed = assembly.take(raw.topic, message)
-            if message is not None:
-                yield message, [(assembly.number(each), each) for each in completed]
-        yield None, [(assembly.number(each), each) for each in assembly.flush()]
+        found = Restorations()
+        for recorded in self.messages(*Restorations.TOPICS):
+            found.see(recorded)
+            yield from found.taken()
+        yield from found.taken(ended=True)
 
     def _take_side(self, rig: Rig | None) -> None:
         """Put the estimates of side files in the place of the file's own."""
@@ -397,9 +336,27 @@ def _parsed_rig(text: str) -> Rig:
     return parse_rig(text)
 
 
-def _restored(info: schemas_pb2.Restoration, pictures: dict[str, RawImage]) -> RestoredPictures:
-    scene, spots = pictures.get(topics.RESTORED_SCENE), pictures.get(topics.RESTORED_SPOTS)
-    return convert.restored_from_messages(info, scene, spots)
+class Restorations:
+    """Restored pictures, put together from a recording's messages as they are read."""
+
+    TOPICS = (topics.RESTORATION, topics.RESTORED_SCENE, topics.RESTORED_SPOTS)
+
+    def __init__(self) -> None:
+        self._found: list[tuple[schemas_pb2.Restoration, dict[str, RawImage]]] = []
+
+    def see(self, recorded: RecordedMessage) -> None:
+        """Take a message on one of the topics."""
+        if isinstance(recorded.message, schemas_pb2.Restoration):
+            self._found.append((recorded.message, {}))
+        elif isinstance(recorded.message, RawImage) and self._found:
+            self._found[-1][1][recorded.topic] = recorded.message
+
+    def taken(self, *, ended: bool = False) -> Iterator[RestoredPictures]:
+        """The pictures that are whole, each once; the last are whole with the next, or when the messages ended."""
+        while len(self._found) > (not ended):
+            info, pictures = self._found.pop(0)
+            scene, spots = pictures.get(topics.RESTORED_SCENE), pictures.get(topics.RESTORED_SPOTS)
+            yield convert.restored_from_messages(info, scene, spots)
 
 
 def _check_replaces(rig: Rig | None, recorded: Rig, path: Path | Url) -> None:
@@ -419,7 +376,3 @@ def _check_replaces(rig: Rig | None, recorded: Rig, path: Path | Url) -> None:
 
 def _scene_shape(rig: Rig) -> tuple[int, int]:
     return rig.scene.shape if rig.scene else (0, 0)
-
-
-_ASSEMBLED = (topics.COMMAND, topics.APPLIED, topics.EXPOSURE, topics.IMAGE)
-_BESIDE = frozenset({topics.TRUTH, topics.SCENE_EXPOSURE, topics.SCENE})

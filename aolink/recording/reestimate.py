@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from importlib.metadata import version
 from pathlib import Path
@@ -17,10 +18,11 @@ from aolink.exposure import Exposure
 from aolink.files import writing
 from aolink.recording import schemas_pb2, topics
 from aolink.recording.editing import RecordingCopy, recorded_estimate
-from aolink.recording.exposures import ExposureAssembly
+from aolink.recording.exposures import Walk
 from aolink.recording.messages import END_OF_TIME, RawMessage
 from aolink.recording.reader import Recording
 from aolink.recording.side_files import check_stands_alone
+from aolink.series import Step
 
 _AT_ONCE = 512
 """The most exposures that are estimated together."""
@@ -53,10 +55,31 @@ def reestimated(
     as_recorded: bool = False,
 ) -> Iterator[tuple[Exposure, list[Estimate]]]:  # fmt: skip
     """The estimates of `reestimate`, exposure by exposure, in the order of ``names``; nothing stays in memory."""
-    driver = Driver(recording.rig, names, engine, skipped_by(recording, names) if as_recorded else None)
-    for number, done in enumerate(driver.steps(recording.exposures()), 1):
+    skipped = Skipped(recording, names if as_recorded else ())
+    driver = Driver(recording.rig, names, engine, skipped.frames)
+    for number, done in enumerate(driver.steps(skipped.exposures()), 1):
         yield done
         progress(number)
+
+
+class Skipped:
+    """The exposures that estimators had no time for in the session, as a pass over the recording finds them.
+
+    ``frames`` has their frame ids, by the names of the estimators of which the recording tells.
+    """
+
+    def __init__(self, recording: Recording, names: Iterable[str]) -> None:
+        told = [name for name in names if topics.estimation_topic(name) in recording.counts]
+        self.frames: dict[str, set[int]] = {name: set() for name in told}
+
+        self._recording = recording
+
+    def exposures(self) -> Iterator[Exposure]:
+        """The recording's exposures, each after it was noted who skipped it."""
+        for step in self._recording.steps(list(self.frames)):
+            for name in step.skipped:
+                self.frames[name].add(step.exposure.frame_id)
+            yield step.exposure
 
 
 class Reestimated(Recording):
@@ -85,52 +108,69 @@ def own_estimators(recording: Recording, say: Callable[[str], None]) -> list[str
     return [name for name in recording.estimators if not retired(name)]
 
 
-def skipped_by(recording: Recording, names: Sequence[str]) -> dict[str, frozenset[int]]:
-    """Frame ids of the exposures that estimators skipped in the session, by the names of those that skipped any."""
-    return {name: skipped for name in names if (skipped := recording.skipped(name))}
-
-
 def scored(recording: Recording, names: Sequence[str]) -> dict[str, Score]:
     """Scores of the estimates in a recording against its truth, by name; one exposure at a time is in memory."""
     scorers = {name: Scorer() for name in names}
-    for exposure, estimates in recording.with_estimates(names):
-        for estimate in estimates:
-            if estimate is not None:
-                scorers[estimate.estimator].add(exposure, estimate)
+    for exposure, estimates in recording.walk(names):
+        for name, estimate in estimates.items():
+            scorers[name].add(exposure, estimate)
     return {name: scorer.result() for name, scorer in scorers.items()}
 
 
-def scored_and_compared(
-    recording: Recording, series: Iterable[tuple[Exposure, Sequence[Estimate]]], names: Sequence[str]
-) -> tuple[dict[str, Score], dict[str, str | None]]:
-    """Scores by name, and where estimates first differ from those in the recording, for the names that it has.
+class Outcome:
+    """Scores of new estimates of a recording by name, and where they first differ from those in it.
 
     With another rig than the recording's own there are no estimates to compare with.
     """
-    scorers = {name: Scorer() for name in names}
-    skipped = skipped_by(recording, names)
-    made_before = recording.estimators if recording.rig_is_recorded else []
-    recorded = {name: recording.iter_estimates(name) for name in names if name in made_before and name not in skipped}
-    differences: dict[str, str | None] = dict.fromkeys(recorded)
-    for name, frames in skipped.items():
-        differences[name] = (
-            f"the session had no time for {len(frames)} exposures, all are estimated here;"
-            " `aolink compare` makes the others again as they were"
-        )
-    count = 0
-    for count, (exposure, each) in enumerate(series, 1):
-        for estimate in each:
+
+    def __init__(self, recording: Recording, names: Sequence[str]) -> None:
+        made_before = recording.estimators if recording.rig_is_recorded else []
+        self.recorded = [name for name in names if name in made_before]
+        """The estimators whose recorded estimates are needed."""
+        self._scorers = {name: Scorer() for name in names}
+        self._skipped = dict.fromkeys(names, 0)
+        self._differences: dict[str, str | None] = dict.fromkeys(self.recorded)
+
+    def add(self, step: Step, made: Iterable[Estimate]) -> None:
+        """Take an exposure with its recorded estimates, and its new ones."""
+        for estimate in made:
             name = estimate.estimator
-            scorers[name].add(exposure, estimate)
-            if name in recorded and differences[name] is None:
-                theirs = next(recorded[name], None)
-                differences[name] = first_difference([theirs] if theirs else [], [estimate])
-                if theirs is None:
-                    differences[name] = f"{count - 1} estimates against more"
-    for name, rest in recorded.items():
-        if differences[name] is None and (more := sum(1 for _ in rest)):
-            differences[name] = f"{count + more} estimates against {count}"
-    return {name: scorer.result() for name, scorer in scorers.items()}, differences
+            self._scorers[name].add(step.exposure, estimate)
+            self._skipped[name] += name in step.skipped
+            if name in self._differences and self._differences[name] is None and name not in step.skipped:
+                theirs = step.estimates.get(name)
+                self._differences[name] = (
+                    first_difference([theirs], [estimate])
+                    if theirs
+                    else f"frame {estimate.frame_id}: was not estimated"
+                )
+
+    def result(self) -> tuple[dict[str, Score], dict[str, str | None]]:
+        """The scores, and in words the differences of the names that the recording has, None where there is none."""
+        for name, skipped in self._skipped.items():
+            if skipped and name in self._differences:
+                self._differences[name] = (
+                    f"the session had no time for {skipped} exposures, all are estimated here;"
+                    " `aolink compare` makes the others again as they were"
+                )
+        return {name: scorer.result() for name, scorer in self._scorers.items()}, self._differences
+
+
+def scored_and_compared(
+    recording: Recording, names: Sequence[str], progress: Progress = no_progress, engine: Engine = "aolink"
+) -> tuple[dict[str, Score], dict[str, str | None]]:
+    """Run estimators over a recording, in one pass: the result of `Outcome`."""
+    outcome, waiting = Outcome(recording, names), deque[Step]()
+
+    def exposures() -> Iterator[Exposure]:
+        for step in recording.steps(outcome.recorded):
+            waiting.append(step)
+            yield step.exposure
+
+    for number, (_, made) in enumerate(Driver(recording.rig, names, engine).steps(exposures()), 1):
+        outcome.add(waiting.popleft(), made)
+        progress(number)
+    return outcome.result()
 
 
 def check_has_exposures(recording: Recording) -> None:
@@ -146,8 +186,8 @@ def check_has_exposures(recording: Recording) -> None:
 def write_reestimated(
     recording: Recording, names: Sequence[str], path: str | Path, *, only: bool = False, overwrite: bool = False,
     progress: Progress = no_progress, engine: Engine = "aolink",
-) -> None:  # fmt: skip
-    """Copy a recording with new estimates.
+) -> tuple[dict[str, Score], dict[str, str | None]]:  # fmt: skip
+    """Copy a recording with new estimates; gives what `scored_and_compared` gives, from the same pass.
 
     Estimates by other names, and pictures restored with them, stay in the copy, unless ``only``; those that were made
     with another rig than ``recording.rig`` could not be read in it and are left out. Messages of other software are
@@ -159,13 +199,13 @@ def write_reestimated(
         ``path`` exists and not ``overwrite``, or cannot be written.
     """
     with writing(Path(path), overwrite=overwrite, sources=recording.files, error=RecordingError) as partial:
-        fill_reestimated(recording, names, partial, only, progress, engine)
+        return fill_reestimated(recording, names, partial, only, progress, engine)
 
 
 def fill_reestimated(
     recording: Recording, names: Sequence[str], path: Path, only: bool = False, progress: Progress = no_progress,
     engine: Engine = "aolink",
-) -> None:  # fmt: skip
+) -> tuple[dict[str, Score], dict[str, str | None]]:  # fmt: skip
     """Write the content of `write_reestimated` into an empty file that is there already. Raises OSError for errors of
     the disk."""
     kept = kept_estimators(recording, names, only=only)
@@ -177,11 +217,13 @@ def fill_reestimated(
     }
     if engine != "aolink":
         notes["engine"] = engine
+    outcome = Outcome(recording, names)
     with RecordingCopy(recording, path, notes) as copy:
-        for some in _with_estimates(recording, Driver(recording.rig, names, engine), kept):
+        for some in _with_estimates(recording, Driver(recording.rig, names, engine), kept, outcome):
             copy.add(some)
             progress(copy.exposures)
         copy.finish(recording.losses)
+    return outcome.result()
 
 
 def kept_estimators(recording: Recording, names: Sequence[str], *, only: bool) -> list[str]:
@@ -191,51 +233,59 @@ def kept_estimators(recording: Recording, names: Sequence[str], *, only: bool) -
     return [name for name in recording.estimators if name not in names]
 
 
-def _without_old_estimates(recording: Recording, kept: Sequence[str]) -> Iterator[RawMessage]:
-    """The messages of a recording, with the estimates, skipped exposures and restored pictures of the estimators
-    ``kept`` only."""
+def _with_estimates(
+    recording: Recording, driver: Driver, kept: Sequence[str], outcome: Outcome
+) -> Iterator[RawMessage]:
+    """The messages of a recording with new estimates after their exposures, and the old estimates, skipped exposures
+    and restored pictures of the estimators ``kept``."""
+    walk = Walk(recording.rig, outcome.recorded, recording.counts, lambda: recording.model)
+    waiting: list[tuple[RawMessage | None, list[Exposure]]] = []
+    steps, estimates = deque[Step](), deque[list[Estimate]]()
+    exposures = size = now = 0
     restored_with = ""
+
+    def estimated() -> Iterator[RawMessage]:
+        made = driver.steps(exposure for _, completed in waiting for exposure in completed)
+        for raw, completed in waiting:
+            if raw is not None:
+                yield raw
+            for _ in completed:
+                estimates.append(next(made)[1])
+                yield from (recorded_estimate(each, raw.log_time_ns if raw else now) for each in estimates[-1])
+        waiting.clear()
+
+    def score() -> None:
+        while steps and estimates:
+            outcome.add(steps.popleft(), estimates.popleft())
+
     for raw in recording.raw_messages():
-        if raw.topic == topics.RESTORATION:  # it comes before its pictures
-            message = recording.decoded(raw)
-            restored_with = message.estimator if isinstance(message, schemas_pb2.Restoration) else ""
-        if raw.topic.startswith(topics.RESTORED) and restored_with not in kept:
-            continue
-        if raw.topic.startswith(topics.ESTIMATE) and raw.topic.removeprefix(topics.ESTIMATE) not in kept:
-            continue
-        if raw.topic.startswith(topics.ESTIMATION) and raw.topic.removeprefix(topics.ESTIMATION) not in kept:
-            continue
-        yield raw
-
-
-def _with_estimates(recording: Recording, driver: Driver, kept: Sequence[str]) -> Iterator[RawMessage]:
-    """The messages of a recording with new estimates after their exposures, and the old estimates of ``kept``."""
-    assembly = ExposureAssembly(recording.rig)
-    waiting: list[tuple[RawMessage, list[Exposure]]] = []
-    exposures = size = 0
-    for raw in _without_old_estimates(recording, kept):
         message = recording.decoded_run(raw) or recording.decoded(raw)
-        completed = assembly.take(raw.topic, message)
+        steps.extend(walk.take(raw, message))
+        if raw.topic == topics.RESTORATION:  # it comes before its pictures
+            restored_with = message.estimator if isinstance(message, schemas_pb2.Restoration) else ""
         if message is None and raw.schema in topics.SCHEMAS:
             continue  # it is one of the losses, and completes nothing
-        waiting.append((raw, completed))
-        exposures, size = exposures + len(completed), size + len(raw.data)
+        of = restored_with if raw.topic.startswith(topics.RESTORED) else _estimator_of(raw.topic)
+        if of is None or of in kept:
+            waiting.append((raw, walk.completed))
+            now = raw.log_time_ns
+        exposures, size = exposures + len(walk.completed), size + len(raw.data)
         if exposures >= _AT_ONCE or size >= _BYTES_AT_ONCE:
-            yield from _estimated(driver, waiting)
-            waiting, exposures, size = [], 0, 0
-    if waiting:
-        waiting[-1][1].extend(assembly.flush())
-        yield from _estimated(driver, waiting)
+            yield from estimated()
+            score()
+            exposures = size = 0
+    steps.extend(walk.flush(now))
+    waiting.append((None, walk.completed))
+    yield from estimated()
+    score()
 
 
-def _estimated(driver: Driver, messages: Sequence[tuple[RawMessage, list[Exposure]]]) -> Iterator[RawMessage]:
-    """Messages, each with the estimates of the exposures that it completes, which are made in order."""
-    made = driver.steps(exposure for _, completed in messages for exposure in completed)
-    for raw, completed in messages:
-        yield raw
-        for _ in completed:
-            for estimate in next(made)[1]:
-                yield recorded_estimate(estimate, raw.log_time_ns)
+def _estimator_of(topic: str) -> str | None:
+    """The estimator that a topic is about; None where it is about none."""
+    for prefix in (topics.ESTIMATE, topics.ESTIMATION):
+        if topic.startswith(prefix):
+            return topic.removeprefix(prefix)
+    return None
 
 
 def first_difference(ours: Sequence[Estimate], theirs: Sequence[Estimate]) -> str | None:

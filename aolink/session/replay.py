@@ -17,7 +17,7 @@ from aolink.exposure import Exposure
 from aolink.recording import topics
 from aolink.recording.editing import between
 from aolink.recording.reader import Recording
-from aolink.recording.reestimate import skipped_by
+from aolink.recording.reestimate import Skipped
 from aolink.wire import messages_pb2 as wire
 
 _NAP_S = 0.1
@@ -45,11 +45,12 @@ def replay(
     RecordingError
         There is no exposure between the two times.
     """
-    driver = Driver(recording.rig, names, skipped=skipped_by(recording, names))
+    skipped = Skipped(recording, names)
+    driver = Driver(recording.rig, names, skipped=skipped.frames)
     step_s = recording.rig.timing.fast_step_s
     first_step: int | None = None
     began: tuple[float, float] | None = None
-    for exposure in recording.exposures():
+    for exposure in skipped.exposures():
         if first_step is None:
             first_step = exposure.first_step
         at_s = (exposure.first_step - first_step) * step_s

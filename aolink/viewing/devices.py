@@ -9,7 +9,7 @@ import numpy as np
 import rerun as rr
 
 from aolink.colours import estimator_colour
-from aolink.plotting.devices import LATENCY_STEPS
+from aolink.plotting.overview import LATENCY_STEPS
 from aolink.recording import schemas_pb2, topics
 from aolink.viewing import entities
 from aolink.viewing.entities import CLOCK, CONTROL, ESTIMATION, FAULTS, LATENCY, LOG, LOST, RECEIVED, ROUND_TRIP, STATUS

@@ -94,7 +94,7 @@ class LiveView:
         focus = [each for each in estimates if each.estimator == self._names[-1] and each.frame_id == exposure.frame_id]
         if focus:
             done = deblur(self._rig, exposure, focus[0])
-            if scene.log_restored(self._drawing, timebase, [exposure], [done]):
+            if scene.log_restored(self._drawing, timebase, {exposure.frame_id: exposure.first_step}, [done]):
                 shown.add(entities.RESTORED_SCENE)
         if self._true_scene is not None and entities.TRUE_SCENE not in shown:
             scene.log_true_scene(self._drawing, sensor, self._true_scene)

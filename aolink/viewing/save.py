@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
@@ -18,8 +19,10 @@ from aolink.exposure import Exposure
 from aolink.plotting.overview import limits_of
 from aolink.plotting.pupil import has_pupil
 from aolink.recording import topics
+from aolink.recording.reader import Restorations
 from aolink.recording.side_files import check_stands_alone
 from aolink.rig import Rig
+from aolink.series import Also
 from aolink.viewing import camera, devices, entities, incidents, motion, scene
 from aolink.viewing.blueprint import PATH_WINDOW, Contents, blueprint
 from aolink.viewing.look import APPLICATION, Look, identity
@@ -131,7 +134,14 @@ class Sender:
         self._drawing = Drawing(
             stream=stream, chosen=chosen, root=root, points=None if every_step else POINTS, near=near
         )
-        self._skipped = {name: recording.skipped(name) for name in self._names}
+        self._skipped: dict[str, set[int]] = {name: set() for name in self._names}
+        self._runs: deque[Any] = deque()
+        """Commands and reports that have not been sent."""
+        self._others: list[RecordedMessage] = []
+        """Messages of other topics, which are sent at the end."""
+        self._restorations = Restorations()
+        self._starts: dict[int, int] = {}
+        """First steps by frame id of the exposures sent, where pictures may have been restored."""
         self._scorers = {name: Scorer() for name in self._names}
         self._measuring: set[str] = set()
         self._shown = [topic for topic in recording.counts if _shows_messages(topic) is not None]
@@ -150,36 +160,28 @@ class Sender:
         """The part of the field that the paths of the exposure that the layout is about, and their blur, are in."""
         if (about := self._look.about) is None:
             return None
-        exposure, found = next(iter(self._recording[about : about + 1].with_estimates(self._names)))
-        paths = [each.path[output] for each in (exposure.truth, *found) if each is not None]
+        exposure, found = next(self._recording[about : about + 1].walk(self._names))
+        paths = [each.path[output] for each in (exposure.truth, *found.values()) if each is not None]
         return limits_of(self._rig.sensor.profile, paths)
 
     def parts(self) -> Iterator[int]:
         """Send the exposures with all that belongs to them, then the devices; gives after each part how many exposures
         are sent."""
         recording = self._recording
-        restored = iter(recording.restored())
-        ahead = next(restored, None)
-        messages = self._messages(tuple(topics.RUNS))
-        waiting: Any = next(messages, None)
+        if self._look.exposures is not None:
+            for each in self._messages(list(self._shown)):
+                self._see(each)
         for exposures, estimates, following in self._read():
-            pictures: list[RestoredPictures] = []
-            while ahead is not None and ahead.frame_id <= exposures[-1].frame_id:
-                pictures.append(ahead)
-                ahead = next(restored, None)
-            self._send(exposures, estimates, pictures, following)
-            run: list[RecordedMessage] = []
-            while waiting is not None and (following is None or waiting.message.first_step < following.first_step):
-                run.append(waiting)
-                waiting = next(messages, None)
-            self._send_messages(run)
+            self._send(exposures, estimates, following)
+            self._send_messages(self._runs_before(following))
             self.done += len(exposures)
             yield self.done
         if self._timebase is None:
             raise ViewerError(
                 f"there is no exposure in {recording.path}, so nothing to view; `aolink info` says what it holds"
             )
-        self._send_messages(list(self._messages([topic for topic in self._shown if topic not in topics.RUNS])))
+        self._send_messages([*self._runs, *self._others])
+        self._send_restored(list(self._restorations.taken(ended=True)))
         part = self._look.exposures
         for k, (name, loop) in enumerate(self._look.loops.items()):
             series = loop[part.start : part.stop] if part is not None else loop
@@ -201,7 +203,10 @@ class Sender:
         exposures: list[Exposure] = []
         estimates: dict[str, dict[int, Estimate]] = {name: {} for name in self._names}
         first: int | None = None
-        for exposure, found in series.with_estimates(self._names):
+        for step in series.steps(self._names, also=self._also()):
+            exposure = step.exposure
+            for name in step.skipped:
+                self._skipped[name].add(exposure.frame_id)
             if exposure.pixels.shape != rig.sensor.shape:
                 raise ViewerError(
                     f"frame {exposure.frame_id} of {self._recording.path} has {exposure.pixels.shape} pixels, the"
@@ -213,16 +218,14 @@ class Sender:
                 yield exposures, estimates, exposure
                 exposures, estimates = [], {name: {} for name in self._names}
             exposures.append(exposure)
-            for name, estimate in zip(self._names, found, strict=True):
-                if estimate is not None:
-                    estimates[name][exposure.frame_id] = estimate
+            for name, estimate in step.estimates.items():
+                estimates[name][exposure.frame_id] = estimate
         if exposures:
             yield exposures, estimates, None
 
     def _send(
-        self, exposures: list[Exposure], estimates: dict[str, dict[int, Estimate]],
-        restored: list[RestoredPictures], following: Exposure | None,
-    ) -> None:  # fmt: skip
+        self, exposures: list[Exposure], estimates: dict[str, dict[int, Estimate]], following: Exposure | None
+    ) -> None:
         drawing, rig = self._drawing, self._rig
         known = self._timebase
         self._timebase = timebase = known.followed_by(exposures) if known else Timebase.of(rig, exposures)
@@ -250,10 +253,34 @@ class Sender:
             log_maps(drawing, timebase, rig, exposures, best, self._scales)
         if rig.scene is not None and scene.log_scenes(drawing, rig.scene, timebase, exposures):
             self._known.add(entities.SCENE)
-        if scene.log_restored(drawing, timebase, exposures, restored):
+        if topics.RESTORATION in self._recording.counts:
+            self._starts |= {each.frame_id: each.first_step for each in exposures}
+            self._send_restored(list(self._restorations.taken()))
+
+    def _send_restored(self, restored: list[RestoredPictures]) -> None:
+        """Send pictures; they come after their exposures."""
+        assert self._timebase is not None
+        known = [each for each in restored if each.frame_id in self._starts]
+        if scene.log_restored(self._drawing, self._timebase, self._starts, known):
             self._known.add(entities.RESTORED_SCENE)
-        if any(each.spots is not None for each in restored):
+        if any(each.spots is not None for each in known):
             self._known.add(entities.RESTORED_SPOTS)
+
+    def _also(self) -> Also:
+        """The functions that get the messages that are shown, by topic."""
+        restored = dict.fromkeys(Restorations.TOPICS, self._restorations.see)
+        return restored if self._look.exposures is not None else restored | dict.fromkeys(self._shown, self._see)
+
+    def _see(self, recorded: RecordedMessage) -> None:
+        """Keep a message until it is sent."""
+        (self._runs if recorded.topic in topics.RUNS else self._others).append(recorded)
+
+    def _runs_before(self, following: Exposure | None) -> list[RecordedMessage]:
+        """Take out the commands and reports of steps before an exposure."""
+        found: list[RecordedMessage] = []
+        while self._runs and (following is None or self._runs[0].message.first_step < following.first_step):
+            found.append(self._runs.popleft())
+        return found
 
     @cached_property
     def _ends(self) -> tuple[Exposure, Exposure]:
@@ -262,13 +289,9 @@ class Sender:
         return first, first if len(self._numbers) == 1 else self._recording[self._numbers[-1]]
 
     def _messages(self, wanted: Sequence[str]) -> Iterator[RecordedMessage]:
-        """Messages of some topics; for a part of the recording only those that belong to it."""
+        """Messages of some topics that belong to the part of the recording."""
         recording = self._recording
-        there = [topic for topic in wanted if recording.counts.get(topic)]
-        if not there:
-            return
-        if self._look.exposures is None:
-            yield from recording.messages(*there)
+        if not (there := [topic for topic in wanted if recording.counts.get(topic)]):
             return
         first, last = self._ends
         period = self._rig.timing.frame_period_steps * self._rig.timing.fast_step_ns

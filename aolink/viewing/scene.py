@@ -6,7 +6,7 @@ All scenes are drawn alike: black is dark, white an intensity of one.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -42,16 +42,14 @@ def log_true_scene(drawing: Drawing, sensor: SceneSensor, counts: NDArray[np.uin
 
 
 def log_restored(
-    drawing: Drawing, timebase: Timebase, exposures: Sequence[Exposure], restored: Sequence[RestoredPictures]
+    drawing: Drawing, timebase: Timebase, starts: Mapping[int, int], restored: Sequence[RestoredPictures]
 ) -> bool:
     """Pictures without their blur: ``/restored/image``, ``/restored/spot`` (the most light in it is white).
 
-    Gives whether there was a scene.
+    ``starts`` has the first steps of their exposures by frame id. Gives whether there was a scene.
     """
-    starts = {e.frame_id: e.first_step for e in exposures}
-    known = [each for each in restored if each.frame_id in starts]
-    scenes = [(each.frame_id, _grey(each.scene)) for each in known if each.scene is not None]
-    lit = [(each.frame_id, each.spots) for each in known if each.spots is not None]
+    scenes = [(each.frame_id, _grey(each.scene)) for each in restored if each.scene is not None]
+    lit = [(each.frame_id, each.spots) for each in restored if each.spots is not None]
     spots = [(frame_id, _grey(light / max(float(light.max()), 1e-6))) for frame_id, light in lit]
     for path, pictures in ((RESTORED_SCENE, scenes), (RESTORED_SPOTS, spots)):
         frames = [frame_id for frame_id, _ in pictures]

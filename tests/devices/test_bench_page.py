@@ -21,7 +21,7 @@ def test_the_mean_nis_is_the_number_of_measurements_and_nothing_is_gated(name: s
     """Over 300 exposures whose model is right, the third of them drawn afresh."""
     nis, status = [], []
     for seed in (1, 2, 3):
-        found = list(estimate(simulate("section-vi-lively", n_exposures=100, seed=seed), name))
+        found = estimate(simulate("section-vi-lively", n_exposures=100, seed=seed), name).estimates(name)
         nis += [each.nis.mean() for each in found]
         status += [each.status for each in found]
     assert np.mean(nis) == pytest.approx(measurements, rel=0.15)

@@ -88,7 +88,7 @@ def test_a_session_is_aligned_by_the_clocks_recorded_estimated_and_replayed(tmp_
     assert not report.warnings  # nobody has set a clock
     assert max(np.abs(each.inputs).max() for each in exposures) > 0.25
 
-    estimates = list(estimate(recording, "moments"))
+    estimates = estimate(recording, "moments").estimates("moments")
     for (_, (again,)), found in zip(replay(recording, ["moments"]), estimates, strict=True):
         assert np.array_equal(again.path, found.path)
     # Where this machine held up the fake camera, an exposure overlaps the one before it; its estimate says so.

@@ -72,7 +72,8 @@ def test_a_session_with_devices_of_another_package(aolink: Run, installed: dict[
     exposures = list(recording.exposures())
     assert all(exposure.inputs_assumed == 0 for exposure in exposures)
     assert max(np.abs(each.inputs).max() for each in exposures) > 0.001
-    for exposure, estimate in zip(exposures, estimate_exposures(tmp_path / "a.mcap", "o1"), strict=True):
+    found = estimate_exposures(tmp_path / "a.mcap", "o1").estimates("o1")
+    for exposure, estimate in zip(exposures, found, strict=True):
         assert exposure.truth is not None
         assert np.abs(estimate.path - exposure.truth.path).max() < 0.02  # its frames have no noise
     refused = aolink("replay", "a.mcap", "--to-rig", "-o", "b.mcap", env=installed)

@@ -35,7 +35,7 @@ def test_exposures_that_have_a_step_less_are_recorded_and_estimated(
     assert {9, 10} == {each.n_steps for each in exposures}
     assert all(len(each.inputs) == each.n_steps for each in exposures)
     for name in ESTIMATORS:
-        again = list(estimate(recording, name))
+        again = estimate(recording, name).estimates(name)
         online = {each.frame_id: each for each in recording.estimates(name)}
         bench.check_paths(rig, zip(exposures, again, strict=True))
         for exposure, found in zip(exposures, again, strict=True):

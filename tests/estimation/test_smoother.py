@@ -83,10 +83,12 @@ def test_the_last_estimate_is_the_filters_and_the_others_know_more():
 
 def test_in_python_it_is_one_call():
     exposures = aolink.simulate("section-vi-lively", 5)
-    estimates = aolink.estimate(exposures, "moments")
-    again = aolink.smooth(exposures, estimates)
+    series = aolink.estimate(exposures, "moments")
+    again = aolink.smooth(series).estimates()
     assert [e.frame_id for e in again] == [e.frame_id for e in exposures]
-    assert again[0].path.tobytes() != estimates[0].path.tobytes()
+    assert again[0].path.tobytes() != series.estimates()[0].path.tobytes()
+    with pytest.raises(EstimatorError, match=r"aolink\.smooth\(series, lag=3\)"):
+        aolink.smooth(exposures, series.estimates())  # type: ignore[arg-type]
 
 
 def test_estimates_of_other_exposures_are_refused():

@@ -18,9 +18,9 @@ from aolink.errors import ExportError
 from aolink.exporting.arrays import arrays
 from aolink.exporting.files import WRITERS, export
 from aolink.files import write_csv
-from aolink.notebook import NotebookRecording
 from aolink.recording import topics
 from aolink.recording.editing import RecordingCopy
+from aolink.recording.reader import Recording
 from aolink.recording.schemas_pb2 import ExposureInfo
 from aolink.rig import load_rig, parse_rig
 from aolink.series import Series
@@ -45,7 +45,7 @@ def test_numpy_reads_every_array(series: Series, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_xarray_reads_the_dataset(series: NotebookRecording, tmp_path: Path) -> None:
+def test_xarray_reads_the_dataset(series: Recording, tmp_path: Path) -> None:
     needed("h5netcdf")
     import xarray
 
@@ -94,7 +94,7 @@ def test_a_spreadsheet_runs_nothing_of_a_table(tmp_path: Path) -> None:
     assert texts == ["", "", "", "", "", "", "'-2+3", ""]
 
 
-def test_pandas_reads_the_same_of_csv_and_parquet_as_a_notebook_has(series: NotebookRecording, tmp_path: Path) -> None:
+def test_pandas_reads_the_same_of_csv_and_parquet_as_a_notebook_has(series: Recording, tmp_path: Path) -> None:
     pandas = needed("pandas")
     needed("pyarrow")
     expected = series.to_pandas()

@@ -9,7 +9,7 @@ import pytest
 
 import aolink
 from aolink.errors import ExportError, RecordingError
-from aolink.notebook import NotebookRecording
+from aolink.recording.reader import Recording
 from tests.needs import needed
 from tests.recording.small import write_small
 
@@ -17,7 +17,7 @@ pandas = needed("pandas")
 xarray = needed("xarray")
 
 
-def test_a_table_has_a_row_for_each_exposure_and_axis(series: NotebookRecording) -> None:
+def test_a_table_has_a_row_for_each_exposure_and_axis(series: Recording) -> None:
     table = series.to_pandas()
     axes = series.rig.plant.axes
     assert len(table) == axes * len(series)
@@ -41,22 +41,22 @@ def test_a_table_has_a_row_for_each_exposure_and_axis(series: NotebookRecording)
     np.testing.assert_allclose(first["input_1_mean"], [e.inputs[:, 0].mean() for e in series])
 
 
-def test_a_table_of_some_exposures_and_one_estimator(lively: NotebookRecording) -> None:
+def test_a_table_of_some_exposures_and_one_estimator(lively: Recording) -> None:
     table = lively[5:8].to_pandas(["o3"])
     assert table["frame_id"].tolist() == [each.frame_id for each in lively[5:8]]
     assert [name for name in table if name.endswith("_nis")] == ["o3_nis"]
     assert table["o3_nis"].tolist() == [each.nis[0] for each in lively[5:8].estimates("o3")]
 
 
-def test_a_slice_of_a_slice_has_tables_and_an_exposure_by_its_number(lively: NotebookRecording) -> None:
+def test_a_slice_of_a_slice_has_tables_and_an_exposure_by_its_number(lively: Recording) -> None:
     part = lively[2:12][1:5]
     assert part.to_pandas(["o3"])["frame_id"].tolist() == [each.frame_id for each in lively[3:7]]
     assert part.to_xarray(["o3"]).sizes["time"] == 4
     assert part[-1].frame_id == lively[6].frame_id
-    assert repr(part).startswith("<Recording section-vi-lively.mcap[3:7]: 4 exposures")
+    assert repr(part).startswith("<Series section-vi-lively.mcap[3:7]: 4 exposures")
 
 
-def test_a_dataset_is_taken_apart_by_time_and_estimator(lively: NotebookRecording) -> None:
+def test_a_dataset_is_taken_apart_by_time_and_estimator(lively: Recording) -> None:
     dataset = lively.to_xarray()
     estimate = lively.estimates("moments")[3]
     one = dataset.sel(estimator="moments").isel(time=3)

@@ -11,7 +11,6 @@ import pytest
 
 import aolink
 from aolink.estimation import run
-from aolink.exposure import Exposures
 from aolink.films.film import array_film
 from aolink.importing.brightness import brightness_of
 from aolink.importing.first_rig import first_rig
@@ -21,6 +20,7 @@ from aolink.importing.survey import survey
 from aolink.importing.tracker import find_objects
 from aolink.recording.reader import Recording
 from aolink.rig import Rig, load_rig, parse_rig
+from aolink.series import Series
 from tests.kinds import truth_of
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
@@ -43,7 +43,7 @@ def rate(rig: Rig) -> float:
     return 1 / (rig.timing.frame_period_steps * rig.timing.fast_step_s)
 
 
-def starts(exposures: Exposures) -> list[int]:
+def starts(exposures: Series) -> list[int]:
     return [each.first_step for each in exposures]
 
 
@@ -69,7 +69,7 @@ def test_objects_that_change_each_in_its_own_way_have_no_common_light() -> None:
     assert (brightness_of(np.exp(0.1 * rng.normal(size=(10, 1)))) == 1).all(), "too short to tell"
 
 
-def spots(rig: Rig, change: float, seed: int = 3) -> tuple[Exposures, np.ndarray]:
+def spots(rig: Rig, change: float, seed: int = 3) -> tuple[Series, np.ndarray]:
     """Exposures of the simulated camera, and their frames as if the spots' light had changed by such a share."""
     simulated = aolink.simulate(rig, 120, seed=seed)
     frames = np.array([each.pixels for each in simulated], dtype=np.float64)
@@ -91,12 +91,14 @@ def test_a_film_of_the_rigs_own_camera_that_fades_is_scaled_to_its_light(
     film = array_film(frames, "film", inputs=inputs)
     (note,) = import_film(film, rig, FilmSettings(rate_hz=rate(rig), start_ns=0), tmp_path / "a.mcap").notes
     assert re.search(said, note)
-    found = aolink.estimate(Recording(tmp_path / "a.mcap"), estimator)
-    as_they_came = aolink.estimate(aolink.exposures(frames, rig, inputs, starts(simulated)), estimator)
+    found = aolink.estimate(Recording(tmp_path / "a.mcap"), estimator).estimates(estimator)
+    as_they_came = aolink.estimate(aolink.exposures(frames, rig, inputs, starts(simulated)), estimator).estimates(
+        estimator
+    )
     true = np.array([truth_of(each).path for each in simulated])
     errors = [
         np.sqrt(np.mean((np.array([each.path for each in some]) - true)[5:] ** 2))
-        for some in (aolink.estimate(simulated, estimator), found, as_they_came)
+        for some in (aolink.estimate(simulated, estimator).estimates(estimator), found, as_they_came)
     ]
     assert errors[1] < 1.1 * errors[0]
     assert errors[2] > 1.1 * errors[1]

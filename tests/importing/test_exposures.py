@@ -72,9 +72,9 @@ def test_frames_in_memory_give_the_estimates_of_the_simulation_bit_for_bit(name)
     given = aolink.exposures(frames, rig, applied(rig, simulated))
     starts = aolink.exposures(frames, rig, applied(rig, simulated), [each.first_step for each in simulated])
     for estimator in ("o1", "moments"):
-        expected = aolink.estimate(simulated, estimator)
+        expected = aolink.estimate(simulated, estimator).estimates(estimator)
         for exposures in (given, starts):
-            found = aolink.estimate(exposures, estimator)
+            found = aolink.estimate(exposures, estimator).estimates(estimator)
             assert len(found) == len(expected)
             for one, other in zip(found, expected, strict=True):
                 for each in fields(one):
@@ -90,7 +90,9 @@ def test_a_film_of_a_simulation_gives_its_estimates_through_a_recording(tmp_path
         tmp_path, np.array([each.pixels for each in simulated]), rig, inputs=applied(rig, simulated)
     )  # fmt: skip
     assert (account.frames, account.exposures, account.saturated, account.clipped) == (8, 8, 0, 0)
-    for one, other in zip(aolink.estimate(recording, "o3"), aolink.estimate(simulated, "o3"), strict=True):
+    for one, other in zip(
+        aolink.estimate(recording, "o3").estimates("o3"), aolink.estimate(simulated, "o3").estimates("o3"), strict=True
+    ):
         np.testing.assert_array_equal(one.path, other.path)
         np.testing.assert_array_equal(one.end_covariance, other.end_covariance)
 
@@ -121,7 +123,7 @@ def test_arrays_in_memory_that_do_not_fit_are_refused(arguments, says):
 
 @pytest.mark.parametrize("wrong", [[], ["film.mcap"], [np.zeros((16, 16))], np.zeros((2, 16, 16)), None])
 def test_what_has_no_rig_is_refused_with_what_to_do(wrong):
-    for wanted in (lambda: aolink.estimate(wrong, "o3"), lambda: aolink.smooth(wrong, [])):
+    for wanted in (lambda: aolink.estimate(wrong, "o3").estimates("o3"), lambda: aolink.smooth(wrong)):
         with pytest.raises(EstimatorError, match=r"know their rig.*aolink\.exposures\(frames, rig\)"):
             wanted()
 

@@ -11,12 +11,13 @@ import aolink
 from aolink.errors import EstimatorError, ImportingError
 from aolink.estimation import run
 from aolink.exporting.files import export
-from aolink.exposure import Exposure, Exposures
+from aolink.exposure import Exposure
 from aolink.films.formats import open_film
 from aolink.importing.frames import FilmAccount, FilmSettings
 from aolink.importing.recording import import_film
 from aolink.recording.reader import Recording
 from aolink.rig import Rig, load_rig
+from aolink.series import Series
 from tests.importing import others
 from tests.importing.rigs import small_rig
 from tests.kinds import must_be
@@ -30,7 +31,7 @@ START_S = 1_790_000_000.0
 FRAMES = np.random.default_rng(9).integers(1000, 2000, size=(7, 8, 8), dtype=np.uint16)
 
 
-def centroids(rig: Rig, exposures: Exposures) -> np.ndarray:
+def centroids(rig: Rig, exposures: Series) -> np.ndarray:
     """What another program would have measured, (frames, 2, spots): the path's mean with some noise."""
     rng = np.random.default_rng(4)
     true = np.array([each.truth.path.mean(axis=1) for each in exposures if each.truth is not None])
@@ -46,7 +47,7 @@ def imported(path: Path, rig: Rig, **settings: object) -> tuple[Recording, FilmA
     return Recording(out), account
 
 
-def times_of(rig: Rig, exposures: Exposures) -> list[float]:
+def times_of(rig: Rig, exposures: Series) -> list[float]:
     return [START_S + each.first_step * rig.timing.fast_step_s for each in exposures]
 
 
@@ -156,7 +157,7 @@ def test_inputs_come_back_from_our_own_export(name: str, tmp_path: Path) -> None
     import_back(first, rig, tmp_path)
 
 
-def import_back(exposures: Exposures, rig: Rig, folder: Path) -> None:
+def import_back(exposures: Series, rig: Rig, folder: Path) -> None:
     """Through MCAP to AOT and back."""
     np.savez(
         folder / "a.npz", frames=[each.pixels for each in exposures],

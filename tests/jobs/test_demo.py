@@ -31,7 +31,7 @@ SENTENCE = re.compile(
 def path_rmse(recording: Recording, name: str) -> float:
     errors = [
         estimate.path - exposure.truth.path
-        for exposure, estimate in zip(recording.exposures(), recording.iter_estimates(name), strict=True)
+        for exposure, estimate in zip(recording.exposures(), recording.estimates(name), strict=True)
         if exposure.truth is not None
     ]
     assert len(errors) == EXPOSURES
@@ -46,7 +46,7 @@ def scene_psnrs(recording: Recording) -> tuple[float, float]:
     assert recording.true_scene is not None
     true = (recording.true_scene - 100.0) / 3500.0
     blurred, sharp = [], []
-    series = zip(recording.exposures(), recording.iter_estimates("moments"), recording.restored(), strict=True)
+    series = zip(recording.exposures(), recording.estimates("moments"), recording.restored(), strict=True)
     for exposure, estimate, restored in series:
         assert exposure.scene is not None
         assert restored.scene is not None

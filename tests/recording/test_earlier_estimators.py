@@ -22,7 +22,7 @@ LINE = (
 def test_its_estimates_are_read() -> None:
     recording = Recording(OLD)
     assert sorted(recording.estimators) == ["mixture", "o1"]
-    assert [each.estimator for each in recording.iter_estimates("mixture")] == ["mixture"] * 3
+    assert [each.estimator for each in recording.estimates("mixture")] == ["mixture"] * 3
 
 
 @pytest.mark.slow

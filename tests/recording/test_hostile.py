@@ -90,7 +90,7 @@ def test_an_impossible_field_is_a_loss_and_nothing_is_computed_with_it(
     for exposure in recording.exposures():
         assert exposure.n_steps <= 200
     for name in recording.estimators:
-        list(recording.iter_estimates(name))
+        recording.estimates(name)
     assert [loss.what for loss in recording.losses if said in loss.what]
 
 

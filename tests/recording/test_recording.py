@@ -175,7 +175,9 @@ def test_estimates_survive_the_recording(recorded: Session) -> None:
     """The driver's own estimates, not recorded ones, against what is read back."""
     recording = Recording(recorded.path)
     for name in ESTIMATORS:
-        for ours, theirs in zip(aolink.estimate(recording, name), recording.estimates(name), strict=True):
+        for ours, theirs in zip(
+            aolink.estimate(recording, name).estimates(name), recording.estimates(name), strict=True
+        ):
             assert np.array_equal(ours.path_sd, theirs.path_sd)
             assert ours.status == theirs.status
 
@@ -336,5 +338,5 @@ def test_a_recording_is_used_as_simulated_exposures_are(recorded: Session) -> No
     first = [exposure.frame_id for exposure in recording]
     assert first == [exposure.frame_id for exposure in recording.exposures()]
     assert first == [exposure.frame_id for exposure in recording]  # it begins anew each time
-    estimates = aolink.estimate(recording, "o3")
+    estimates = aolink.estimate(recording, "o3").estimates("o3")
     assert [each.frame_id for _, each in zip(recording, estimates, strict=True)] == first

@@ -15,9 +15,7 @@ import aolink
 from aolink.errors import DeviceError, RecordingError
 from aolink.estimation import Estimate
 from aolink.exposure import Exposure
-from aolink.recording import schemas_pb2 as pb
 from aolink.recording.editing import cut, merge
-from aolink.recording.estimate_pairs import EstimatePairs
 from aolink.recording.reader import Recording
 from aolink.rig import load_rig
 from aolink.session import record
@@ -167,8 +165,8 @@ def bytes_read(work: Callable[[], object]) -> int:
 def test_estimators_run_on_a_slice(recorded: Session) -> None:
     recording = aolink.read(recorded.path)
     some = aolink.estimate(recording[4:8], "o3")
-    assert [each.frame_id for each in some] == [each.frame_id for each in recording[4:8]]
-    assert len(aolink.smooth(recording[4:8], some)) == 4
+    assert [each.frame_id for each in some.estimates("o3")] == [each.frame_id for each in recording[4:8]]
+    assert len(aolink.smooth(some, estimators="o3").estimates("o3")) == 4
 
 
 def test_what_a_recording_says_of_itself(recorded: Session) -> None:
@@ -176,7 +174,7 @@ def test_what_a_recording_says_of_itself(recorded: Session) -> None:
     assert repr(recording) == (
         "<Recording session.mcap: 12 exposures, rig section-vi-lively, estimates of open-loop, o1, o2, o3, truth>"
     )
-    assert repr(recording[2:9:2]).startswith("<Recording session.mcap[2:9:2]: 4 exposures")
+    assert repr(recording[2:9:2]).startswith("<Series session.mcap[2:9:2]: 4 exposures")
     page = recording._repr_html_()
     assert page.startswith("<table>")
     assert "12 of 200 fast steps (200 ms), one every 200 ms" in page
@@ -197,19 +195,3 @@ def test_damage_is_said_in_the_table(recorded: Session, tmp_path: Path) -> None:
     page = aolink.read(path)._repr_html_()
     assert "<th>damage</th>" in page
     assert "<b>" not in page
-
-
-@pytest.mark.parametrize("skipped", [False, True])
-def test_nothing_is_waited_for_after_the_last_wanted_estimate(skipped: bool) -> None:
-    """The second exposure has an estimate, or the session says that there was no time for one."""
-    first, second = Recording(REFERENCES[0]).exposures(0, 2)
-    one, two = (pb.Estimate(frame_id=each.frame_id) for each in (first, second))
-    pairs = EstimatePairs(0, 2)
-    assert list(pairs.take(one, [])) == []
-    assert list(pairs.take(pb.ExposureInfo(), [(0, first)])) == [(one, first)]
-    assert not pairs.complete
-    assert list(pairs.take(pb.ExposureInfo(), [(1, second)])) == []
-    assert not pairs.complete
-    last = pb.Estimation(frame_id=second.frame_id, skipped=True) if skipped else two
-    assert list(pairs.take(last, [])) == ([] if skipped else [(two, second)])
-    assert pairs.complete

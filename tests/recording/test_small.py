@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 from aolink.cli.common import app
 from aolink.errors import AolinkError, EstimatorError, RecordingError, ViewerError
 from aolink.recording.reader import Recording
-from aolink.recording.reestimate import reestimated, scored_and_compared
+from aolink.recording.reestimate import scored_and_compared
 from tests.recording.small import write_small
 
 Run = Callable[..., subprocess.CompletedProcess[str]]
@@ -108,7 +108,7 @@ def test_without_truth_there_is_a_nis_all_the_same(tmp_path: Path) -> None:
     scores = []
     for truth in (True, False):
         recording = Recording(write_small(tmp_path / f"{truth}.mcap", 6, truth=truth))
-        found, _ = scored_and_compared(recording, reestimated(recording, ["o3"]), ["o3"])
+        found, _ = scored_and_compared(recording, ["o3"])
         scores.append(found["o3"])
     assert scores[0].nis == scores[1].nis
     assert scores[1].nis.mean > 0

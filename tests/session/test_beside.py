@@ -86,6 +86,11 @@ def test_a_slow_estimator_costs_no_frame_and_no_command(loaded: Session) -> None
         assert recording.counts[topic] == EXPOSURES
 
 
+def skipped_by(recording: Recording, name: str) -> set[int]:
+    """Frame ids of the exposures that an estimator had no time for."""
+    return {step.exposure.frame_id for step in recording.steps([name]) if name in step.skipped}
+
+
 @pytest.mark.slow
 def test_what_it_had_no_time_for_is_counted_and_recorded(loaded: Session) -> None:
     recording, metadata = Recording(loaded.path), Recording(loaded.path).metadata
@@ -94,12 +99,12 @@ def test_what_it_had_no_time_for_is_counted_and_recorded(loaded: Session) -> Non
         accounts = messages_of(pb.Estimation, recording, topics.estimation_topic(name))
         assert counted.estimated + counted.skipped == len(accounts) == EXPOSURES
         assert sorted(each.frame_id for each in accounts) == list(range(1, EXPOSURES + 1))
-        estimated = [each.frame_id for each in recording.iter_estimates(name)]
+        estimated = [each.frame_id for each in recording.estimates(name)]
         assert [each.frame_id for each in accounts if not each.skipped] == estimated
         assert len(estimated) == counted.estimated == len(counted.took_ms) > 0
         assert all((each.took_ns > 0) != each.skipped for each in accounts)
         assert all(bool(each.reason) == each.skipped for each in accounts)
-        assert recording.skipped(name) == {each.frame_id for each in accounts if each.skipped}
+        assert skipped_by(recording, name) == {each.frame_id for each in accounts if each.skipped}
         assert metadata[f"skipped_{name}"] == str(counted.skipped)
     assert loaded.report.estimation[slow()].skipped > loaded.report.estimation["o3"].skipped
     assert loaded.report.exposures_skipped[slow()] == loaded.report.estimation[slow()].skipped > 0
@@ -131,14 +136,14 @@ def test_compare_replay_and_estimate_know_of_the_skipped(
     # The exposures that were skipped tell it more: it is not the same.
     last = Recording(loaded.path).estimates(slow())[-1]
     assert not np.array_equal(whole.estimates(slow())[last.frame_id - 1].end_state, last.end_state)
-    assert whole.skipped(slow()) == frozenset()
+    assert not skipped_by(whole, slow())
     facts = json.loads(aolink("info", loaded.path, "--json").stdout)
     assert facts["losses"][f"skipped_{slow()}"] == skipped
 
 
 def test_latencies_stay_in_order_beside_a_slow_estimator(loaded: Session) -> None:
     """A frame is estimated when its first estimate is there, and then a command knows it."""
-    skipped = Recording(loaded.path).skipped(slow()) & Recording(loaded.path).skipped("o3")
+    skipped = skipped_by(Recording(loaded.path), slow()) & skipped_by(Recording(loaded.path), "o3")
     assert len(loaded.report.latencies) == EXPOSURES
     for each in loaded.report.latencies:
         assert 0 < each.first_byte_ns <= each.complete_ns
@@ -218,7 +223,7 @@ def test_the_recording_goes_on_without_an_estimator_that_was_killed(rig_file: Pa
     recording = Recording(path)
     assert recording.complete
     again = reestimate(recording, ["o3"], as_recorded=True)["o3"]
-    assert first_difference(list(recording.iter_estimates("o3")), again) is None
+    assert first_difference(recording.estimates("o3"), again) is None
 
 
 @pytest.mark.slow
@@ -247,7 +252,7 @@ def test_an_estimator_that_hangs_is_said_to_and_fails_unless_it_wakes(
     assert ("it has not answered for" in counted.failed) == (not wakes)
     assert any("the estimator o3 failed" in each for each in report.warnings) == (not wakes)
     again = reestimate(Recording(path), ["o3"], as_recorded=True)["o3"]
-    assert first_difference(list(Recording(path).iter_estimates("o3")), again) is None
+    assert first_difference(Recording(path).estimates("o3"), again) is None
 
 
 def children(parent: int, what: str) -> list[int]:
@@ -320,9 +325,9 @@ def test_ctrl_c_waits_for_what_is_under_way_and_records_the_rest_as_skipped(rig_
     recording = Recording(path)
     assert recording.complete
     exposures = {each.frame_id for each in recording.exposures()}
-    estimated = {each.frame_id for each in recording.iter_estimates(slow())}
-    assert estimated | recording.skipped(slow()) == exposures
-    assert not estimated & recording.skipped(slow())
+    estimated = {each.frame_id for each in recording.estimates(slow())}
+    assert estimated | skipped_by(recording, slow()) == exposures
+    assert not estimated & skipped_by(recording, slow())
     assert f"{slow()}: {len(estimated)} of {len(exposures)} exposures".encode() in output
 
 

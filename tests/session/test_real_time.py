@@ -63,7 +63,7 @@ def test_the_frames_show_where_the_truth_says_the_spot_was(serve: Ports, tmp_pat
     recording = Recording(path)
     exposures = list(recording.exposures())
     assert len(exposures) + report.frames_lost == 15
-    estimates = list(aolink.estimate(recording, "profile"))
+    estimates = aolink.estimate(recording, "profile").estimates("profile")
     sd = np.array([np.sqrt(estimate.path_covariance().mean()) for estimate in estimates])
     errors = np.array(
         [

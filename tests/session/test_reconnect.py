@@ -109,7 +109,9 @@ def test_a_camera_that_is_pulled_out_loses_exposures_and_goes_on_with_the_others
     after = next(each for each in exposures if len(each.lead_inputs))
     assert len(after.lead_inputs) == PERIOD * report.frames_lost
     assert all(each.inputs_assumed == 0 for each in exposures)
-    for estimate, exposure in zip(aolink.estimate(Recording(path), "moments"), exposures, strict=True):
+    for estimate, exposure in zip(
+        aolink.estimate(Recording(path), "moments").estimates("moments"), exposures, strict=True
+    ):
         assert exposure.truth is not None
         sigma = math.sqrt(estimate.path_covariance().mean())
         assert abs(estimate.path.mean() - exposure.truth.path.mean()) < 5 * sigma

@@ -281,7 +281,7 @@ def test_motion_and_its_covariance_are_those_of_the_path(session: Path) -> None:
     np.testing.assert_array_equal(path, estimate.path)
     np.testing.assert_allclose(np.linalg.norm(root, axis=1), estimate.path_sd[0], rtol=1e-9)
     exposures = aolink.simulate("sh-4x4", 2)
-    estimate = aolink.estimate(exposures, "o3")[-1]
+    estimate = aolink.estimate(exposures, "o3").estimates("o3")[-1]
     mix = np.tile(np.eye(2), (1, 16)) / 16
     path, own = motion(estimate, mix, psd_root(estimate.coefficient_covariance))
     covariance = own @ own.T
@@ -304,7 +304,7 @@ def test_an_exposure_that_starts_late_ends_in_the_step_after_its_last(name: str)
     rig = load_rig(name)
     late = replace(rig, timing=replace(rig.timing, exposure_offset=0.4))
     exposures = aolink.simulate(late, 3)
-    exposure, estimate = exposures[-1], aolink.estimate(exposures, "moments")[-1]
+    exposure, estimate = exposures[-1], aolink.estimate(exposures, "moments").estimates("moments")[-1]
     assert exposure.start_offset == 0.4
     mix, count = np.eye(rig.n_outputs), estimate.coefficients.shape[1]
     path, root = motion(estimate, mix, psd_root(estimate.coefficient_covariance), after=True)
@@ -330,7 +330,7 @@ def test_spots_are_restored_in_the_windows_that_have_one() -> None:
     """Dark windows stay dark, and spots are counted without them."""
     exposures = aolink.simulate("sh-4x4", 2)
     rig, exposure = exposures.rig, exposures[-1]
-    estimate = aolink.estimate(exposures, "o3")[-1]
+    estimate = aolink.estimate(exposures, "o3").estimates("o3")[-1]
     assert isinstance(rig.sensor, SpotSensor)
     sensor = replace(rig.sensor, light=(0.0, 0.0, 1.0) + 13 * (0.0,))
     done = deblur(replace(rig, sensor=sensor), exposure, estimate)
@@ -350,7 +350,7 @@ def test_all_spots_of_a_bench_are_restored() -> None:
     rig, exposure = exposures.rig, exposures[-1]
     sensor = rig.sensor
     assert isinstance(sensor, SpotSensor)
-    done = deblur(rig, exposure, aolink.estimate(exposures, "o3")[-1])
+    done = deblur(rig, exposure, aolink.estimate(exposures, "o3").estimates("o3")[-1])
     assert done.reason == ""
     assert done.spots is not None
     came = np.clip(to_density(sensor, exposure.pixels) * sensor.pixel_size, 0, 1)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, cast
@@ -21,7 +21,7 @@ from aolink.recording import schemas_pb2 as schemas
 from aolink.recording.reader import Recording
 from aolink.restoration import RestoredPictures
 from aolink.rig import Rig, load_rig
-from aolink.series import Series
+from aolink.series import NOTHING, Also, Series, Step
 from aolink.wire import messages_pb2 as wire
 from tests.kinds import line_of
 
@@ -74,6 +74,7 @@ class StandIn(Series):
     side_of: str = ""
 
     def __post_init__(self) -> None:
+        Series.__init__(self, self)
         rng = np.random.default_rng(7)
         period, ns = self.rig.timing.frame_period_steps, self.rig.timing.fast_step_ns
         n_steps = self.rig.timing.exposure_steps
@@ -114,11 +115,16 @@ class StandIn(Series):
     def __len__(self) -> int:
         return len(self._exposures)
 
-    def __getitem__(self, index: Any) -> Any:
-        return self._exposures[index]
-
-    def iter_estimates(self, name: str) -> Iterator[Estimate]:
-        return iter(self.estimates(name))
+    def steps(
+        self, names: Sequence[str] = (), start: int = 0, stop: int | None = None, *, also: Also = NOTHING
+    ) -> Iterator[Step]:
+        for recorded in self.messages(*also) if also else ():
+            also[recorded.topic](recorded)
+        made = {name: {each.frame_id: each for each in self.estimates(name)} for name in names}
+        for number, exposure in enumerate(self._exposures[start:stop], start):
+            frame = exposure.frame_id
+            its = {name: found[frame] for name, found in made.items() if frame in found}
+            yield Step(number, exposure, its, {"o3"} if frame in self.without_time else set())
 
     @property
     def estimators(self) -> list[str]:
@@ -128,9 +134,6 @@ class StandIn(Series):
     def counts(self) -> dict[str, int]:
         return Counter(each.topic for each in self.messages())
 
-    def skipped(self, name: str) -> frozenset[int]:
-        return frozenset(self.without_time if name == "o3" else ())
-
     @property
     def true_scene(self) -> None:
         return None
@@ -138,10 +141,8 @@ class StandIn(Series):
     def restored(self) -> Iterator[RestoredPictures]:
         return iter(())
 
-    def exposures(self) -> Iterator[Exposure]:
-        return iter(self._exposures)
-
-    def estimates(self, name: str) -> list[Any]:
+    def estimates(self, name: str | None = None) -> list[Any]:
+        assert name is not None
         rng = np.random.default_rng(len(name))
         sd, m = SD[name], MEASUREMENTS[name]
         made = []

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -11,11 +11,10 @@ import numpy as np
 import pytest
 
 from aolink.estimation import run
-from aolink.estimation.estimate import Estimate, Status
-from aolink.exposure import Exposure
+from aolink.estimation.estimate import Status
 from aolink.restoration import deblur
 from aolink.rig import Rig, load_rig
-from aolink.series import Series
+from aolink.series import NOTHING, Also, Series, Step
 from aolink.simulation.model import simulate
 from aolink.viewing import save_rrd
 from tests.viewing.rrd import read_rrd
@@ -39,8 +38,9 @@ class Simulated(Series):
     side_of: str = ""
 
     def __post_init__(self) -> None:
+        Series.__init__(self, self)
         self._exposures = simulate(self.rig, N)
-        self._estimates = run(self.rig, self._exposures, self.names)
+        self.made = run(self.rig, self._exposures, self.names)
 
     damage = ""
     has_truth = True
@@ -52,17 +52,12 @@ class Simulated(Series):
     def __len__(self) -> int:
         return N
 
-    def __getitem__(self, index: Any) -> Any:
-        return self._exposures[index]
-
-    def iter_estimates(self, name: str) -> Iterator[Estimate]:
-        return iter(self._estimates[name])
-
-    def exposures(self) -> Iterator[Exposure]:
-        return iter(self._exposures)
-
-    def estimates(self, name: str) -> list[Estimate]:
-        return self._estimates[name]
+    def steps(
+        self, names: Sequence[str] = (), start: int = 0, stop: int | None = None, *, also: Also = NOTHING
+    ) -> Iterator[Step]:
+        for number in range(N)[start:stop]:
+            its = {name: self.made[name][number] for name in names}
+            yield Step(number, self._exposures[number], its)
 
     def messages(self, *topics: str) -> Iterator[Any]:
         return iter(())
@@ -71,11 +66,8 @@ class Simulated(Series):
     def counts(self) -> dict[str, int]:
         return {}
 
-    def skipped(self, name: str) -> frozenset[int]:
-        return frozenset()
-
     def restored(self) -> Iterator[Any]:
-        yield deblur(self.rig, self._exposures[0], self._estimates["o1"][0])
+        yield deblur(self.rig, self._exposures[0], self.made["o1"][0])
 
     true_scene = None
 
@@ -140,7 +132,7 @@ def test_windows_in_the_dark_have_no_paths(tmp_path: Path) -> None:
 
 def test_the_session_page_says_how_many_exposures_were_gated(tmp_path: Path) -> None:
     recording = Simulated(load_rig("sh-4x4"))
-    o1 = recording.estimates("o1")
+    o1 = recording.made["o1"]
     o1[1:3] = [replace(o1[1], status=Status.GATED), replace(o1[2], status=Status.DIVERGED)]
     entities = read_rrd(save_rrd(as_recording(recording), tmp_path / "gated.rrd"))
     rows = [row.split("|") for row in entities["/session"]["TextDocument:text"][0][0].splitlines() if "|" in row]

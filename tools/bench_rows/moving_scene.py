@@ -40,7 +40,7 @@ def moving_scene(effort: Effort) -> list[Row]:
     for name in ("o1", "o3", "moments", "profile"):
         if name not in ESTIMATOR_NAMES:
             continue
-        estimates = aolink.estimate(exposures, name)
+        estimates = aolink.estimate(exposures, name).estimates(name)
         each = found([scene_psf(rig, *both) for both in zip(exposures, estimates, strict=True)])
         rows.append(Row(f"moving-scene, tv, path of {name}: mean (least) PSNR",
             f"{each.mean():.1f} ({each.min():.1f}) dB", f"blurred {blurred:.1f}; true path {true.mean():.1f}",

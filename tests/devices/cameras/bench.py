@@ -54,7 +54,7 @@ def recorded(
     report = record(rig, None, None, path, estimators=estimators, exposures=exposures)
     recording = Recording(path)
     found = list(recording.exposures())
-    again = list(estimate(path, "o3"))
+    again = estimate(path, "o3").estimates("o3")
     assert [each.frame_id for each in again] == [each.frame_id for each in found]
     assert all(each.status == Status.OK for each in again)
     assert recording.metadata["mirror"] == "none"

@@ -55,7 +55,7 @@ def test_a_session_is_recorded_estimated_and_replayed(
     assert (counted.device, report.connection_faults["sequence_gaps"]) == ("camera", counted.sequence_gaps)
     assert counted.sequence_gaps >= chunks_lost
 
-    exposures, estimates = list(recording.exposures()), list(estimate(recording, "o3"))
+    exposures, estimates = list(recording.exposures()), estimate(recording, "o3").estimates("o3")
     errors = []
     for exposure, found in zip(exposures, estimates, strict=True):
         rendered = next(each for each in truth if np.array_equal(each.pixels * exposure.mask, exposure.pixels))

@@ -89,7 +89,7 @@ def check_session(report: Report, path: Path, mirror: str) -> None:
     exposures = list(recording)
     assert max(np.abs(each.inputs).max() for each in exposures) > 0.2
     assert all(each.truth is not None for each in exposures)
-    check_paths(recording.rig, zip(exposures, estimate(path, "o1"), strict=True))
+    check_paths(recording.rig, zip(exposures, estimate(path, "o1").estimates("o1"), strict=True))
 
 
 def check_paths(rig: Rig, estimated: Iterable[tuple[Exposure, Estimate]], within: float = 0.05) -> None:

@@ -114,7 +114,9 @@ def test_a_whole_session(tmp_path: Path) -> None:
     recording = Recording(tmp_path / "a.mcap")
     assert recording.metadata["mirror"].startswith(DEVICE)
     # The drive moves the spot by 0.3.
-    bench.check_paths(recording.rig, zip(recording.exposures(), estimate(recording, "o1"), strict=True), within=0.1)
+    bench.check_paths(
+        recording.rig, zip(recording.exposures(), estimate(recording, "o1").estimates("o1"), strict=True), within=0.1
+    )
 
 
 @pytest.mark.parametrize(

@@ -251,7 +251,7 @@ def test_a_whole_session(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
     assert all(exposure.inputs_assumed == 0 for exposure in exposures)
     assert max(np.abs(exposure.inputs).max() for exposure in exposures) > 0.1
     # The drive moves the spot by 0.3.
-    bench.check_paths(recording.rig, zip(exposures, estimate(recording, "o1"), strict=True))
+    bench.check_paths(recording.rig, zip(exposures, estimate(recording, "o1").estimates("o1"), strict=True))
 
 
 @pytest.mark.slow  # in real time

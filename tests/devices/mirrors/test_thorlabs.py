@@ -206,7 +206,9 @@ def test_a_whole_session(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
     recording = Recording(tmp_path / "a.mcap")
     assert recording.metadata["mirror"].startswith("Thorlabs BPC303, serial number 29501986")
     # The drive moves the spot by 0.3.
-    bench.check_paths(recording.rig, zip(recording.exposures(), estimate(recording, "o1"), strict=True), within=0.1)
+    bench.check_paths(
+        recording.rig, zip(recording.exposures(), estimate(recording, "o1").estimates("o1"), strict=True), within=0.1
+    )
 
 
 def test_a_unit_that_is_unplugged_ends_the_session_with_a_whole_recording(
