@@ -16,7 +16,7 @@ from aolink.films.film import Film
 from aolink.importing.exposures import imported
 from aolink.importing.frames import FilmAccount, FilmSettings, ImportedExposure
 from aolink.recording import convert, topics
-from aolink.recording.mcap_file import McapFile, WriteOptions, schema_of
+from aolink.recording.mcap_file import AT_LEISURE, McapFile, schema_of
 from aolink.recording.writer import begin_recording
 from aolink.rig import Rig
 from aolink.wire.messages_pb2 import Applied
@@ -52,7 +52,7 @@ def import_film(
         "import_settings": str(settings),
     }
     with writing(path, overwrite=overwrite, sources=sources, error=RecordingError) as partial:
-        file = McapFile(partial, WriteOptions(), descriptor=open_unfinished(partial))
+        file = McapFile(partial, AT_LEISURE, descriptor=open_unfinished(partial))
         try:
             begin_recording(file, rig, facts, first.frame.host_start_ns, {})
             sequence, digest = 0, hashlib.sha256(f"{film.name} {settings} {rig.digest}".encode())

@@ -22,7 +22,7 @@ from aolink.exporting.common import Progress, no_progress
 from aolink.files import open_unfinished, writing
 from aolink.recording import convert, schemas_pb2, topics
 from aolink.recording.lead import Lead
-from aolink.recording.mcap_file import McapFile, WriteOptions, schema_of
+from aolink.recording.mcap_file import AT_LEISURE, McapFile, schema_of
 from aolink.recording.messages import RawMessage, in_time
 from aolink.recording.reader import Recording
 from aolink.recording.scan import Loss
@@ -64,7 +64,7 @@ class RecordingCopy:
         """Numbers of messages and of exposures that have been written."""
         self._foreign, self._encodings = source.schemas, source.encodings
         self._schemas: dict[str, Schema] = {}
-        self._file = McapFile(path, WriteOptions(), descriptor=open_unfinished(path))
+        self._file = McapFile(path, AT_LEISURE, descriptor=open_unfinished(path))
         attachments = source.attachments if attachments is None else attachments
         begin_recording(self._file, source.rig, notes, source.start_ns, attachments)
 

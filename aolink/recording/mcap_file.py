@@ -63,6 +63,10 @@ class WriteOptions:
                 raise RecordingError(f"{name} is {getattr(self, name):g}: a value from {low:g} to {high:g} is needed")
 
 
+AT_LEISURE = WriteOptions(compression="zstd", chunk_bytes=1 << 20, flush_s=60.0)
+"""For a file that no session waits for, and that is whole or not there: large chunks take a third less room."""
+
+
 class _File:
     """An open file that writes all bytes or raises an error."""
 

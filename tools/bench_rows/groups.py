@@ -16,8 +16,8 @@ ROWS = {
     "devices": ("late_steps", "clock_sd"),
     "parking": ("time_to_park",),
     "recording": (
-        "recording_rate", "loop_stall", "reestimation_rate", "memory_of_an_hour", "kill_at_any_moment", "truncation",
-        "flipped_bits", "batch_workers", "rrd_of_ten_minutes", "rrd_size", "view_first",
+        "recording_rate", "loop_stall", "reestimation_rate", "chunks_read", "memory_of_an_hour", "kill_at_any_moment",
+        "truncation", "flipped_bits", "batch_workers", "rrd_of_ten_minutes", "rrd_size", "view_first",
     ),
     "start": ("command_start", "first_profile", "view_start"),
     "batches": ("tiny_recordings", "read_over_needed", "cluster_workers"),

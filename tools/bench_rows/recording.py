@@ -9,6 +9,7 @@ import signal
 import statistics
 import tempfile
 import time
+from collections import deque
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -33,7 +34,7 @@ from aolink.recording.reestimate import reestimate, write_reestimated
 from aolink.recording.writer import RecordingWriter, begin_recording
 from aolink.rig import load_rig
 from aolink.wire import messages_pb2 as wire
-from bench_rows.row import Effort, Row, median_s, resident_mb
+from bench_rows.row import Effort, Row, median_s, resident_mb, timed
 
 KILLS = 100
 _ROWS = 50_000
@@ -227,6 +228,51 @@ def _reestimated(what: str, name: str, count: int, effort: Effort, target: float
     theirs = f"reading {count / reading:.0f}; past the mirror's reports {count / skipping:.0f}"
     ours = f"{count / estimating:.0f} frames/s"
     return Row(f"re-estimation with o3{what}", ours, theirs, reading / estimating, target)
+
+
+def chunks_read(effort: Effort) -> list[Row]:
+    """How often each chunk of a session of 1500 exposures with four estimators is read, and how long that takes beside
+    a walk over its exposures and estimates."""
+    from aolink.exporting.files import export
+    from aolink.plotting.report import write_report
+    from aolink.recording import messages
+    from aolink.recording.reestimate import scored_and_compared
+    from aolink.viewing import save_rrd
+
+    real: Any = messages.chunk_at
+    read = 0
+
+    def counting(*arguments: Any) -> Any:
+        nonlocal read
+        read += 1
+        return real(*arguments)
+
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        with RecordingWriter(folder / "a.mcap", load_rig("section-vi-lively"), {}, 0, deterministic=True) as writer:
+            record_long(folder / "bare.mcap", effort.of(1500, 10))
+            write_reestimated(Recording(folder / "bare.mcap"), ["open-loop", "o1", "o3", "moments"], folder / "b.mcap")
+            for each in Recording(folder / "b.mcap").messages():  # in the chunks of a session
+                writer.write(each.topic, each.message, each.log_time_ns)
+        recording = Recording(folder / "a.mcap")
+        chunks = len(recording.chunk_index or ())
+        work: dict[str, Callable[[], object]] = {
+            "walk": lambda: deque(recording.walk(), maxlen=0),
+            "estimate -e o3": lambda: scored_and_compared(recording, ["o3"]),
+            "export x.csv": lambda: export(recording, folder / "x.csv"),
+            "report": lambda: write_report([recording], folder / "x.html"),
+            "view --save": lambda: save_rrd(recording, folder / "x.rrd"),
+        }
+        rows, messages.chunk_at = [], counting  # type: ignore[attr-defined]
+        try:
+            for what, run in work.items():
+                read = 0
+                took = f"{timed(run):.1f} s"
+                times = read / chunks
+                rows.append(Row(f"{chunks} chunks read by {what}", f"{times:.2f} times", took, 1 / times, 0.95))
+        finally:
+            messages.chunk_at = real  # type: ignore[attr-defined]
+    return rows
 
 
 def memory_of_an_hour(effort: Effort) -> Row:
