@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -204,3 +204,75 @@ def _consistency(values: RunningMean, degrees: int) -> Consistency:
         return Consistency(mean=math.nan, low=math.nan, high=math.nan)
     low, high = (chi_square_quantile(share, degrees) / values.count for share in (0.025, 0.975))
     return Consistency(mean=values.mean, low=low, high=high)
+
+
+@dataclass(frozen=True)
+class ScoreTable:
+    """Scores as texts, for the screen, a page and the viewer."""
+
+    heads: list[str]
+    rows: dict[str, list[str]]
+    """Cells by the estimator's name; "!" ends one that is outside its bounds."""
+    notes: list[str]
+    """Sentences below it: the bounds, and why measurements were not used."""
+
+
+_MOST_REASONS = 3
+"""How many reasons of one estimator are said."""
+
+
+def score_table(by_name: Mapping[str, Score], only: Container[str] = ()) -> ScoreTable:
+    """RMSE against truth, NIS and NEES with their 95 % bounds; without a truth NIS alone.
+
+    Where any exposure was gated, a column says how many. ``only`` names the columns, all by default.
+    """
+    scores = by_name.values()
+    columns: dict[str, Callable[[Score], str]] = {"NIS": lambda each: _mean(each.nis)}
+    if any(each.exposures for each in scores):
+        columns = {
+            "RMSE start": lambda each: _rmse(each.start_rmse), "RMSE end": lambda each: _rmse(each.end_rmse),
+            "RMSE path": lambda each: _rmse(each.path_rmse), **columns,
+            "NEES start": lambda each: _mean(each.start_nees), "NEES end": lambda each: _mean(each.end_nees),
+        }  # fmt: skip
+    if any(each.gated for each in scores):
+        columns["gated"] = lambda each: f"{each.gated} of {each.estimated}"
+    columns = {name: column for name, column in columns.items() if not only or name in only}
+    notes = []
+    if bounds := _bounds(by_name):
+        of_states = "RMSE start" in columns and any(math.isfinite(each.start_rmse) for each in scores)
+        norm = "RMSE of states: norm over the states. " if of_states else ""
+        notes += [f"{norm}! outside the 95 % bounds of a consistent filter:", bounds]
+    rows = {name: [column(each) for column in columns.values()] for name, each in by_name.items()}
+    return ScoreTable(list(columns), rows, [*notes, *unused_lines(by_name)])
+
+
+def unused_lines(by_name: Mapping[str, Score]) -> list[str]:
+    """The number of exposures that each estimator could not use, and why, in words; empty where every estimator used
+    all."""
+    lines = []
+    for name, each in by_name.items():
+        lines += [f"{name}: {unused.text(each.estimated)}" for unused in each.unused[:_MOST_REASONS]]
+        if (more := len(each.unused) - _MOST_REASONS) > 0:
+            lines.append(f"{name}: and {more} other reasons, which --json has")
+    return lines
+
+
+def _rmse(value: float) -> str:
+    return "-" if math.isnan(value) else f"{value:.4f}"
+
+
+def _mean(value: Consistency) -> str:
+    return "-" if math.isnan(value.mean) else f"{value.mean:.2f}{'' if value.inside else ' !'}"
+
+
+def _bounds(by_name: Mapping[str, Score]) -> str:
+    """NEES and NIS bounds; those of NIS depend on how many moments an estimator takes."""
+    nis: dict[str, list[str]] = {}
+    for name, each in by_name.items():
+        if not math.isnan(each.nis.mean):
+            nis.setdefault(f"{each.nis.low:.2f} to {each.nis.high:.2f}", []).append(name)
+    parts = [f"NIS {bounds} for {', '.join(names)}" for bounds, names in nis.items()]
+    nees = next((each.end_nees for each in by_name.values() if not math.isnan(each.end_nees.mean)), None)
+    if nees:
+        parts.insert(0, f"NEES {nees.low:.2f} to {nees.high:.2f}")
+    return "; ".join(parts)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import io
-import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from html import escape
@@ -13,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from aolink.errors import AolinkError, ExportError
-from aolink.estimation.score import Consistency, Score
+from aolink.estimation.score import Score, score_table
 from aolink.files import writing
 from aolink.plotting.devices import incidents, plot_latency, plot_losses
 from aolink.plotting.exposure import draw_exposure, exposure_with_estimates
@@ -269,49 +268,22 @@ def _sections(sessions: Sequence[_Session]) -> Iterable[str]:
 
 def _comparison(sessions: Sequence[_Session]) -> str:
     """A row for each recording and estimator."""
-    heads = ("recording", "rig", "exposures", "estimator", "RMSE path", "RMSE end", "NIS", "NEES end", "gated")
+    wanted = ("RMSE path", "RMSE end", "NIS", "NEES end", "gated")
     rows = []
     for each in sessions:
-        count = str(len(each.recording))
-        known = each.view.scores if each.view is not None else {}
-        begin = [_text(each.name), _text(each.recording.rig.name), _number(count)]
-        if not known:
-            rows.append([*begin, _text("none"), *["<td></td>"] * 5])
-        for name, score in known.items():
-            errors = [_number(_rounded(error, score)) for error in (score.path_rmse, score.end_rmse)]
-            consistent = [_consistency(score.nis), _consistency(score.end_nees)]
-            rows.append([*begin, _text(name), *errors, *consistent, _number(str(score.gated))])
-    return _table(heads, rows, text_columns=(0, 1, 3))
+        begin = [_text(each.name), _text(each.recording.rig.name), _number(str(len(each.recording)))]
+        found = score_table(each.view.scores if each.view is not None else {}, wanted)
+        for name, cells in (found.rows or {"none": []}).items():
+            of = dict(zip(found.heads, cells, strict=bool(cells)))
+            rows.append([*begin, _text(name), *(_number(of.get(head, "")) for head in wanted)])
+    return _table(("recording", "rig", "exposures", "estimator", *wanted), rows, text_columns=(0, 1, 3))
 
 
 def _score_table(scores: Mapping[str, Score]) -> str:
-    """RMSE, NIS and NEES as `aolink estimate` prints them, and why measurements were not used."""
-    truth = any(score.exposures for score in scores.values())
-    heads = ["estimator", *(("RMSE start", "RMSE end", "RMSE path") if truth else ()), "NIS"]
-    heads += ["NEES start", "NEES end"] if truth else []
-    gated = any(score.gated for score in scores.values())
-    heads += ["gated"] if gated else []
-    rows = []
-    for name, score in scores.items():
-        errors = [_number(_rounded(each, score)) for each in (score.start_rmse, score.end_rmse, score.path_rmse)]
-        nees = [_consistency(score.start_nees), _consistency(score.end_nees)]
-        row = [_text(name), *(errors if truth else ()), _consistency(score.nis), *(nees if truth else ())]
-        rows.append([*row, *([_number(str(score.gated))] if gated else ())])
-    notes = ["! is outside the 95 % bounds of a consistent filter. RMSE of the path is in slope units."]
-    notes += [f"{name}: {each.text(score.estimated)}" for name, score in scores.items() for each in score.unused[:3]]
-    return _table(heads, rows, text_columns=(0,)) + "".join(map(_note, notes))
-
-
-def _rounded(value: float, score: Score) -> str:
-    return f"{value:.4f}" if score.exposures and math.isfinite(value) else "-"
-
-
-def _consistency(value: Consistency) -> str:
-    if math.isnan(value.mean):
-        return _number("-")
-    bounds = f"{value.low:.2f} to {value.high:.2f}"
-    mark, kind = ("", "n") if value.inside else (" !", "n off")
-    return f'<td class="{kind}" title="95 % bounds: {bounds}">{value.mean:.2f}{mark}</td>'
+    """The table that `aolink estimate` prints."""
+    found = score_table(scores)
+    rows = [[_text(name), *map(_number, cells)] for name, cells in found.rows.items()]
+    return _table(["estimator", *found.heads], rows, text_columns=(0,)) + "".join(map(_note, found.notes))
 
 
 def _text(text: str) -> str:
@@ -319,7 +291,7 @@ def _text(text: str) -> str:
 
 
 def _number(text: str) -> str:
-    return f'<td class="n">{escape(text)}</td>'
+    return f'<td class="n{" off" if text.endswith("!") else ""}">{escape(text)}</td>'
 
 
 def _table(heads: Sequence[str], rows: Sequence[Sequence[str]], *, text_columns: Sequence[int]) -> str:

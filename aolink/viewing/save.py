@@ -14,7 +14,7 @@ import rerun as rr
 from aolink.colours import by_rank
 from aolink.errors import ViewerError
 from aolink.estimation.estimate import Estimate
-from aolink.estimation.score import Scorer
+from aolink.estimation.score import Scorer, score_table
 from aolink.exposure import Exposure
 from aolink.plotting.overview import limits_of
 from aolink.plotting.pupil import has_pupil
@@ -357,17 +357,10 @@ class Sender:
             "",
         ]
         if self._names:
-            lines += [
-                "| estimator | path RMSE (slope units) | end state | NIS (95 % bounds) | gated |",
-                "| --- | --- | --- | --- | --- |",
-            ]
-        for name, scorer in self._scorers.items():
-            result = scorer.result()
-            errors = result.path_rmse, result.end_rmse
-            path, end = (f"{x:.4f}" if result.exposures else "truth unknown" for x in errors)
-            nis = result.nis
-            shown = "" if np.isnan(nis.mean) else f"{nis.mean:.2f} ({nis.low:.2f} to {nis.high:.2f})"
-            lines.append(f"| {name} | {path} | {end} | {shown} | {result.gated} of {result.estimated} |")
+            found = score_table({name: scorer.result() for name, scorer in self._scorers.items()})
+            heads = ["estimator", *found.heads]
+            table = [heads, ["---"] * len(heads), *([name, *cells] for name, cells in found.rows.items())]
+            lines += [*(f"| {' | '.join(cells)} |" for cells in table), "", *found.notes]
         skipped = {name: len(frames) for name, frames in self._skipped.items() if frames}
         if skipped:
             lines += ["", "Exposures skipped for want of time: " + ", ".join(f"{k} {n}" for k, n in skipped.items())]

@@ -11,8 +11,8 @@ import numpy as np
 from rich.table import Table
 
 from aolink.cli.tables.json import without_nan
-from aolink.cli.tables.scores import unused_lines
 from aolink.estimation.registry import BASELINE_ESTIMATOR
+from aolink.estimation.score import unused_lines
 from aolink.recording import schemas_pb2 as pb
 
 if TYPE_CHECKING:
