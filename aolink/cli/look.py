@@ -17,6 +17,10 @@ if TYPE_CHECKING:
     from aolink.recording.reader import Recording
 
 
+_LOOK_S = 0.1
+"""Time between two looks at a file that grows, s."""
+
+
 @app.command(
     epilog="Example: aolink view session.mcap --screenshot session.png"
     "  |  aolink view session.mcap --exposure 7  |  aolink view session.mcap --start 10 --end 20 --compare again.mcap"
@@ -49,6 +53,9 @@ def view(
     compare: Annotated[
         str | None, typer.Option(metavar="OTHER", help="Show another recording beside it, in fainter lines.")
     ] = None,
+    follow: Annotated[
+        bool, typer.Option("--follow", help="Show a recording that a session is still writing, as it grows.")
+    ] = False,
     overwrite: OverwriteOption = False,
 ) -> None:
     """Open a recording in Rerun, or a Rerun file that was saved from one.
@@ -60,13 +67,18 @@ def view(
     from aolink import viewing
     from aolink.recording.remote import location, only_paths
 
+    choices = (exposure, start, end, lenslet, compare)
+    if follow:
+        if side or save or screenshot or any(each is not None for each in choices):
+            raise typer.BadParameter("--follow shows the whole session as it comes, alone or with --web")
+        _follow(recorded, web=web)
+        return
     file, *sides = map(location, [recorded, *(side or ())])
     sources = only_paths([file, *sides, *([location(compare)] if compare else [])])
     for target, suffix in ((save, ".rrd"), (screenshot, ".png")):
         if target is not None:
             check_target(target, overwrite=overwrite, sources=sources, suffix=suffix)
     recording = None if file.suffix == ".rrd" else open_recording(file, side=sides)
-    choices = (exposure, start, end, lenslet, compare)
     if recording is None and (save is not None or side or any(each is not None for each in choices)):
         raise typer.BadParameter(f"{file} is a Rerun file already: --save, side files and choices need a recording")
     if not (web or save or screenshot):
@@ -99,6 +111,20 @@ def view(
             viewing.serve(recording, look, on_ready=_address, progress=tell)
         elif save is None and screenshot is None:
             viewing.show(recording, look, progress=tell)
+
+
+def _follow(file: str, *, web: bool) -> None:
+    import time
+
+    from aolink import viewing
+    from aolink.recording.growing import GrowingRecording
+
+    if not web:
+        viewing.check_display()
+    recording = GrowingRecording(file, lambda: time.sleep(_LOOK_S))
+    common.say_damage(recording)
+    with progress("follow", None) as tell:
+        viewing.follow(recording, web=web, on_ready=_address, progress=tell)
 
 
 def _address(address: str) -> None:

@@ -24,13 +24,18 @@ CutTime = Annotated[float | None, typer.Option(metavar="S", help="Seconds from t
 def info(
     file: Annotated[str, typer.Argument(help="A recording: a file, or a URL.", metavar="FILE")],
     check: Annotated[bool, typer.Option("--check", help="Read every byte, not the index alone.")] = False,
+    log: Annotated[bool, typer.Option("--log", help="Print what the session said while it ran, line by line.")] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Summarise a recording. Exit code 1 if a part of it cannot be read."""
     from aolink.cli.tables import recordings as tables
-    from aolink.recording.facts import recording_facts
+    from aolink.recording.facts import log_lines, recording_facts
 
     recording = open_recording(file, check=check)
+    if log:
+        for line in log_lines(recording):
+            print(json.dumps(line) if as_json else f"{line['time_utc']}  {line['level']:<7}  {line['text']}")
+        return
     facts = recording_facts(recording)
     if as_json:
         print(json.dumps(facts, allow_nan=False))

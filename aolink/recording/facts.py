@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import math
+from collections.abc import Iterator
 from dataclasses import asdict
 from datetime import UTC, datetime
 from typing import Any
+
+from foxglove_schemas_protobuf.Log_pb2 import Log
 
 from aolink.estimation import Status
 from aolink.estimation.score import UnusedCounter
@@ -113,6 +116,15 @@ def recording_facts(recording: Recording, counted: Counted | None = None) -> dic
         "session": {name: _typed(name, value) for name, value in recording.metadata.items()},
         "estimators": recording.estimators,
     }
+
+
+def log_lines(recording: Recording) -> Iterator[dict[str, str | None]]:
+    """What the session, or other software on ``/log``, said while it ran: time, level and text, in order."""
+    for recorded in recording.messages(topics.LOG) if topics.LOG in recording.counts else ():
+        entry: Any = recorded.message
+        known = Log.Level.DESCRIPTOR.values_by_number
+        level = known[entry.level].name if entry.level in known else str(entry.level)
+        yield {"time_utc": _date(recorded.log_time_ns), "level": level, "text": " ".join(entry.message.split())}
 
 
 def _date(time_ns: int) -> str | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator
+from itertools import chain
 from pathlib import Path
 
 from mcap.records import Attachment, Channel, McapRecord, Metadata, Schema
@@ -11,7 +12,7 @@ from mcap.records import Message as McapMessage
 from aolink import files
 from aolink.errors import RecordingError
 from aolink.recording import topics
-from aolink.recording.messages import RawMessage
+from aolink.recording.messages import END_OF_TIME, RawMessage
 from aolink.recording.reader import Recording
 from aolink.recording.remote import Url, location
 from aolink.recording.scan import MAGIC, Loss, grown, open_recording
@@ -19,10 +20,10 @@ from aolink.rig import Rig
 
 
 class GrowingRecording(Recording):
-    """A recording whose exposures come as they are written: the iterator waits for more.
+    """A recording whose exposures, and the session's estimates of them, come as they are written: the iterator waits.
 
     They end with the file: with the end of its data or, where it was cut off, when no process writes it any longer.
-    They can be read once, in order, without truth and scene; numbers, slices and counts need an index.
+    They can be read once, in order; numbers, slices and counts need an index.
 
     Parameters
     ----------
@@ -41,19 +42,31 @@ class GrowingRecording(Recording):
         if isinstance(place := location(path), Url):
             raise RecordingError(f"{place} is a URL: what is followed while it is written is a file of this machine")
         self._wait = wait
-        self._coming = self._written(place)
+        self._coming: Iterator[McapRecord] = self._written(place)
         self._names: dict[int, str] = {}
         """Names of the schemas by their ids."""
         super().__init__(place, rig=rig)
 
     def survey(self, *, check: bool) -> str | None:
-        """Read up to the rig file, which a session writes before any message."""
+        """Read up to the rig file and the session's facts, which are written before any message."""
+        rig_text = None
         for record in self._coming:
             if isinstance(record, Attachment) and record.name == topics.RIG_ATTACHMENT:
-                return record.data.decode(errors="replace")
-            if isinstance(record, McapMessage):
-                raise RecordingError(f"{self.path} has messages before its rig file: it can only be read when finished")
-        return None
+                rig_text = record.data.decode(errors="replace")
+            elif isinstance(record, Metadata) and record.name == topics.SESSION_METADATA:
+                self.note_metadata([record])
+                if rig_text is not None:
+                    break
+            elif isinstance(record, McapMessage):
+                if rig_text is None:
+                    text = f"{self.path} has messages before its rig file: it can only be read when finished"
+                    raise RecordingError(text)
+                self._coming = chain([record], self._coming)
+                break
+        # How many there will be is not known: an exposure waits until its estimates are there, or it was skipped.
+        names = self.metadata.get("estimators", "").split()
+        self.counts |= dict.fromkeys(map(topics.estimate_topic, names), END_OF_TIME)
+        return rig_text
 
     def own_messages(
         self, wanted: Collection[str], low: int = 0, high: int = 1 << 64, chunks: slice = slice(None)

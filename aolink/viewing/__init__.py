@@ -7,7 +7,7 @@ calls them with a whole recording, `LiveView` with one exposure after the other.
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from aolink.viewing.feed import serve, show
+    from aolink.viewing.feed import follow, serve, show
     from aolink.viewing.live import LiveView, live_viewer
     from aolink.viewing.look import Look
     from aolink.viewing.process import check_display, open_viewer, serve_web
@@ -19,7 +19,7 @@ else:  # the type checker would accept any name
     __getattr__ = at_first_use(
         __name__,
         {
-            "feed": "serve show",
+            "feed": "follow serve show",
             "live": "LiveView live_viewer",
             "look": "Look",
             "process": "check_display open_viewer serve_web",
@@ -29,8 +29,8 @@ else:  # the type checker would accept any name
     )
 
 __all__ = [
-    "LiveView", "Look", "check_display", "live_viewer", "open_viewer", "save_rrd", "screenshot", "serve", "serve_web",
-    "show",
+    "LiveView", "Look", "check_display", "follow", "live_viewer", "open_viewer", "save_rrd", "screenshot", "serve",
+    "serve_web", "show",
 ]  # fmt: skip
 
 

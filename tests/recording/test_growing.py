@@ -35,7 +35,8 @@ def by_messages(source: Path, target: Path) -> Iterator[bool]:
     """Write a recording anew with what a session writes it with; gives False for each part, True when it is closed."""
     recording = Recording(source)
     file = McapFile(target, WriteOptions())
-    begin_recording(file, recording.rig, {"session": "again"}, recording.start_ns, {})
+    facts = {"session": "again", "estimators": " ".join(recording.estimators)}
+    begin_recording(file, recording.rig, facts, recording.start_ns, {})
     yield False
     for number, each in enumerate(recording.messages()):
         data = each.message.SerializeToString()
@@ -72,6 +73,24 @@ def test_exposures_come_while_the_recording_is_written(
     assert not any(at_end for _, at_end in came[: EXPOSURES // 2])
     assert growing.complete
     assert growing.end_metadata["ended"] == "complete"
+
+
+@pytest.mark.parametrize("how", [by_messages, by_bytes])
+def test_estimates_come_with_their_exposures(
+    recorded: Session, tmp_path: Path, how: Callable[[Path, Path], Iterator[bool]]
+) -> None:
+    parts = how(recorded.path, tmp_path / "growing.mcap")
+    closed = [next(parts)]
+    growing, whole = (
+        GrowingRecording(tmp_path / "growing.mcap", lambda: closed.append(next(parts))),
+        Recording(recorded.path),
+    )
+    assert growing.estimators == whole.estimators != []
+    came = [(found, closed[-1]) for _, found in growing.walk()]
+    assert not any(at_end for _, at_end in came[: EXPOSURES // 2])
+    for (ours, _), (_, theirs) in zip(came, whole.walk(), strict=True):
+        assert ours.keys() == theirs.keys()
+        assert all(ours[name].path.tobytes() == theirs[name].path.tobytes() for name in theirs)
 
 
 def test_a_finished_one_goes_through_at_once(recorded: Session) -> None:

@@ -146,3 +146,15 @@ def test_info_has_date_and_units_and_json_has_numbers(aolink: Run, tmp_path: Pat
     assert facts["start_utc"] == "2023-11-14T22:13:20+00:00"
     assert facts["duration_s"] == 1.0
     assert facts["bytes"] == (tmp_path / "s.mcap").stat().st_size
+
+
+def test_info_prints_what_the_session_said(tmp_path: Path) -> None:
+    path = Path(__file__).parents[2] / "recordings" / "section-vi.mcap"
+    text, error = ran("info", path, "--log")
+    assert error is None
+    first, last = text.splitlines()
+    assert "INFO     session of 20 exposures" in first
+    assert last.endswith("session complete: 20 exposures")
+    (entry, _) = map(json.loads, ran("info", path, "--log", "--json")[0].splitlines())
+    assert entry["level"] == "INFO"
+    assert ran("info", write_small(tmp_path / "a.mcap", 1), "--log") == ("", None)
