@@ -17,7 +17,7 @@ from aolink.numerics.arrays import FloatArray
 from aolink.optics.kernel import exposure_density
 from aolink.optics.sensor import BaseSensor, Sensor
 from aolink.plotting.overview import limits_of, profile_density
-from aolink.plotting.style import BAND, TimeUnit, colour, extremes, figure_or_new, hides_swings
+from aolink.plotting.style import BAND, TimeUnit, colour, extremes, figure_or_new, hides_swings, is_narrow
 from aolink.series import Series
 
 if TYPE_CHECKING:
@@ -98,12 +98,17 @@ def draw_exposure(
         raise ExportError(f"there is no spot {spot}: the sensor has {sensor.spots}, counted from 0")
     outputs = [2 * spot, 2 * spot + 1] if on_plane else [spot]
     figure = figure_or_new(figure, (_SIZE_IN[0], _SIZE_IN[1] * (1.6 if on_plane else 1.0)))
-    widths = [3.0, 1.0, 1.2, 2.0] if on_plane else [3.0, 1.0, 1.2]
-    grid = figure.add_gridspec(len(outputs), len(widths), width_ratios=widths)
+    narrow, rows = is_narrow(figure), len(outputs)
+    if narrow:  # the paths above, and below them what else there is
+        grid = figure.add_gridspec(rows + 1, 2 * rows, height_ratios=[1.0] * rows + [1.6])
+    else:
+        widths = [3.0, 1.0, 1.2, 2.0] if on_plane else [3.0, 1.0, 1.2]
+        grid = figure.add_gridspec(rows, len(widths), width_ratios=widths)
     first: Axes | None = None
     for row, output in enumerate(outputs):
-        left = figure.add_subplot(grid[row, 0], sharex=first)
-        panels = [left, *(figure.add_subplot(grid[row, k], sharey=left) for k in (1, 2))]
+        left = figure.add_subplot(grid[row, :] if narrow else grid[row, 0], sharex=first)
+        beside = [grid[rows, k] if narrow else grid[row, 1 + k] for k in range(0 if narrow and on_plane else 2)]
+        panels = [left, *(figure.add_subplot(place, sharey=left) for place in beside)]
         _draw_row(panels, series, exposure, estimates, output, unit)
         left.set_ylabel(("x", "y (slope units)")[row] if on_plane else "spot (slope units)")
         if row < len(outputs) - 1:
@@ -111,9 +116,9 @@ def draw_exposure(
                 panel.set_xlabel("")
         first = first or left
     if on_plane:
-        draw_spot(figure.add_subplot(grid[:, 3]), sensor, exposure, estimates, spot)
+        draw_spot(figure.add_subplot(grid[rows, :] if narrow else grid[:, 3]), sensor, exposure, estimates, spot)
     if first is not None and first.get_legend_handles_labels()[0]:
-        figure.legend(*first.get_legend_handles_labels(), loc="outside upper left", ncols=4)
+        figure.legend(*first.get_legend_handles_labels(), loc="outside upper left", ncols=2 if narrow else 4)
     return figure
 
 
@@ -122,7 +127,7 @@ def _draw_row(
     unit: TimeUnit,
 ) -> None:  # fmt: skip
     """Draw path, histogram and intensity profile of one output."""
-    over_time, histogram, intensity = panels
+    over_time, *others = panels
     line: Sensor = series.rig.sensor.profile
     seen = profile_density(series.rig.sensor, exposure, output)
     paths = paths_of(exposure, estimates, [output])
@@ -132,13 +137,16 @@ def _draw_row(
     over_time.pcolormesh(
         [0, length], line.edges, seen[:, None], cmap="Greys", vmin=0, vmax=2.5 * max(top, 1e-12), rasterized=True
     )
+    draw_paths(over_time, series, exposure, estimates, [output], unit)
+    over_time.set(ylim=(low, high))
+    if not others:
+        return
+    histogram, intensity = others
     bins = np.linspace(low, high, _BINS + 1)
     draw_intensity(intensity, series, exposure, estimates, output, orientation="horizontal")
-    draw_paths(over_time, series, exposure, estimates, [output], unit)
     for name, (path,) in paths.items():
         share = np.histogram(np.clip(path, low, high), bins, density=True)[0]
         histogram.stairs(share, bins, orientation="horizontal", color=colour(name), linewidth=0.9)
-    over_time.set(ylim=(low, high))
     histogram.set_xlabel("time at a position\n(1 / slope unit)")
     intensity.set_xlabel("intensity\n(1 / slope unit)")
     for panel in (histogram, intensity):

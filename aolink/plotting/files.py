@@ -17,7 +17,7 @@ from aolink.plotting.overview import need_exposures, overview
 from aolink.plotting.pupil import plot_pupil
 from aolink.plotting.scene import plot_scene
 from aolink.plotting.session import plot_blur, plot_errors, plot_nis
-from aolink.plotting.style import TimeUnit, new_figure, paper
+from aolink.plotting.style import TimeUnit, is_narrow, new_figure, paper
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -96,6 +96,9 @@ def save_figure(
     kind = FIGURES[what]
     with paper():
         figure = new_figure(width_mm, width_mm * kind.height)
+        narrow = is_narrow(figure)
+        if narrow:
+            figure.set_figheight(figure.get_figheight() * (2.2 if what == "exposure" else 1.5))
         if kind.draw is not None:
             view = overview(recording, estimators, output=output, progress=progress)
             if kind.draw is plot_blur:
@@ -116,7 +119,7 @@ def save_figure(
                 plot_scene(recording, number, figure)
             else:
                 if recording.rig.sensor.directions == 2:
-                    figure.set_figheight(figure.get_figheight() * 1.5)
+                    figure.set_figheight(figure.get_figheight() * (1.2 if narrow else 1.5))
                 plot_exposure(recording, number, figure, estimators=estimators, spot=spot, unit=unit)
         metadata = {key: None for suffix, key in _DATED.items() if suffix == path.suffix.lower()}
         with writing(path, overwrite=overwrite, sources=recording.files, error=ExportError) as partial:

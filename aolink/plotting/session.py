@@ -12,7 +12,7 @@ from aolink.errors import ExportError
 from aolink.estimation.estimate import Status
 from aolink.numerics.arrays import FloatArray
 from aolink.plotting.overview import NIS_COVERAGE, Overview, limits_of, need_exposures, nis_bounds, overview
-from aolink.plotting.style import TimeUnit, axes_or_new, colour, colour_bar, figure_or_new, legend_above
+from aolink.plotting.style import TimeUnit, axes_or_new, colour, colour_bar, figure_or_new, is_narrow, legend_above
 from aolink.series import Series
 
 if TYPE_CHECKING:
@@ -69,7 +69,7 @@ def plot_blur(
         np.ravel(view.spans) * scale, line.edges, blur, cmap="Greys", vmin=0, vmax=1.2 * max(top, 1e-12),
         rasterized=True,
     )  # fmt: skip
-    colour_bar(grey, axes, "intensity (1 / slope unit)")
+    colour_bar(grey, axes, "1 / slope unit" if is_narrow(axes.figure) else "intensity (1 / slope unit)")
     chosen = ["truth", *view.names[-1:]] if names is None else names
     for name in [each for each in chosen if each in view.paths]:
         _draw_paths(axes, view, name, scale)
@@ -86,7 +86,9 @@ def _draw_paths(axes: Axes, view: Overview, name: str, scale: float) -> None:
     paths = view.paths[name]
     begin, end = view.spans[:, :1], view.spans[:, 1:]
     gap = np.full((len(begin), 1), np.nan)
-    width = 1.4 if name == "truth" else 0.9
+    # In a long session lines lie close to each other: thin ones leave the blur to be seen.
+    room = 20 * axes.figure.bbox.width / axes.figure.dpi / len(begin)
+    width = max(0.25, (1.4 if name == "truth" else 0.9) * min(1.0, room))
     if paths.envelope:
         edges = np.linspace(0, 1, len(paths.places) + 1)
         times = begin + (end - begin) * np.repeat(edges, 2)[1:-1]

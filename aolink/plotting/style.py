@@ -28,6 +28,8 @@ _PAPER: dict[Any, Any] = {
     "axes.spines.top": False, "axes.spines.right": False, "pdf.fonttype": 42, "savefig.dpi": 300,
     "axes.titlesize": 8,
 }  # fmt: skip
+_NARROW_IN = 4.8
+"""Figures of less width are narrow, inches."""
 _ENVELOPE_FROM = 0.5
 """Where a curve through some points of a path misses it by this share of its motion (RMS), its range is drawn."""
 
@@ -65,9 +67,15 @@ def colour(name: str) -> tuple[float, ...]:
     return (0.0, 0.0, 0.0) if name == "truth" else tuple(part / 255 for part in estimator_colour(name))
 
 
+def is_narrow(figure: Figure | SubFigure) -> bool:
+    """Whether a figure is as narrow as a column of a paper, so that panels stand one below the other."""
+    return float(figure.bbox.width / figure.dpi) < _NARROW_IN
+
+
 def legend_above(axes: Axes, columns: int = 5) -> None:
     """A legend over the axes, where it covers no curve; none where nothing has a label."""
     if axes.get_legend_handles_labels()[0]:
+        columns = min(columns, 3) if is_narrow(axes.figure) else columns
         axes.legend(
             loc="lower left", bbox_to_anchor=(0, 1), borderaxespad=0.2, ncols=columns, columnspacing=1.0,
             handlelength=1.5,
