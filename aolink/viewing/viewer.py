@@ -29,6 +29,8 @@ _SETTLE_S = 60.0
 """How long the viewer's picture may take to stop changing, s."""
 _EQUAL = 3
 """Pictures in a row that must be equal: views appear one by one while their data is loaded."""
+_TIMELESS_S = 2.0
+"""A file that has been loaded for as long, and has no time yet, has none, s."""
 _CORNER = 40
 """Pixels along each side that hold a rounded corner of the window."""
 _LEAST_COLOURS = 50
@@ -96,7 +98,7 @@ def headless_viewer(rrd_path: str | Path, size: tuple[int, int] = PICTURE_SIZE) 
             client.run_command("ui.toggle_top_panel")
             if timeline == TIME:
                 client.set_time(TIME, duration=np.timedelta64(inside, "ns"), play_state="paused")
-            else:
+            elif timeline:
                 client.set_time(FAST_STEP, sequence=inside, play_state="paused")
             yield client
         except (RuntimeError, OSError, ViewerError) as error:
@@ -155,9 +157,10 @@ def _connected(process: subprocess.Popen[bytes], port: int, said: IO[bytes]) -> 
 
 def _inside_once_loaded(client: ViewerClient) -> tuple[str, int]:
     """A time at which everything has begun and nothing has ended, with its timeline before it: ns since the first
-    exposure began or, in a file of an older aolink, a fast step.
+    exposure began or, in a file of an older aolink, a fast step. The timeline is empty for a file without time, such as
+    `aolink slopes` writes.
     """
-    deadline = time.monotonic() + _SETTLE_S
+    deadline, timeless = time.monotonic() + _SETTLE_S, 0
     while True:
         state = client.get_state()
         timelines = {t.name: t for r in state.recordings for t in r.timelines}
@@ -165,6 +168,9 @@ def _inside_once_loaded(client: ViewerClient) -> tuple[str, int]:
         if name in timelines and not state.loading:
             start, end = timelines[name].start or 0, timelines[name].end or 0
             return name, start + round(0.6 * (end - start))
+        timeless = timeless + 1 if state.recordings and not state.loading and not timelines else 0
+        if timeless * POLL_S > _TIMELESS_S:
+            return "", 0
         if time.monotonic() > deadline:
             raise ViewerError("the viewer shows no recording with fast steps: give a file that aolink wrote")
         time.sleep(POLL_S)

@@ -242,6 +242,20 @@ def test_a_viewer_that_gets_the_data_over_the_network_shows_the_layout(rrd: Path
 
 
 @pytest.mark.slow
+def test_a_file_without_time_is_shown_as_it_is(tmp_path: Path) -> None:
+    """As `aolink slopes --rrd` writes one."""
+    with rr.RecordingStream("another") as stream:
+        stream.save(tmp_path / "still.rrd")
+        stream.log("picture", rr.Image(np.random.default_rng(1).integers(0, 255, (40, 60, 3), np.uint8)), static=True)
+    try:
+        screenshot(tmp_path / "still.rrd", tmp_path / "still.png")
+    except ViewerError as error:
+        needs_a_renderer(error)
+    colours = np.asarray(Image.open(tmp_path / "still.png")).reshape(-1, 3)
+    assert len(np.unique(colours, axis=0)) > 1000
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("how", [(), ("--follow",)])
 def test_a_recording_is_served_while_it_is_read(
     how: tuple[str, ...], tmp_path: Path, start_aolink: Callable[..., subprocess.Popen[str]]
