@@ -155,9 +155,7 @@ def record(
     report = session.Report()
 
     def on_progress(done: int) -> None:
-        skipped = report.exposures_skipped.items()
-        notes = ["skipped: " + ", ".join(f"{name} {n}" for name, n in skipped)] if skipped else []
-        tell(done, "; ".join([*notes, *([report.control.note] if report.control else [])]))
+        tell(done, report.note())
 
     with _live_view(loaded, names, shown=view) as live:
         with StopRequest().installed() as stop, progress("exposures", exposures) as tell:

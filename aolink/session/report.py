@@ -168,6 +168,34 @@ class Report:
         """How many exposures were skipped, by the names of the estimators that skipped any."""
         return {name: each.skipped for name, each in self.estimation.items() if each.skipped}
 
+    def state(self) -> dict[str, Any]:
+        """How the session stands, for a screen or a program that looks while it runs: counts of exposures and of what
+        was lost, came late or was skipped, the newest latency, the acting controller. What there is none of is left
+        out."""
+        newest = self.latencies[-1] if self.latencies else None
+        known = {
+            "frames_lost": self.frames_lost,
+            "frames_incomplete": self.frames_incomplete, "steps_late": self.steps_late,
+            "skipped": self.exposures_skipped,
+            "latency_ms": newest and {
+                name.removesuffix("_ns"): (at - newest.exposure_end_ns) / 1e6
+                for name in ("complete_ns", "estimated_ns", "command_sent_ns") if (at := getattr(newest, name))
+            },
+            "loop": self.control and self.control.note, "warnings": len(self.warnings),
+        }  # fmt: skip
+        return {"exposures": self.exposures} | {name: value for name, value in known.items() if value}
+
+    def note(self) -> str:
+        """The same in a few words, for a progress bar."""
+        state = self.state()
+        words = {"frames_lost": "lost", "frames_incomplete": "incomplete", "steps_late": "steps late"}
+        notes = [f"{state[name]} {word}" for name, word in words.items() if name in state]
+        if skipped := ", ".join(f"{name} {count}" for name, count in self.exposures_skipped.items()):
+            notes.append(f"skipped: {skipped}")
+        if "estimated" in (after_ms := state.get("latency_ms", {})):
+            notes.append(f"estimated after {after_ms['estimated']:.0f} ms")
+        return "; ".join([*notes, *([state["loop"]] if "loop" in state else [])])
+
     def counts(self) -> dict[str, str]:
         """All counts without the latencies, as text, for the recording's metadata."""
         facts = asdict(replace(self, control=None))

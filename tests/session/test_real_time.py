@@ -9,6 +9,7 @@ import os
 import stat
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -27,8 +28,15 @@ RIG = load_rig("section-vi")
 @pytest.mark.slow
 def test_a_session_has_latencies_and_accounts_for_every_step(serve: Ports, tmp_path: Path) -> None:
     path = tmp_path / "real.mcap"
+    report, states = Report(), list[dict[str, Any]]()
     with serve() as (camera, mirror):
-        report = record(RIG, camera, mirror, path, estimators=["o3"], exposures=4)
+        record(
+            RIG, camera, mirror, path,
+            estimators=["o3"], exposures=4, report=report, progress=lambda done: states.append(report.state()),
+        )  # fmt: skip
+    assert states[-1]["exposures"] == 4
+    assert report.state()["latency_ms"]["estimated"] > 0
+    assert "estimated after" in report.note()
     assert (report.ended, report.exposures, report.virtual_time) == ("complete", 4, False)
     assert report.steps_commanded == report.steps_applied + report.steps_parked == 800
     assert report.steps_late == report.steps_parked
