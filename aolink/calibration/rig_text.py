@@ -7,6 +7,7 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
 import tomlkit
 
 from aolink.calibration.measure import Calibration, Measured
@@ -28,6 +29,10 @@ def calibrated_text(text: str, rig: Rig, calibration: Calibration, sources: Sequ
     """
     for key, value in calibration.values.items():
         text = with_value(text, key, tomlkit.value(written(value)), may_be_new=True)
+    if calibration.hot_pixels:
+        places = np.transpose(np.unravel_index(calibration.hot_pixels, rig.sensor.shape)).tolist()
+        known = {*rig.sensor.defects, *map(tuple, places)}
+        text = with_value(text, "sensor.defects", tomlkit.item(sorted(map(list, known))), may_be_new=True)
     text = with_table(text, "calibration", _updated_table(rig, calibration, sources), _COMMENT)
     parse_rig(text)
     return text

@@ -30,6 +30,8 @@ _NEARLY = 0.9
 """Share of the frames in which such a pixel differs from its neighbours at least."""
 _STEPS = 2.0
 """Steps of the camera's numbers by which such a pixel differs at least."""
+_LISTED = 20
+"""The most pixels that a note lists for a rig file."""
 _SHOWN = 3
 """Hot and dead pixels of which a note has the places."""
 
@@ -64,12 +66,14 @@ def find_defects(film: Film, light: FilmLight, sd: float) -> BoolArray:
     return found
 
 
-def defects_note(defects: BoolArray) -> str:
-    """A note for the user on hot and dead pixels, (rows, columns)."""
+def defects_note(defects: BoolArray, *, of_rig: bool = False) -> str:
+    """A note for the user on hot and dead pixels, (rows, columns); ``of_rig``: of a frame as the rig file has it."""
     rows, columns = np.nonzero(defects)
     some = ", ".join(f"{x},{y}" for x, y in zip(columns[:_SHOWN], rows[:_SHOWN], strict=True))
+    key = [list(map(int, each)) for each in zip(rows, columns, strict=True)]
+    more = f"; with another film of this camera: sensor.defects = {key}" if of_rig and len(key) <= _LISTED else ""
     what = "hot or dead pixel is" if len(rows) == 1 else "hot or dead pixels are"
-    return f"{len(rows)} {what} left out, at {some}{' and others' if len(rows) > _SHOWN else ''}"
+    return f"{len(rows)} {what} left out, at {some}{' and others' if len(rows) > _SHOWN else ''}{more}"
 
 
 def _noise(flat: FloatArray) -> float:

@@ -79,7 +79,7 @@ def imported(film: Film, rig: Rig, settings: FilmSettings, account: FilmAccount)
     light = FilmLight(film, settings)
     defects = find_defects(film, light, math.sqrt(rig.sensor.kernel.variance) / rig.sensor.pixel_width)
     if defects.any():
-        account.notes += (defects_note(defects),)
+        account.notes += (defects_note(defects, of_rig=True),)
         light = FilmLight(film, settings, defects)
     offset = rig.sensor.black_level if settings.invert or settings.subtract_median else 0.0
     scale = settings.scale or default_scale(film, rig)

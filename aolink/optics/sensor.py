@@ -14,7 +14,7 @@ from typing import Literal
 
 import numpy as np
 
-from aolink.numerics.arrays import FloatArray, Indices
+from aolink.numerics.arrays import BoolArray, FloatArray, Indices
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,6 +66,19 @@ class BaseSensor(ABC):
     """Counts for a density of one."""
     photoelectrons: float = 0.0
     """Photo-electrons of a whole spot in one exposure; 0 means that shot noise is negligible."""
+    defects: tuple[tuple[int, int], ...] = ()
+    """Row and column of each pixel that is hot, dead or otherwise wrong."""
+    pedestal: Literal["known", "free"] = "known"
+    """Whether ``black_level`` is what a pixel in the dark gives, or that is found in each window of each frame."""
+
+    @cached_property
+    def defect_mask(self) -> BoolArray | None:
+        """True where a pixel is defective, (rows, columns); None where none is."""
+        if not self.defects:
+            return None
+        mask = np.zeros(self.shape, dtype=np.bool_)
+        mask[tuple(np.array(self.defects).T)] = True
+        return mask
 
     @property
     @abstractmethod

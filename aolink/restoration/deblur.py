@@ -109,6 +109,8 @@ def _restored_spots(rig: Rig, exposure: Exposure, estimate: Estimate, method: st
     sensor = rig.sensor
     share = to_density(sensor, exposure.pixels) * sensor.pixel_size
     good = exposure.mask & ~is_saturated(sensor, exposure.pixels)
+    if sensor.defect_mask is not None:
+        good &= ~sensor.defect_mask
     mixes = np.eye(rig.n_outputs).reshape(-1, sensor.directions, rig.n_outputs)
     psfs = estimated_psfs(exposure, estimate, mixes, sensor.kernel, sensor.pixel_width)
     out, gains = np.zeros_like(share), list[float]()

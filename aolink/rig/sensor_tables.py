@@ -47,6 +47,9 @@ def read_sensor(
         sensor: BaseSensor = _line(table, axes * n_outputs, read_out)
     else:
         sensor = _spots(table, axes, n_outputs, read_out | {"light": light})
+    rows, columns = sensor.shape
+    if outside := [each for each in sensor.defects if each[0] >= rows or each[1] >= columns]:
+        raise RigError(f"sensor.defects has {list(outside[0])}, outside the {rows} x {columns} pixels")
     if sensor.black_level >= sensor.full_scale:
         raise RigError(f"sensor.black_level = {sensor.black_level:g} is not below the full scale, {sensor.full_scale}")
     return sensor
@@ -107,7 +110,22 @@ def _read_out(table: Table, known_field: tuple[float, float] | None) -> dict[str
         "black_level": table.number("black_level", 0.0, low=0.0),
         "counts_per_density": table.number("counts_per_density", above=0.0),
         "photoelectrons": table.number("photoelectrons", 0.0, low=0.0),
+        "defects": _defects(table),
+        "pedestal": table.choice("pedestal", ("known", "free")) if table.has("pedestal") else "known",
     }
+
+
+def _defects(table: Table) -> tuple[tuple[int, int], ...]:
+    """Read ``sensor.defects``, [row, column] of each defective pixel."""
+    if not table.has("defects") or table.get("defects") == []:
+        return ()
+    pairs = table.get("defects")
+    ok = isinstance(pairs, list) and all(
+        isinstance(each, list) and len(each) == 2 and all(type(k) is int and k >= 0 for k in each) for each in pairs
+    )
+    if not ok:
+        raise RigError("sensor.defects must be a list of [row, column], whole numbers from 0, one for each pixel")
+    return tuple(sorted({(row, column) for row, column in pairs}))
 
 
 def read_kernel(table: Table) -> Kernel:

@@ -100,8 +100,12 @@ def test_a_hot_pixel_of_a_film_that_nothing_is_followed_in(tmp_path):
     clean = np.array([each.pixels for each in simulate(rig, 12, seed=16)])
     hot = clean.copy()
     hot[:, 30, 31] += 5000
+    note = f"{NOTE}; with another film of this camera: sensor.defects = [[30, 31]]"
     paths = []
-    for name, counts, notes, masked in (("clean", clean, (), set()), ("hot", hot, (NOTE,), {(30, 31)})):
+    for name, counts, notes, masked in (
+        ("clean", clean, (), set()),
+        ("hot", hot, (note,), {(30, 31)}),
+    ):
         target = tmp_path / f"{name}.mcap"
         account = import_film(array_film(counts, name), rig, FilmSettings(), target)
         assert tuple(note for note in account.notes if "hot" in note) == notes

@@ -164,6 +164,9 @@ def test_hot_pixels_are_left_out_and_named() -> None:
     rig = camera(1000, 0.001)
     found = calibrate(rig, changed(shoot(rig, 1, ALL)[0], heat))
     assert found.hot_pixels == (7, 30)
+    text = calibrated_text(LIVELY.toml, LIVELY, found, ["dark a sha256:1"])
+    assert parse_rig(text).sensor.defects == ((0, 7), (0, 30))
+    assert calibrated_text(text, parse_rig(text), found, ["dark a sha256:1"]) == text
     assert_true(found, rig)
 
 

@@ -60,7 +60,8 @@ def _calibration_facts(result: Calibrated) -> list[str]:
             f" for {found.spot.freedom} degrees of freedom{verdict}"
         )
     if found.hot_pixels:
-        lines.append(f"hot or noisy pixels, left out: {', '.join(map(str, found.hot_pixels))}")
+        numbers = ", ".join(map(str, found.hot_pixels))
+        lines.append(f"hot or noisy pixels, left out, and written as sensor.defects: {numbers}")
     return lines
 
 

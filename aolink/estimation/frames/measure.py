@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from aolink.errors import EstimatorError
 from aolink.estimation.frames.centroid_noise import centroid_covariance
+from aolink.estimation.frames.flaws import has_flaws, without_flaws
 from aolink.estimation.frames.frame_data import FrameData, Measurement, Needs, Profile
 from aolink.estimation.frames.moments import least_significance, measure_moments, spot_significance
 from aolink.estimation.frames.spots import Profiles, measure_spots, moments_of_frames, profiles
@@ -39,23 +40,22 @@ class Measurements:
         self._axes = rig.plant.axes
         if needs is None or needs.what != "moments" or rig.plant.n_outputs > 1:
             return
+        given = [without_flaws(sensor, each, needs) for each in exposures] if has_flaws(sensor) else exposures
         shape = sensor.shape
         whole = [
             k
-            for k, each in enumerate(exposures)
+            for k, each in enumerate(given)
             if each.slopes is None and each.pixels.shape == shape == each.mask.shape and each.mask.all()
         ]
         if not whole:
             return
         if isinstance(sensor, SpotSensor):
             # One frame of many spots is not copied.
-            pixels = [exposures[k].pixels for k in whole]
+            pixels = [given[k].pixels for k in whole]
             frames = pixels[0][None] if len(pixels) == 1 else np.stack(pixels)
             good, moments = moments_of_frames(sensor, frames, needs, _least_significance(sensor))
         elif shape[0] == 1:
-            good, moments = _moments_of_lines(
-                sensor.profile, np.concatenate([exposures[k].pixels for k in whole]), needs
-            )
+            good, moments = _moments_of_lines(sensor.profile, np.concatenate([given[k].pixels for k in whole]), needs)
         else:
             return
         if moments is not None:
@@ -98,7 +98,10 @@ def measure(rig: Rig, exposure: Exposure, needs: Needs | None) -> MeasuredFrame:
         return None, ""
     if exposure.slopes is not None:
         return _measured_slopes(rig, exposure.frame_id, exposure.slopes, needs)
-    sensor, pixels = rig.sensor, exposure.pixels
+    sensor = rig.sensor
+    if has_flaws(sensor):
+        exposure = without_flaws(sensor, exposure, needs)
+    pixels = exposure.pixels
     if pixels.shape != sensor.shape:
         return None, f"the frame has {pixels.shape} pixels, the rig's sensor {sensor.shape}"
     if isinstance(sensor, SpotSensor):
