@@ -18,6 +18,8 @@ from aolink.wire.port import check_address
 
 DeviceKind = Literal["camera", "mirror"]
 KINDS: tuple[DeviceKind, ...] = get_args(DeviceKind)
+_GONE = {"basler": "aravis opens GigE and USB3 Vision cameras, micromanager those that Micro-Manager knows"}
+"""Drivers of earlier versions, and what opens their devices now."""
 NATIVE = "native"
 """The driver of devices that speak aolink's packets; its only key is ``port``."""
 
@@ -93,6 +95,8 @@ class Failure:
 def load_driver(kind: DeviceKind, name: str) -> Callable[..., Any]:
     """The class of a driver. Raises DeviceError where there is none of this name, or it cannot be loaded."""
     point = _others(kind).get(name)
+    if name in _GONE and point is None:
+        raise DeviceError(f"the {kind} driver {name} is no more: {_GONE[name]}")
     if point is None:
         raise DeviceError(
             f"there is no {kind} driver {name}, there is {', '.join(driver_names(kind))}: install the package that"

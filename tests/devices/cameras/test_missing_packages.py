@@ -20,7 +20,7 @@ main()
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("driver", "module"), [("basler", "pypylon"), ("opencv", "cv2")])
+@pytest.mark.parametrize(("driver", "module"), [("micromanager", "pymmcore"), ("opencv", "cv2")])
 def test_a_missing_library_is_named_with_what_to_install(driver: str, module: str, tmp_path: Path) -> None:
     (tmp_path / "my.toml").write_text(f'{load_rig("section-vi").toml}\n[devices.camera]\ndriver = "{driver}"\n')
     command = [sys.executable, "-c", WITHOUT.format(module=module), "record", "--rig", "my.toml", "-o", "a.mcap"]

@@ -1,0 +1,141 @@
+"""Any camera that Micro-Manager has a device adapter for, through pymmcore: what a laboratory already runs."""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, ClassVar
+
+from aolink.devices.cameras.pictures import FrameThread, ThreadCamera, as_counts, check_within, checked_corner
+from aolink.devices.simple import Lacks, SimpleFrame
+from aolink.errors import DeviceError
+from aolink.extensions import needs_extra
+from aolink.rig import Rig
+
+_LABEL = "Camera"
+"""Name of the camera in Micro-Manager's core where the rig file names its adapter."""
+_LOOK_S = 0.0005
+"""Time between two looks for a frame, s."""
+_PATH = "MICROMANAGER_PATH"
+
+
+class MicroManagerCamera(ThreadCamera):
+    """A camera that takes frames by itself, one every frame period, with the exposure time of the rig file.
+
+    Micro-Manager tells when a frame came to this machine, not when the camera took it.
+
+    Parameters
+    ----------
+    config:
+        A configuration file (.cfg) of Micro-Manager, whose camera is taken; or
+    adapter, device:
+        the names of the adapter and of its device, such as ``"DemoCamera"`` and ``"DCam"``.
+    folder:
+        The folder of the device adapters, that of the Micro-Manager installation; by default the environment's
+        ``MICROMANAGER_PATH``.
+    properties:
+        Properties of the camera by their names, set in this order: ``PixelType``, ``Gain``, a trigger, ...
+    corner:
+        Row and column of the chip at which the sensor begins.
+
+    Raises
+    ------
+    DeviceError
+        pymmcore is not installed, the adapter or its camera cannot be opened, or it cannot do what the rig file says.
+    """
+
+    lacks: ClassVar[tuple[Lacks, ...]] = (Lacks.TIME, Lacks.TRIGGER)
+
+    def __init__(
+        self, rig: Rig, *, config: str = "", adapter: str = "", device: str = "", folder: str = "",
+        properties: Mapping[str, bool | int | float | str] | None = None, corner: Sequence[int] = (0, 0),
+    ) -> None:  # fmt: skip
+        with needs_extra("micromanager", DeviceError):
+            import pymmcore
+        if bool(config) == bool(adapter and device):
+            raise DeviceError("devices.camera needs config (a .cfg file of Micro-Manager), or adapter and device")
+        self._rig, self._metadata = rig, pymmcore.Metadata
+        row, column = checked_corner(corner) or (0, 0)
+        self._core: Any = pymmcore.CMMCore()
+        self._name = f"Micro-Manager's {device or config}"
+        try:
+            if place := folder or os.environ.get(_PATH, ""):
+                self._core.setDeviceAdapterSearchPaths([place])
+            if config:
+                self._core.loadSystemConfiguration(str(rig.path_of(config, "devices.camera.config")))
+            else:
+                self._core.loadDevice(_LABEL, adapter, device)
+                self._core.initializeDevice(_LABEL)
+                self._core.setCameraDevice(_LABEL)
+            self._label = self._core.getCameraDevice()
+            for name, value in (properties or {}).items():
+                self._core.setProperty(self._label, name, int(value) if isinstance(value, bool) else value)
+            self._set_up(row, column)
+        except RuntimeError as error:
+            self._core.reset()
+            reason = " ".join(str(error).split())
+            raise DeviceError(f"{self._name} cannot be opened: {reason}; is {_PATH} its folder?") from None
+        except BaseException:
+            self._core.reset()
+            raise
+        version = self._core.getVersionInfo()
+        self.description = f"{self._name}, {version}, exposure {self._exposure_ns / 1e9:g} s"
+
+    def time_ns(self) -> None:
+        """Micro-Manager gives no time of the camera's."""
+
+    def start(self, start_ns: int, exposures: int) -> None:
+        """Take frames until stopped; those that begin before ``start_ns`` do not belong to the session."""
+        self.thread = FrameThread(self._read)
+
+    def close(self) -> None:
+        """Release the camera."""
+        super().close()
+        self._core.reset()
+
+    def _set_up(self, row: int, column: int) -> None:
+        core, sensor, timing = self._core, self._rig.sensor, self._rig.timing
+        height, width = sensor.shape
+        core.clearROI()
+        check_within((core.getImageHeight(), core.getImageWidth()), (height, width), (row, column), self._name)
+        core.setROI(column, row, width, height)
+        found = core.getImageHeight(), core.getImageWidth()
+        if found != (height, width):
+            raise DeviceError(f"{self._name} gives {found} pixels, the rig file's sensor has {(height, width)}")
+        if core.getNumberOfComponents() != 1 or core.getImageBitDepth() > sensor.bit_depth:
+            raise DeviceError(
+                f"{self._name} gives {core.getNumberOfComponents()} colour(s) of {core.getImageBitDepth()} bits, the"
+                f" rig file's sensor has one of {sensor.bit_depth}: set devices.camera.properties, such as PixelType"
+            )
+        wanted_ms = timing.exposure_steps * timing.fast_step_s * 1e3
+        core.setExposure(wanted_ms)
+        self._exposure_ns = round(core.getExposure() * 1e6)
+        if abs(core.getExposure() - wanted_ms) > timing.fast_step_s * 1e3:
+            raise DeviceError(f"{self._name} exposes for {core.getExposure():g} ms, the rig file says {wanted_ms:g} ms")
+
+    def _read(self, stopped: threading.Event) -> Iterator[SimpleFrame]:
+        core, timing = self._core, self._rig.timing
+        core.startContinuousSequenceAcquisition(timing.frame_period_steps * timing.fast_step_s * 1e3)
+        try:
+            while not stopped.is_set():
+                if core.isBufferOverflowed():
+                    raise DeviceError(f"{self._name} gave frames faster than they were taken: this machine is too slow")
+                if not core.getRemainingImageCount():
+                    if not core.isSequenceRunning():
+                        raise DeviceError(f"{self._name} takes no more frames: is it still connected?")
+                    stopped.wait(_LOOK_S)
+                    continue
+                arrived_ns, about = time.monotonic_ns(), self._metadata()
+                pixels = as_counts(core.popNextImageMD(about), self._name)
+                number = about.GetSingleTag("ImageNumber").GetValue() if about.HasTag("ImageNumber") else ""
+                yield SimpleFrame(
+                    pixels=pixels, exposure_ns=self._exposure_ns, arrived_ns=arrived_ns,
+                    number=int(number) if number.isdecimal() else None,
+                )  # fmt: skip
+        except RuntimeError as error:
+            raise DeviceError(f"{self._name} failed: {' '.join(str(error).split())}") from None
+        finally:
+            if core.isSequenceRunning():
+                core.stopSequenceAcquisition()
