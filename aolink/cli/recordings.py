@@ -24,6 +24,7 @@ CutTime = Annotated[float | None, typer.Option(metavar="S", help="Seconds from t
 def info(
     file: Annotated[str, typer.Argument(help="A recording: a file, or a URL.", metavar="FILE")],
     check: Annotated[bool, typer.Option("--check", help="Read every byte, not the index alone.")] = False,
+    every: Annotated[bool, typer.Option("--all", help="Print all facts.")] = False,
     log: Annotated[bool, typer.Option("--log", help="Print what the session said while it ran, line by line.")] = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -40,7 +41,7 @@ def info(
     if as_json:
         print(json.dumps(facts, allow_nan=False))
     else:
-        stdout.print(tables.facts(facts))
+        stdout.print(tables.facts(facts) if every else tables.summary(facts))
     if recording.damage:
         raise typer.Exit(1)
 

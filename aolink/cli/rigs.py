@@ -32,6 +32,7 @@ def rig(
     context: typer.Context,
     rig: RigArgument = "",
     check: Annotated[bool, typer.Option("--check", help="Check the rig file, print the findings, and end.")] = False,
+    listed: Annotated[bool, typer.Option("--list", help="List the rigs that come with aolink, and end.")] = False,
     exposure_scan: Annotated[
         bool, typer.Option("--exposure-scan", help="Print the error of o1 to expect at other exposure times, and end.")
     ] = False,
@@ -74,8 +75,12 @@ def rig(
     as_json: JsonOption = False,
 ) -> None:
     """Run a simulated rig: print its two ports and serve them until stopped (Ctrl-C)."""
-    from aolink.rig import load_rig, parse_light, with_faults
+    from aolink.rig import builtin_rigs, load_rig, parse_light, with_faults
 
+    if listed:
+        for name in builtin_rigs():
+            stdout.print(f"{name:<18}{load_rig(name).summary.split('. ')[0].rstrip('.')}.", markup=False)
+        return
     _check_goes_with(context, film)
     if film is not None:
         path = Path(rig or f"{film.stem}.toml")

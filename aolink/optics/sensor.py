@@ -16,6 +16,9 @@ import numpy as np
 
 from aolink.numerics.arrays import BoolArray, FloatArray, Indices
 
+KERNEL_WIDTHS = {"sigma": 1.0, "sd": math.sqrt(2.0), "fwhm": 1 / (2 * math.sqrt(math.log(2.0)))}
+"""How a kernel's width may be given, and the paper's sigma for one of it."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Kernel:

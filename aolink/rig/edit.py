@@ -11,6 +11,7 @@ from tomlkit.exceptions import TOMLKitError
 from tomlkit.items import InlineTable, Item, Key, Table
 
 from aolink.errors import RigError
+from aolink.optics.sensor import KERNEL_WIDTHS
 from aolink.rig.toml_table import did_you_mean
 
 
@@ -31,25 +32,36 @@ def with_value(text: str, key: str, value: Any, *, may_be_new: bool = False, com
     RigError
         The text is not TOML, or has no such key.
     """
-    *path, name = key.split(".")
+    path = key.split(".")[:-1]
 
     def edit(document: tomlkit.TOMLDocument) -> None:
         table: Any = document
         for part in path:
             table = _entry(table, part, key)
+        name, given = _as_given(table, key, value)
         new = may_be_new and isinstance(table, Mapping) and name not in table
         if new and (last := _last_value(table)) is not None:
             # tomlkit would put it behind comments that belong to the next table.
             end = "" if last.trivia.trail.endswith("\n") else "\n"
-            last.trivia.trail += f"{end}{last.trivia.indent}{name} = {tomlkit.item(value).as_string()}\n"
+            last.trivia.trail += f"{end}{last.trivia.indent}{name} = {tomlkit.item(given).as_string()}\n"
             return
         if not new:
             _entry(table, name, key)
-        table[name] = value
+        table[name] = given
         if comment:
             table[name].comment(comment)
 
     return _edited(text, edit)
+
+
+def _as_given(table: Any, key: str, value: Any) -> tuple[str, Any]:
+    """The name and the value of a key as the file has it: a kernel's width may be given as its sd or its fwhm."""
+    name = key.rpartition(".")[2]
+    if key.endswith("kernel.sigma") and isinstance(table, Mapping):
+        for other, factor in KERNEL_WIDTHS.items():
+            if other != name and other in table:
+                return other, float(f"{float(value) / factor:.9g}")
+    return name, value
 
 
 def with_table(text: str, name: str, values: Mapping[str, Any], comment: str) -> str:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from aolink.errors import RigError
-from aolink.optics.sensor import BaseSensor, Kernel, Sensor, SpotSensor
+from aolink.optics.sensor import KERNEL_WIDTHS, BaseSensor, Kernel, Sensor, SpotSensor
 from aolink.rig.toml_table import Table
 
 
@@ -131,6 +131,11 @@ def _defects(table: Table) -> tuple[tuple[int, int], ...]:
 def read_kernel(table: Table) -> Kernel:
     """Read a table ``kernel``. Raises `RigError`."""
     shape = table.choice("shape", ("gaussian",))
+    given = [name for name in KERNEL_WIDTHS if table.has(name)]
+    if len(given) > 1:
+        raise RigError(f"{table.key(given[0])} and {table.key(given[1])} both say how wide the kernel is: give one")
+    if given and given != ["sigma"]:
+        return Kernel(shape=shape, sigma=KERNEL_WIDTHS[given[0]] * table.number(given[0], above=0.0))
     if not isinstance(table.get("sigma"), list):
         return Kernel(shape=shape, sigma=table.number("sigma", above=0.0))
     width = table.matrix("sigma", (2, 2), "Sigma of the plane, or a number for a round kernel")

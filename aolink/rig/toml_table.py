@@ -21,10 +21,10 @@ A actuators amplitude axes B B_w bias_v bit_depth black_level black_level_sd blo
 clock_drift_ppm clock_offset_s coefficients control correlation_s counts_per_density counts_per_density_sd
 counts_per_intensity coupling dac_bits damping dark_frames defects delay_s delay_sd_s devices disturbance drift_s drive
 driver effort exposure_offset exposure_steps fall_back fast_step_s faults field flat_frames focal_length_m footprint_m
-frame_period_steps frequency frequency_hz gain gamma grid initial_covariance initial_mean input_max input_min kernel
-kernel_sigma_sd kernel_width kind latency_s layers leak least_light least_singular_value lenslets light max_v mirror
-model modes name noise_density noise_density_sd noise_sd obstruction offset outer_scale_m pad_radius_m park pedestal
-period_s photoelectrons photoelectrons_sd picture picture_pixels pitch_m pixel_scale pixels plant plant_noise
+fwhm frame_period_steps frequency frequency_hz gain gamma grid initial_covariance initial_mean input_max input_min
+kernel kernel_sigma_sd kernel_width kind latency_s layers leak least_light least_singular_value lenslets light max_v
+mirror model modes name noise_density noise_density_sd noise_sd obstruction offset outer_scale_m pad_radius_m park
+pedestal period_s photoelectrons photoelectrons_sd picture picture_pixels pitch_m pixel_scale pixels plant plant_noise
 process_noise pupil_m queue_steps r0_m radius_m rate_per_minute recorded resonance_hz scene sd seed sensor sensor_noise
 shape sigma simulation slew_max_per_s slope_unit_rad sources step_sd still_frames summary tension_n_per_m timing
 turbulence unmodelled vibration voltage wandering watchdog_s wavelength_m when_lost wind_m_s window zernike_m

@@ -139,7 +139,7 @@ def test_info_has_date_and_units_and_json_has_numbers(aolink: Run, tmp_path: Pat
     write_small(tmp_path / "s.mcap", 6)
     printed = aolink("info", "s.mcap").stdout
     assert "2023-11-14 22:13:20 UTC" in printed
-    assert " 1 s " in printed
+    assert "UTC, 1 s" in printed
     assert " kB " in printed
     facts = json.loads(aolink("info", "s.mcap", "--json").stdout)
     assert facts["start_ns"] == 1_700_000_000_000_000_000

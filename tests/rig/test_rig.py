@@ -15,7 +15,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from aolink.errors import RigError
+from aolink.optics.sensor import KERNEL_WIDTHS
 from aolink.rig import CalibrationTable, Faults, Wanders, builtin_rigs, load_rig, parse_rig, tables
+from aolink.rig.edit import with_value
 from aolink.rig.toml_table import KEYS, Table
 
 TEXT = load_rig("section-vi").toml
@@ -337,7 +339,7 @@ def test_numbers_and_nesting_beyond_what_can_be_read_are_refused(value: str) -> 
 
 def test_the_list_of_keys_is_that_of_the_keys_that_the_readers_ask_for() -> None:
     in_loops = {*Faults.__dataclass_fields__, *CalibrationTable.__dataclass_fields__, *get_args(Wanders)}
-    in_loops |= {"camera", "mirror"}
+    in_loops |= {"camera", "mirror", *KERNEL_WIDTHS}
     asked = in_loops
     readers = {name for name in vars(Table) if not name.startswith("_")} - {"key", "missing", "finish"}
     for path in Path(tables.__file__).parent.glob("*.py"):
@@ -428,3 +430,21 @@ def test_a_film_needs_no_mirror_in_its_rig_file():
     assert rig.drive.kind == "none"
     np.testing.assert_allclose(rig.mirror.input_max - rig.mirror.input_min, 0, atol=1e-8)
     assert (rig.mirror.park == 0).all()
+
+
+@pytest.mark.parametrize("width", [{"sd": 0.05}, {"fwhm": 0.05 * 2.354820045}, {"sigma": 0.05 * 2**0.5}])
+def test_a_kernels_width_may_be_given_in_three_ways(width: dict[str, float]) -> None:
+    ((name, value),) = width.items()
+    text = load_rig("section-vi").toml.replace("sigma = 0.05 ", f"{name} = {value:.12g} ", 1)
+    assert parse_rig(text).sensor.kernel.variance == pytest.approx(0.0025)
+    wider = parse_rig(with_value(text, "sensor.kernel.sigma", 0.1))
+    assert wider.sensor.kernel.sigma == pytest.approx(0.1)
+    assert f"\n{name} = " in wider.toml
+    with pytest.raises(RigError, match="both say how wide"):
+        parse_rig(text.replace(f"\n{name} = ", f"\n{'sd' if name == 'sigma' else 'sigma'} = 0.1\n{name} = ", 1))
+
+
+def test_the_rigs_that_come_along_are_listed(aolink: Callable[..., subprocess.CompletedProcess[str]]) -> None:
+    lines = " ".join(aolink("rig", "--list").stdout.split())
+    assert all(f"{name} " in lines for name in builtin_rigs())
+    assert "The paper's example" in lines

@@ -20,6 +20,52 @@ if TYPE_CHECKING:
     from aolink.recording.compare import TopicComparison
 
 
+_DEVICES = ("camera", "mirror")
+_ODD = (
+    "rearmed", "ports_vanished", "steps_parked", "steps_clipped", "chunks_refused", "blocks_retransmitted",
+    "cut", "part", "recorded_with", "estimated_from", "calibration",
+)  # fmt: skip
+"""Facts that a summary has where there are any."""
+
+
+def summary(values: Mapping[str, Any]) -> Table:
+    """What a session was, what was lost and what is odd, in some ten lines; `facts` has all."""
+    table = Table(box=None, show_header=False, pad_edge=False)
+    table.add_column(no_wrap=True)
+    table.add_column(overflow="fold")
+    session, gaps, counts = values["session"], values["gaps"], values["messages"]
+    begun = (values["start_utc"] or f"{values['start_ns']} ns since 1970").replace("T", " ").replace("+00:00", " UTC")
+    virtual = ", the rig's own time" if session.get("virtual_time") is True else ""
+    devices = [f"{kind} {session[kind]}" for kind in _DEVICES if session.get(kind)]
+    steps = ", ".join(f"{name.replace('_', ' ')} {count}" for name, count in values["commands"].items() if count)
+    losses = [f"{name.replace('_', ' ')} {count}" for name, count in values["losses"].items()]
+    if gaps["count"]:
+        losses.append(f"{gaps['count']} gaps between frames, the longest of {gaps['longest_steps']} fast steps")
+    odd = {name: session.get(name) for name in _ODD if session.get(name) not in (None, "", 0, "0")}
+    rows = {
+        "file": f"{values['file']}, {with_unit(values['bytes'], 'B')}",
+        "recorded": f"{begun}{virtual}, {duration(values['duration_s'])}",
+        "rig": str(session.get("rig", "not named")),
+        "devices": "; ".join(devices),
+        "lacks": "; ".join(f"{kind}: {session[f'{kind}_lacks']}" for kind in _DEVICES if session.get(f"{kind}_lacks")),
+        "exposures": f"{counts.get('/camera/image', 0)}{', with their truth' if values['truth'] else ''}",
+        "lost": ", ".join(losses) or "nothing",
+        "steps": steps,
+        "answers": "; ".join(Answers.of(values["answers"]).lines()),
+        "estimates": ", ".join(f"{name} {each['count']}" for name, each in values["estimates"].items()) or "none",
+        "unused": "\n".join(_unused(values["estimates"])),
+        "damage": values["damage"],
+        "odd": ", ".join(f"{name.replace('_', ' ')} {value}" for name, value in odd.items()),
+        "ended": "" if session.get("ended", "complete") == "complete" else str(session["ended"]),
+        "warnings": str(session.get("warnings") or ""),
+        "note": str(session.get("note") or ""),
+    }
+    for name, text in rows.items():
+        if text:
+            table.add_row(name, escape(text))
+    return table
+
+
 def facts(values: Mapping[str, Any]) -> Table:
     """Name and value, line by line, in the units that people read; `recording_facts` has the numbers."""
     table = Table(box=None, show_header=False, pad_edge=False)

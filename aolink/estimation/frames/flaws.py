@@ -8,14 +8,12 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from aolink.estimation.frames.frame_data import Needs
 from aolink.exposure import Exposure
 from aolink.numerics.arrays import BoolArray, FloatArray
 from aolink.optics.camera import effective_noise_density, is_saturated
 from aolink.optics.frame import spot_windows
-from aolink.optics.maxima import mended
 from aolink.optics.sensor import BaseSensor
 
 _LIT = 3.0
@@ -39,6 +37,8 @@ def without_flaws(sensor: BaseSensor, exposure: Exposure, needs: Needs) -> Expos
     summed, they are interpolated from the pixels about them. Where the pedestal is free, it is subtracted from each
     window.
     """
+    from aolink.optics.maxima import mended  # SciPy takes long to load, and few rigs need it here
+
     pixels: NDArray[Any] = exposure.pixels
     mask, defects = exposure.mask, sensor.defect_mask
     if pixels.shape != sensor.shape or exposure.slopes is not None:
@@ -66,6 +66,8 @@ def pedestals(sensor: BaseSensor, pixels: NDArray[np.uint16] | FloatArray, usabl
     The mean of the pixels that no light reaches: those that are neither brighter than that mean by `_LIT` standard
     deviations of the noise nor near one that is, from the darkest quarter on (sigma clipping).
     """
+    from scipy import ndimage
+
     counts, good = spot_windows(sensor, pixels.astype(np.float64)), spot_windows(sensor, usable)
     reach = math.ceil(_BESIDE * math.sqrt(sensor.kernel.variance) / sensor.pixel_width)
     beside = np.ones((1, min(2 * reach + 1, 2 * counts.shape[1] - 1), 2 * reach + 1), dtype=bool)
