@@ -6,6 +6,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from difflib import get_close_matches
 from functools import cache
 from importlib.metadata import EntryPoint, PackageNotFoundError, distribution, entry_points
 from typing import Any, Protocol, TypeVar
@@ -57,7 +58,10 @@ def row_named(name: str, ours: Mapping[str, Row], group: str, kind: str, error: 
     if name in ours:
         return ours[name]
     if (point := installed(group).get(name)) is None:
-        raise error(f"there is no {kind} {name!r}: use one of {', '.join(names_with(ours, group))}")
+        known = names_with(ours, group)
+        like = get_close_matches(name.lower(), known, 1)
+        meant = f"did you mean {like[0]}? There is" if like else "use one of"
+        raise error(f"there is no {kind} {name!r}: {meant} {', '.join(known)}")
     row, expected = loaded(point, kind, error), type(next(iter(ours.values())))
     if not isinstance(row, expected) or row.name != name:
         raise error(f"{described(point, kind)} is {row!r}, expected a row of this name, {expected.__name__}")

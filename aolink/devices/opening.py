@@ -19,7 +19,7 @@ from aolink.devices.native import NativeCamera, NativeMirror
 from aolink.devices.no_mirror import NoMirror
 from aolink.devices.paced import PacedMirror
 from aolink.devices.simple import DirectMirror, SimpleCamera, SimpleMirror
-from aolink.errors import AolinkError, DeviceError, RigError
+from aolink.errors import AolinkError, DeviceError, PortError, RigError
 from aolink.rig import Rig
 from aolink.rig.device_tables import Delay, DeviceTable
 from aolink.wire import messages_pb2 as pb
@@ -67,6 +67,9 @@ def open_devices(
             f"a native camera counts fast steps together with its own mirror, not with the driver"
             f" {tables['mirror'].driver}: use both native devices, or another driver for the camera"
         )
+    given = [each.options.get("port") for each in tables.values() if each.driver == NATIVE]
+    if len(given) == 2 and given[0] == given[1]:
+        raise PortError(f"camera and mirror are both at {given[0]}: each has a port of its own, give both")
     host = Host(stop)
     with ExitStack() as stack:
         stack.callback(host.close)

@@ -11,6 +11,7 @@ import hashlib
 import re
 import tomllib
 from dataclasses import dataclass
+from difflib import get_close_matches
 from importlib import resources
 from pathlib import Path
 
@@ -117,9 +118,11 @@ def load_rig(path_or_name: str | Path) -> Rig:
         except OSError as error:
             if path.name.removesuffix(".toml") in builtin_rigs() and path.parent == Path():
                 return load_rig(path.name.removesuffix(".toml"))
+            like = get_close_matches(path.name.removesuffix(".toml"), builtin_rigs(), 1)
+            meant = f"did you mean {like[0]}? Otherwise " if like else ""
             raise RigError(
                 f"cannot read the rig file {path}: {error.strerror};"
-                f" give a TOML file or one of: {', '.join(builtin_rigs())}"
+                f" {meant}give a TOML file or one of: {', '.join(builtin_rigs())}"
             ) from None
         except UnicodeDecodeError:
             raise RigError(f"{path} is not a rig file: it is not text") from None

@@ -62,6 +62,8 @@ def with_timing(rig, exposure_steps, frame_period_steps):
 
 
 def test_there_is_no_other_estimator(rig):
+    with pytest.raises(EstimatorError, match="no estimator 'momnts': did you mean moments"):
+        make_estimator(rig, "momnts")
     with pytest.raises(EstimatorError, match="no estimator 'o4': use one of open-loop, o1"):
         make_estimator(rig, "o4")
     with pytest.raises(EstimatorError, match="no option 'tuning'"):

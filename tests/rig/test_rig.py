@@ -444,6 +444,11 @@ def test_a_kernels_width_may_be_given_in_three_ways(width: dict[str, float]) -> 
         parse_rig(text.replace(f"\n{name} = ", f"\n{'sd' if name == 'sigma' else 'sigma'} = 0.1\n{name} = ", 1))
 
 
+def test_a_misspelt_rig_is_guessed() -> None:
+    with pytest.raises(RigError, match=r"did you mean section-vi\? "):
+        load_rig("sektion-vi")
+
+
 def test_the_rigs_that_come_along_are_listed(aolink: Callable[..., subprocess.CompletedProcess[str]]) -> None:
     lines = " ".join(aolink("rig", "--list").stdout.split())
     assert all(f"{name} " in lines for name in builtin_rigs())

@@ -88,11 +88,16 @@ def fake_device(answer: Callable[[Packet], bytes]) -> Iterator[str]:
 
 
 def test_a_port_that_is_not_there_is_refused(aolink: Run) -> None:
-    result = aolink(*record_arguments("/dev/nowhere", "/dev/nowhere"))
+    result = aolink(*record_arguments("/dev/nowhere", "/dev/nowhere-else"))
     assert_refused(result, 3, "there is no port /dev/nowhere: `aolink devices` lists those of this machine")
 
 
 @pytest.mark.slow
+def test_one_port_for_both_is_refused(aolink: Run) -> None:
+    result = aolink("record", "--camera", "/dev/ttyX", "--mirror", "/dev/ttyX", "--rig", "section-vi", "-o", "a.mcap")
+    assert_refused(result, 3, "camera and mirror are both at /dev/ttyX: each has a port of its own")
+
+
 def test_a_port_in_use_is_refused(aolink: Run) -> None:
     with simulated_rig("section-vi") as (camera, mirror):
         held = SerialPort(camera)
