@@ -450,7 +450,7 @@ def test_a_port_that_would_write_a_file_is_refused_before_it_does(aolink: Run, t
         "record": ["record", "--camera", os.ttyname(slave), "--mirror", port, "--rig", "section-vi", "-o", "a.mcap"],
         "rig file": ["record", "--camera", os.ttyname(slave), "--rig", "my.toml", "-o", "a.mcap"],
         "check": ["rig", "my.toml", "--check"],
-        "replay": ["replay", "old.mcap", "--to-rig", "--camera", port, "--mirror", port, "-o", "a.mcap"],
+        "replay": ["replay", "old.mcap", "--to-rig", "--camera", port, "--mirror", os.ttyname(slave), "-o", "a.mcap"],
     }[where]
     result = aolink(*command)
     os.close(master)
