@@ -3,7 +3,7 @@
 ROWS = {
     "estimation": (
         "o3_step", "update_forms", "frame_moments_and_o3", "frame_from_last_byte", "moments_of_many_axes",
-        "profile_of_many_axes", "profile_of_tip_tilt", "spots_under_turbulence",
+        "profile_of_many_axes", "profile_of_tip_tilt", "largest_sensor", "spots_under_turbulence",
         "membrane_in_real_time",
     ),
     "optics": (
