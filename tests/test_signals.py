@@ -235,7 +235,6 @@ def test_a_batch_ends_in_good_order_with_its_processes(tmp_path: Path, places: d
         started.assert_nothing_half_is_left()
         results = [*started.folder.glob("out/*.mcap")]
         assert 0 < len(results) < 200
-        assert {path.with_suffix(".json") for path in results} == {*started.folder.glob("out/*.json")}
 
 
 @pytest.mark.slow

@@ -15,7 +15,7 @@ from aolink.files import check_target, writing
 from aolink.signals import StopRequest
 
 if TYPE_CHECKING:
-    from aolink.jobs.batch import Done, Job, SideJob
+    from aolink.jobs.batch import Done, Job
     from aolink.jobs.unit import Model
 
 
@@ -36,8 +36,8 @@ def estimate(
             "--output",
             "-o",
             metavar="FILE|DIR/",
-            help="Write a copy with the new estimates beside those of other estimators; with many files or models, a"
-            " folder for the copies and their table.",
+            help="Write a copy with the new estimates beside those of other estimators; with many files or models, or"
+            " into a folder, side files: estimates alone, one file for each -e, and their table.",
         ),
     ] = None,
     rig: Annotated[
@@ -53,87 +53,69 @@ def estimate(
     ] = Engine.AOLINK,
     only: Annotated[bool, typer.Option("--only", help="Leave the recording's own estimates out of the copy.")] = False,
     jobs: Annotated[int, typer.Option(min=1, help="How many recordings to estimate at once.")] = 1,
-    parquet: Annotated[bool, typer.Option("--parquet", help="Write the table as Parquet, not as CSV.")] = False,
-    side: Annotated[
-        bool,
-        typer.Option("--side", help="Write side files into DIR: estimates alone, one file for each -e, no copies."),
-    ] = False,
+    side: Annotated[bool, typer.Option("--side", hidden=True)] = False,
+    parquet: Annotated[bool, typer.Option("--parquet", hidden=True)] = False,
     table: Annotated[
         Path | None,
         typer.Option(
             metavar="X.parquet",
-            help="With --side: the table of the recordings, and X.exposures.parquet with a row for each exposure.",
+            help="With a folder: the table of the recordings, and X.exposures.parquet with a row for each exposure.",
         ),
     ] = None,
     shard: Annotated[
-        str | None, typer.Option(metavar="I/N", help="With --side: part I of N of the recordings, for a job array.")
+        str | None, typer.Option(metavar="I/N", help="With a folder: part I of N of the recordings, for a job array.")
     ] = None,
     scheduler: Annotated[
-        str | None, typer.Option(metavar="ADDRESS", help="With --side: on the workers of this Dask scheduler.")
+        str | None, typer.Option(metavar="ADDRESS", help="With a folder: on the workers of this Dask scheduler.")
     ] = None,
     overwrite: OverwriteOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """Estimate the motion inside each exposure of recordings, again or for the first time.
 
-    Without -e it runs the estimators that the recording has estimates of, or moments.
+    Without -e it runs the estimators that one recording has estimates of, or moments; with many files, moments.
     With many files or models it skips work that was done before and has not changed.
     A file that fails does not stop the others (exit code 1). Exit code 6 if no exposure gave a measurement.
     """
     output, is_folder = (Path(target), target.endswith("/") or Path(target).is_dir()) if target else (None, False)
-    if side and (output is None or only or parquet):
-        raise typer.BadParameter("--side needs -o DIR, and goes with --table X.parquet, not with --only or --parquet")
-    if not side and (table or shard or scheduler):
-        raise typer.BadParameter("--table, --shard and --scheduler are for side files: give --side too")
+    if parquet:
+        raise typer.BadParameter("--table X.parquet writes the table as Parquet")
     if scheduler and jobs > 1:
         raise typer.BadParameter("--jobs is for this machine: with --scheduler its workers do the work")
     if only and output is None:
         raise typer.BadParameter("--only is for the copy that -o writes: give -o too")
     _check_names(estimator or [])
     models = batch_models(rig, settings)
-    if not side and len(files) == 1 and len(models) == 1 and not is_folder:
-        if parquet or jobs > 1:
-            raise typer.BadParameter("--parquet and --jobs are for many files or models, with -o DIR/")
+    if not (side or is_folder or table or shard or scheduler) and len(files) == 1 and len(models) == 1:
+        if jobs > 1:
+            raise typer.BadParameter("--jobs is for many files or models, with -o DIR/")
         _estimate_one(
             files[0], models[0], estimator, output, engine, only=only, overwrite=overwrite, as_json=as_json
         )  # fmt: skip
         return
     if output is None or (output.suffix == ".mcap" and not is_folder and not side):
         raise typer.BadParameter("many files or models need -o DIR: a folder for the results")
+    if only:
+        raise typer.BadParameter("--only is for the copy of one recording: side files have the new estimates alone")
     from aolink.estimation.registry import DEFAULT_ESTIMATOR
     from aolink.jobs import batch
     from aolink.jobs.tables import parquet as load_parquet
-    from aolink.recording.remote import location
 
-    if side:
-        if table is not None:
-            if table.suffix.lower() == ".parquet":  # any other name is refused, and needs no folder
-                _make_folder(table.parent)
-            check_target(table, overwrite=True, suffix=".parquet")
-            load_parquet()
-        sources = batch.shard(files, shard) if shard else files
-        if scheduler:  # the workers run in other folders
-            sources, output = [batch.absolute(each) for each in sources], output.absolute()
-        todo: Sequence[Job | SideJob] = batch.side_jobs(
-            sources,
-            models,
-            estimator or [DEFAULT_ESTIMATOR],
-            output,
-            engine.value,
-            table=table is not None,
-            overwrite=overwrite,
-        )
-        part = f"-{shard.replace('/', '-of-')}" if shard else ""
-        results = table.with_stem(table.stem + part) if table else output / f"results{part}.csv"
-        _estimate_many(todo, output, results, jobs, scheduler, side=True, overwrite=overwrite, as_json=as_json)
-        return
-    if urls := [each for each in map(location, files) if not isinstance(each, Path)]:
-        raise typer.BadParameter(f"{urls[0]} is a URL: of many recordings behind URLs --side makes side files")
+    if table is not None:
+        if table.suffix.lower() == ".parquet":  # any other name is refused, and needs no folder
+            _make_folder(table.parent)
+        check_target(table, overwrite=True, suffix=".parquet")
+        load_parquet()
+    sources = batch.shard(files, shard) if shard else files
+    if scheduler:  # the workers run in other folders
+        sources, output = [batch.absolute(each) for each in sources], output.absolute()
     todo = batch.jobs(
-        [*map(Path, files)], models, estimator or [], output, engine.value, only=only, overwrite=overwrite
+        sources, models, estimator or [DEFAULT_ESTIMATOR], output, engine.value,
+        table=table is not None, overwrite=overwrite,
     )  # fmt: skip
-    name = "results.parquet" if parquet else "results.csv"
-    _estimate_many(todo, output, output / name, jobs, None, side=False, overwrite=overwrite, as_json=as_json)
+    part = f"-{shard.replace('/', '-of-')}" if shard else ""
+    results = table.with_stem(table.stem + part) if table else output / f"results{part}.csv"
+    _estimate_many(todo, output, results, jobs, scheduler, overwrite=overwrite, as_json=as_json)
 
 
 def batch_models(rig: str | None, settings: Sequence[str] | None) -> "list[Model]":
@@ -155,14 +137,14 @@ def _check_names(estimators: Sequence[str]) -> None:
 
 
 def _estimate_many(
-    todo: "Sequence[Job | SideJob]", folder: Path, table: Path, workers: int, scheduler: str | None, *, side: bool,
-    overwrite: bool, as_json: bool,
+    todo: "Sequence[Job]", folder: Path, table: Path, workers: int, scheduler: str | None, *, overwrite: bool,
+    as_json: bool,
 ) -> None:  # fmt: skip
     from aolink.cli.tables import recordings as tables
     from aolink.jobs import batch
     from aolink.jobs.tables import check_table, fill_table, join_tables, table_beside
 
-    of_exposures = table.with_suffix(".exposures.parquet") if side and table.suffix == ".parquet" else None
+    of_exposures = table.with_suffix(".exposures.parquet") if table.suffix == ".parquet" else None
     places = [table]
     if of_exposures is not None:
         places += [of_exposures, *(table_beside(job.output) for job in todo)]
@@ -179,7 +161,7 @@ def _estimate_many(
                 done = _printed(run_on(scheduler, todo, stop=stop, progress=tell))
             else:
                 done = _printed(batch.run_here(todo, workers, stop=stop, progress=tell))
-        rows = batch.table_rows(done, None if side else folder)
+        rows = batch.table_rows(done)
         fill_table(partial, rows, table.suffix)
         if of_exposures is not None:
             parts = [table_beside(each.job.output) for each in done if not each.error]
@@ -187,10 +169,10 @@ def _estimate_many(
     if as_json:
         print(json.dumps(rows, allow_nan=False))
     else:
-        if not side or len(rows) <= _MOST_ROWS_SHOWN:
+        if len(rows) <= _MOST_ROWS_SHOWN:
             stdout.print(tables.batch(rows))
-        if not side:
-            _draw(rows, folder / "results.png")
+            if any(row["estimator"] for row in rows):
+                _draw(rows, folder / "results.png")
         failed, skipped = sum(bool(each.error) for each in done), sum(each.skipped for each in done)
         text = f"{len(done)} of {len(todo)} done, {skipped} of them before, {failed} failed; table: {table}"
         stdout.print(text, markup=False)
@@ -216,7 +198,7 @@ def _printed(each_done: "Iterable[Done]") -> "list[Done]":
     done = []
     for each in each_done:
         done.append(each)
-        of = f"{each.job.source} {each.job.model.name}".strip()
+        of = f"{each.job.source} {each.job.settings.model.name}".strip()
         if each.error:
             stderr.print(f"aolink: {of}: {each.error}", markup=False)
         for warning in each.warnings:

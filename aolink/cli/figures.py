@@ -65,7 +65,10 @@ def plot(
     stdout.print(f"written: {output}", markup=False)
 
 
-@app.command(epilog="Example: aolink report session.mcap -o report.html  |  aolink report results/ -o batch.html")
+@app.command(
+    epilog="Example: aolink report session.mcap -o report.html"
+    "  |  aolink report session.mcap results/session.o3.mcap -o report.html"
+)
 def report(
     files: Annotated[
         list[str], typer.Argument(metavar="FILE...", help="Recordings, folders of them, and their side files.")

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from aolink.errors import AolinkError
 from aolink.exporting.common import Progress, no_progress
 from aolink.extensions import install_command
-from aolink.jobs.batch import Done, Job, SideJob, do
+from aolink.jobs.batch import Done, Job, do
 from aolink.jobs.unit import aolink_version
 
 if TYPE_CHECKING:
@@ -24,7 +24,7 @@ _POLL_S = 0.02
 
 
 def run_on(
-    address: str, todo: Sequence[Job | SideJob], *, stop: Callable[[], bool] = lambda: False,
+    address: str, todo: Sequence[Job], *, stop: Callable[[], bool] = lambda: False,
     progress: Progress = no_progress,
 ) -> Iterator[Done]:  # fmt: skip
     """Do jobs on the workers of a scheduler; gives each when it is done, in no order. A failed one stops no other.
@@ -60,17 +60,19 @@ def run_on(
                     )
                 job = jobs.pop(future.key)
                 error = future.exception()
-                yield Done(job, [], _in_words(error)) if error else future.result()
+                yield Done(job, error=_in_words(error)) if error else future.result()
                 progress(len(todo) - len(jobs))
             if not some:
                 time.sleep(_POLL_S)
 
 
-def _on_worker(job: Job | SideJob, version: str) -> Done:
+def _on_worker(job: Job, version: str) -> Done:
     """Do a job on a worker. The version of aolink is checked here, because a worker that joined late was not asked
     before."""
     if aolink_version() != version:
-        return Done(job, [], f"a worker has aolink {aolink_version()}, this is {version}: install the same everywhere")
+        return Done(
+            job, error=f"a worker has aolink {aolink_version()}, this is {version}: install the same everywhere"
+        )
     return do(job)
 
 

@@ -117,8 +117,7 @@ def check_table(path: Path) -> None:
         found = []
     if not {*_KEYS} <= {*found}:
         raise RecordingError(
-            f"{path} exists and is no table of a batch: give another folder or, with --side, another --table;"
-            " --overwrite replaces it"
+            f"{path} exists and is no table of a batch: give another folder or another --table; --overwrite replaces it"
         )
 
 

@@ -28,6 +28,7 @@ from aolink.recording.reader import Recording
 from aolink.recording.reestimate import check_has_exposures
 from aolink.rig import parse_rig
 from aolink.rig.edit import with_value
+from aolink.series import Step
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -168,16 +169,16 @@ def exposure_row(time_ns: int, exposure: Exposure, estimate: Estimate) -> dict[s
 
 
 def _estimates(recording: Recording, settings: Settings) -> Iterator[tuple[int, Exposure, Estimate]]:
-    times: deque[int] = deque()
+    waiting: deque[Step] = deque()
 
     def exposures() -> Iterator[Exposure]:
-        for time_ns, exposure in recording.timed_exposures():
-            times.append(time_ns)
-            yield exposure
+        for step in recording.steps():
+            waiting.append(step)
+            yield step.exposure
 
     try:
         for exposure, (estimate,) in Driver(recording.rig, [settings.estimator], settings.engine).steps(exposures()):
-            yield times.popleft(), exposure, estimate
+            yield waiting.popleft().time_ns, exposure, estimate
     except (ArithmeticError, ValueError) as error:
         if settings.model == Model():
             raise

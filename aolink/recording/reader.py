@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 
 from aolink.errors import RecordingError, RigError
 from aolink.estimation import ExposureModel, exposure_model
-from aolink.exposure import Exposure
 from aolink.limits import load_array
 from aolink.recording import convert, schemas_pb2, topics
 from aolink.recording.exposures import ASSEMBLED, BESIDE, Walk
@@ -192,10 +191,6 @@ class Recording(RecordedMessages, Series):
     def facts(self) -> dict[str, str]:
         """The summary of the recording, in words."""
         return super().facts() | ({"damage": self.damage} if self.damage else {})
-
-    def timed_exposures(self) -> Iterator[tuple[int, Exposure]]:
-        """The exposures, each after the log time of the message that completed it, ns."""
-        return ((step.time_ns, step.exposure) for step in self.steps())
 
     def steps(
         self, names: Sequence[str] = (), start: int = 0, stop: int | None = None, *, also: Also = NOTHING

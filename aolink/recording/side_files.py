@@ -10,7 +10,7 @@ def check_is_side_of(side: RecordedMessages, recording: RecordedMessages) -> Non
     """Raise RecordingError where a file does not hold estimates of a recording and nothing else."""
     if not side.side_of:
         raise RecordingError(
-            f"{side.path} is a recording of its own and no side file of {recording.path}: `aolink estimate --side`"
+            f"{side.path} is a recording of its own and no side file of {recording.path}: `aolink estimate -o DIR/`"
             " writes those"
         )
     if side.side_of != recording.digest:

@@ -91,7 +91,7 @@ def test_a_worker_is_killed_and_nothing_is_lost_or_doubled(cluster: Cluster, tmp
     bad = tmp_path / "bad.mcap"
     bad.write_bytes(b"nonsense, and a good deal of it")
     (tmp_path / "out").mkdir()
-    todo = batch.side_jobs([*sources, str(bad)], batch.models(None, []), ["o3"], tmp_path / "out")
+    todo = batch.jobs([*sources, str(bad)], batch.models(None, []), ["o3"], tmp_path / "out")
     done: list[batch.Done] = []
     with ExitStack() as stack:
         workers = [stack.enter_context(cluster.worker(name)) for name in ("one", "two")]
@@ -103,11 +103,11 @@ def test_a_worker_is_killed_and_nothing_is_lost_or_doubled(cluster: Cluster, tmp
         assert workers[0].wait() == -9
     assert sorted(each.job.output for each in done) == sorted(job.output for job in todo)
     assert [each.job.source for each in done if each.error] == [str(bad)]
-    rows = {row["recording"]: row["exposures"] for each in done for row in each.rows}
+    rows = {each.row["recording"]: each.row["exposures"] for each in done if each.row}
     assert rows == {source: 100 + k for k, source in enumerate(sources)}
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [f"{k}.o3.mcap" for k in range(10)]
     (alone := tmp_path / "alone").mkdir()
-    for job in batch.side_jobs(sources[:2], batch.models(None, []), ["o3"], alone):
+    for job in batch.jobs(sources[:2], batch.models(None, []), ["o3"], alone):
         assert not batch.do(job).error
         there = Recording(tmp_path / "out" / job.output.name)
         assert [m.data for m in there.raw_messages()] == [m.data for m in Recording(job.output).raw_messages()]

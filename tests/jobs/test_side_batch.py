@@ -40,10 +40,9 @@ def test_a_part_that_makes_no_sense(part: str) -> None:
 
 def test_thousands_of_names_are_no_matter_and_two_that_are_one_are_refused() -> None:
     sources = [f"{k}.mcap" for k in range(10_000)]
-    assert len(batch.side_jobs(sources, batch.models(None, []), ["o3"], Path("out"))) == 10_000
-    assert len(batch.jobs([*map(Path, sources)], batch.models(None, []), ["o3"], Path("out"))) == 10_000
+    assert len(batch.jobs(sources, batch.models(None, []), ["o3"], Path("out"))) == 10_000
     with pytest.raises(RigError, match=r"two recordings would be written as s\.o3\.mcap"):
-        batch.side_jobs(["a/s.mcap", "b/s.mcap"], batch.models(None, []), ["o3"], Path("out"))
+        batch.jobs(["a/s.mcap", "b/s.mcap"], batch.models(None, []), ["o3"], Path("out"))
 
 
 @pytest.mark.slow
@@ -51,7 +50,7 @@ def test_the_command_in_parts_and_then_as_a_whole(aolink: Run, tmp_path: Path) -
     """A part has its own table; the run over all finds everything done, and gives the tables of all."""
     names = [write_small(tmp_path / f"s{k}.mcap", 3 + k).name for k in range(5)]
     (tmp_path / "bad.mcap").write_bytes(b"nonsense, and a good deal of it")
-    every = ("estimate", *names, "bad.mcap", "-e", "o3", "-e", "o1", "--side", "-o", "out")
+    every = ("estimate", *names, "bad.mcap", "-e", "o3", "-e", "o1", "-o", "out/")
     for part in ("1/2", "2/2"):
         result = aolink(*every, "--shard", part, "--jobs", "2")
         assert result.returncode == (1 if part == "1/2" else 0), result.stderr
@@ -74,7 +73,7 @@ def test_the_command_in_parts_and_then_as_a_whole(aolink: Run, tmp_path: Path) -
 def test_parts_with_a_table_of_a_name_have_one_each(aolink: Run, tmp_path: Path) -> None:
     names = [write_small(tmp_path / f"s{k}.mcap", 2).name for k in range(2)]
     for part in ("1/2", "2/2"):
-        done = aolink("estimate", *names, "-e", "o1", "--side", "-o", "out", "--shard", part, "--table", "all.parquet")
+        done = aolink("estimate", *names, "-e", "o1", "-o", "out/", "--shard", part, "--table", "all.parquet")
         assert done.returncode == 0, done.stderr
     tables = [pq.read_table(tmp_path / f"all-{k}-of-2.parquet").to_pylist() for k in (1, 2)]
     assert sorted(row["recording"] for table in tables for row in table) == names
@@ -85,13 +84,13 @@ def test_parts_with_a_table_of_a_name_have_one_each(aolink: Run, tmp_path: Path)
 def test_the_folder_of_the_table_is_made(aolink: Run, tmp_path: Path) -> None:
     """As that of the side files is, which may be the same; where it cannot be made, nothing is done."""
     write_small(tmp_path / "s.mcap", 2)
-    every = ("estimate", "s.mcap", "-e", "o1", "--side", "-o", "out", "--table")
+    every = ("estimate", "s.mcap", "-e", "o1", "-o", "out/", "--table")
     for table in ("out/all.parquet", "other/deep/all.parquet"):
         done = aolink(*every, table)
         assert done.returncode == 0, done.stderr
         assert [row["recording"] for row in pq.read_table(tmp_path / table).to_pylist()] == ["s.mcap"]
         assert (tmp_path / table).with_name("all.exposures.parquet").exists()
-    done = aolink("estimate", "s.mcap", "-e", "o1", "--side", "-o", "none", "--table", "s.mcap/all.parquet")
+    done = aolink("estimate", "s.mcap", "-e", "o1", "-o", "none/", "--table", "s.mcap/all.parquet")
     assert done.stderr.splitlines() == ["aolink: cannot make the folder s.mcap: file exists"]
     assert not (tmp_path / "none").exists()
 
@@ -102,7 +101,7 @@ def test_both_tables_in_parquet(aolink: Run, tmp_path: Path) -> None:
     names = [write_small(tmp_path / f"s{k}.mcap", 3 + k).name for k in range(2)]
     (tmp_path / "bad.mcap").write_bytes(b"nonsense, and a good deal of it")
     result = aolink(
-        "estimate", *names, "bad.mcap", "-e", "o3", "--set", "plant.process_noise=5,10", "--side", "-o", "out",
+        "estimate", *names, "bad.mcap", "-e", "o3", "--set", "plant.process_noise=5,10", "-o", "out/",
         "--table", "all.parquet",
     )  # fmt: skip
     assert result.returncode == 1
@@ -123,7 +122,7 @@ def test_a_part_that_is_started_twice_is_one_clear_line(aolink: Run, tmp_path: P
     """The table is held while its part is worked on."""
     write_small(tmp_path / "a.mcap", 3)
     (tmp_path / "out").mkdir()
-    arguments = ("estimate", "a.mcap", "--side", "-o", "out", "--shard", "1/3")
+    arguments = ("estimate", "a.mcap", "-o", "out/", "--shard", "1/3")
     with writing(tmp_path / "out" / "results-1-of-3.csv"):
         second = aolink(*arguments)
         assert second.returncode == 1
@@ -137,10 +136,9 @@ def test_a_part_that_is_started_twice_is_one_clear_line(aolink: Run, tmp_path: P
 @pytest.mark.parametrize(
     ("name", "arguments"),
     [
-        ("t.parquet", ["--side", "--table", "t.parquet"]),
-        ("t.exposures.parquet", ["--side", "--table", "t.parquet"]),
-        ("out/a.o1.parquet", ["--side", "--table", "t.parquet"]),
-        ("out/results.csv", ["--side"]),
+        ("t.parquet", ["--table", "t.parquet"]),
+        ("t.exposures.parquet", ["--table", "t.parquet"]),
+        ("out/a.o1.parquet", ["--table", "t.parquet"]),
         ("out/results.csv", []),
     ],
 )
@@ -150,7 +148,9 @@ def test_a_table_takes_the_place_of_a_table_only(aolink: Run, tmp_path: Path, na
     (tmp_path / name).write_text("name,mass\nmine,3\n")
     command = ("estimate", "a.mcap", "-e", "o1", *arguments, "-o", "out/")
     refused = aolink(*command)
-    assert refused.stderr.startswith(f"aolink: {name} exists and is no table of a batch: give another folder or, ")
+    assert refused.stderr.startswith(
+        f"aolink: {name} exists and is no table of a batch: give another folder or another --table"
+    )
     assert refused.stderr.count("\n") == 1
     assert (tmp_path / name).read_text() == "name,mass\nmine,3\n"
     assert not [*(tmp_path / "out").glob("*.mcap")]
@@ -162,14 +162,13 @@ def test_a_table_takes_the_place_of_a_table_only(aolink: Run, tmp_path: Path, na
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--side"], "--side needs -o DIR"),
-        (["--side", "-o", "out", "--only"], "not with --only or --parquet"),
-        (["--shard", "1/2", "-o", "out"], "are for side files: give --side too"),
-        (["--table", "t.parquet", "-o", "out"], "are for side files: give --side too"),
-        (["--side", "-o", "out", "--table", "t.csv"], "give a name that ends with .parquet"),
-        (["--side", "-o", "out", "--shard", "3/2"], "I/N is needed"),
-        (["--side", "-o", "out", "--scheduler", "tcp://127.0.0.1:1", "--jobs", "2"], "--jobs is for this machine"),
-        (["--side", "-o", "out", "-e", "o1", "-e", "o9"], "there is no estimator 'o9'"),
+        (["--shard", "1/2"], "need -o DIR"),
+        (["-o", "out/", "--only"], "--only is for the copy of one recording"),
+        (["-o", "out/", "--parquet"], "--table X.parquet writes the table as Parquet"),
+        (["-o", "out/", "--table", "t.csv"], "give a name that ends with .parquet"),
+        (["-o", "out/", "--shard", "3/2"], "I/N is needed"),
+        (["-o", "out/", "--scheduler", "tcp://127.0.0.1:1", "--jobs", "2"], "--jobs is for this machine"),
+        (["-o", "out/", "-e", "o1", "-e", "o9"], "there is no estimator 'o9'"),
     ],
 )
 def test_options_that_do_not_go_together(aolink: Run, tmp_path: Path, arguments: list[str], message: str) -> None:

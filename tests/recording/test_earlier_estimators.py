@@ -9,7 +9,6 @@ import pytest
 
 from aolink.colours import by_rank, estimator_colour
 from aolink.errors import EstimatorError
-from aolink.jobs.batch import do, jobs, models
 from aolink.recording.reader import Recording
 
 Run = Callable[..., "subprocess.CompletedProcess[str]"]
@@ -43,12 +42,10 @@ def test_a_command_that_takes_its_estimators_leaves_that_one_out_and_says_so(aol
 
 
 @pytest.mark.slow
-def test_a_comparison_with_itself_and_a_batch_do_so_too(aolink: Run, tmp_path: Path) -> None:
+def test_a_comparison_with_itself_does_so_too(aolink: Run) -> None:
     compared = aolink("compare", OLD, "--json")
     assert LINE in compared.stderr.replace("\n", " ")
     assert json.loads(compared.stdout)
-    (job,) = jobs([OLD], models(None, []), [], tmp_path)
-    assert do(job).warnings == [LINE]
 
 
 def test_it_is_refused_by_name(aolink: Run) -> None:

@@ -67,7 +67,7 @@ def test_a_recording_without_estimates_gets_the_default_ones(aolink: Run, tmp_pa
     for command in ("estimate", "replay"):
         found = json.loads(aolink(command, "s.mcap", "--json").stdout)
         assert found.keys() - {"differs_from_recorded"} == {"moments"}
-    assert aolink("estimate", "s.mcap", "--side", "-o", "out").returncode == 0
+    assert aolink("estimate", "s.mcap", "-o", "out/").returncode == 0
     assert [each.name for each in (tmp_path / "out").glob("*.mcap")] == ["s.moments.mcap"]
     assert aolink("estimate", "s.mcap", "-e", "o1", "-o", "with.mcap").returncode == 0
     again = json.loads(aolink("estimate", "with.mcap", "--json").stdout)

@@ -141,7 +141,7 @@ def test_what_is_not_there_is_one_clear_error(
 def test_side_files_are_drawn_and_reported(aolink: Aolink, tmp_path: Path) -> None:
     needed("matplotlib")
     shutil.copy(LIVELY, tmp_path / "a.mcap")
-    assert aolink("estimate", "a.mcap", "-e", "o1", "--side", "-o", "sides").returncode == 0
+    assert aolink("estimate", "a.mcap", "-e", "o1", "-o", "sides/").returncode == 0
     (side,) = (tmp_path / "sides").glob("*.mcap")
     assert aolink("plot", "a.mcap", "nis", "--side", side, "-o", "a.png").returncode == 0
     assert aolink("report", "a.mcap", side, "-o", "a.html").returncode == 0

@@ -181,10 +181,7 @@ def cluster_workers(effort: Effort) -> Row:
             record_long(folder / f"{k}.mcap", effort.of(600, 5))
         sources = [str(folder / f"{k}.mcap") for k in range(8)]
         (folder / "out").mkdir()
-        todo = [
-            batch.SideJob(each.source, each.output, Settings(estimator="moments", overwrite=True))
-            for each in batch.side_jobs(sources, batch.models(None, []), ["moments"], folder / "out")
-        ]
+        todo = batch.jobs(sources, batch.models(None, []), ["moments"], folder / "out", overwrite=True)
 
         def cluster(count: int) -> str:
             options, file = ["--host", "127.0.0.1", "--no-dashboard"], folder / f"scheduler-{count}.json"
@@ -204,7 +201,7 @@ def cluster_workers(effort: Effort) -> Row:
             """Time that the workers were busy, s."""
             done = list(run_on(address, some))
             assert not any(each.error for each in done)
-            return math.fsum(row["seconds"] for each in done for row in each.rows)
+            return math.fsum(each.row["seconds"] for each in done)
 
         def plain(pool: ProcessPoolExecutor, some: Sequence[Any] = todo) -> None:
             assert not any(each.error for each in pool.map(batch.do, some))

@@ -303,7 +303,7 @@ def batch_workers(effort: Effort) -> Row:
         def work(jobs: int) -> float:
             target = folder / f"on-{jobs}-{time.monotonic_ns()}"
             target.mkdir()
-            todo = batch.jobs(sources, batch.models(None, []), ["moments"], target)
+            todo = batch.jobs([*map(str, sources)], batch.models(None, []), ["moments"], target)
             start = time.perf_counter()
             assert not any(each.error for each in batch.run_here(todo, jobs))
             return time.perf_counter() - start
