@@ -85,6 +85,7 @@ def identify(recordings: Sequence[Recording], rig: Rig | None, wanted: Wanted, t
     for name in wanted.models:
         kinds_of(name)
     first = rig or recordings[0].rig
+    _check_plant(first, wanted)
     plant_known = wanted.plant is None
     seen: list[Readings] = []
     longest: list[Exposure] = []
@@ -107,14 +108,22 @@ def from_readings(
     rig: Rig, seen: Sequence[Readings], exposures: Sequence[Exposure], wanted: Wanted, tell: Tell | None = None,
 ) -> Result:  # fmt: skip
     """Identify models as `identify` does, from the readings of each recording, and the exposures of one."""
+    _check_plant(rig, wanted)
     found = [_of_output(rig, label, each, exposures, wanted, tell) for label, each in _by_output(rig, seen)]
     one = found[0]
-    if wanted.plant and len(found) > 1:
-        raise IdentificationError("a plant is identified where one input moves one output of a copy of it")
     text = identification.identified_text(
         rig.toml, rig, [each.model for each in found], plant=one.plant, noise=one.noise, wider=one.wider
     )
     return Result(found=tuple(found), text=text)
+
+
+def _check_plant(rig: Rig, wanted: Wanted) -> None:
+    """Raise IdentificationError for a rig whose plant cannot be identified, before any work."""
+    if wanted.plant and 1 < rig.plant.n_outputs <= _APART:
+        raise IdentificationError(
+            f"a plant is identified where one input moves one output of a copy of it: this rig's has"
+            f" {rig.plant.n_inputs} inputs and {rig.plant.n_outputs} outputs; without --plant a disturbance is identified"
+        )
 
 
 def _by_output(rig: Rig, seen: Sequence[Readings]) -> list[tuple[str, list[Readings]]]:

@@ -1,11 +1,15 @@
 """The job of `aolink identify`, from exposures to a model and its sets."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 import aolink
+from aolink.errors import IdentificationError
 from aolink.identification import Process, ProcessSum, identified_text, readings
-from aolink.jobs.identify import Wanted, from_readings
+from aolink.jobs.identify import Wanted, from_readings, identify
+from aolink.recording.reader import Recording
 from aolink.rig import load_rig, parse_rig
 
 RIG = load_rig("loop")
@@ -52,3 +56,9 @@ def test_changes_of_the_kernel_are_fitted_but_have_no_place_in_the_rig_file():
     written = parse_rig(result.text).sensor
     assert written.noise_density == pytest.approx(rig.sensor.noise_density * found.noise, rel=1e-4)
     assert written.kernel.variance == pytest.approx(rig.sensor.kernel.variance + found.wider, rel=1e-4)
+
+
+def test_a_plant_that_cannot_be_identified_is_refused_before_any_work():
+    recording = Recording(Path(__file__).parents[2] / "recordings" / "tip-tilt.mcap")
+    with pytest.raises(IdentificationError, match="this rig's has 2 inputs and 2 outputs"):
+        identify([recording], None, Wanted(models=(), plant="second-order"), lambda what, done, of: pytest.fail(what))
