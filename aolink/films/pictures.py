@@ -19,6 +19,8 @@ from aolink.films.stills import encoded
 from aolink.numerics.arrays import FloatArray
 
 _TIFF, _FITS = (".tif", ".tiff"), (".fits", ".fit", ".fts")
+_EVEN = 1.2
+"""A ground is even where a quarter of a PSF's values are not above it by more than this factor."""
 _PEDESTAL = 0.05
 """Share of a PSF's sum in an even ground from which on it is one, and of its values that may be below that ground."""
 
@@ -115,9 +117,11 @@ def read_psf(path: Path) -> tuple[FloatArray, tuple[str, ...]]:
         found = read_frame(path, RestorationError)
     if found.size > 2 and np.isfinite(found).all() and found.sum() > 0:
         ground = float(np.quantile(found, _PEDESTAL))
-        if (share := ground * found.size / found.sum()) > _PEDESTAL and ground < found.max() / 5:
-            return found, (
+        share = ground * found.size / found.sum()
+        even = np.count_nonzero(found <= _EVEN * ground) > found.size / 4
+        if share > _PEDESTAL and ground < found.max() / 5 and even:
+            return np.maximum(found - ground, 0.0), (
                 f"{share:.0%} of the PSF's sum is an even ground of {ground:.3g}, as of a camera's dark level, with"
-                " which the picture becomes worse: subtract it from the PSF",
+                " which the picture would become worse: it is subtracted from the PSF",
             )
     return found, ()

@@ -140,7 +140,7 @@ def test_a_column_of_text_is_a_psf_along_the_columns(text: str, psf: list[Any], 
     assert read_psf(tmp_path / "a.npy")[0].tolist() == psf
 
 
-def test_a_picture_is_a_psf_and_its_pedestal_is_said(tmp_path: Path) -> None:
+def test_a_picture_is_a_psf_and_its_pedestal_is_subtracted_and_said(tmp_path: Path) -> None:
     picture = np.zeros((15, 15), np.uint16)
     picture[7, 4:11] = 900
     tifffile.imwrite(tmp_path / "a.tif", picture)
@@ -148,7 +148,14 @@ def test_a_picture_is_a_psf_and_its_pedestal_is_said(tmp_path: Path) -> None:
     assert (psf == picture).all()
     assert notes == ()
     tifffile.imwrite(tmp_path / "b.tif", picture + 100)
-    assert "of the PSF's sum is an even ground of 100" in read_psf(tmp_path / "b.tif")[1][0]
+    psf, (note,) = read_psf(tmp_path / "b.tif")
+    assert "of the PSF's sum is an even ground of 100" in note
+    assert (psf == picture).all()
+    broad = np.exp(-np.hypot(*np.mgrid[-7:8, -7:8]) / 5)
+    np.save(tmp_path / "c.npy", broad)  # its edge is no ground
+    psf, notes = read_psf(tmp_path / "c.npy")
+    assert notes == ()
+    assert (psf == broad).all()
 
 
 @pytest.mark.parametrize(("name", "content"), [("a.csv", "1 2\n3\n"), ("a.npy", "junk"), ("a.csv", None)])
