@@ -6,9 +6,7 @@ import math
 
 import numpy as np
 
-from aolink.estimation.compiled.likelihoods import log_likelihoods_of_row
-from aolink.estimation.compiled.line import Line
-from aolink.estimation.compiled.plane import Plane
+from aolink.estimation.compiled.pixels import Pixels, log_likelihoods_of_row
 from aolink.estimation.compiled.small import cholesky_into, compiled, compiled_sums, decay, inlined, lower_inverse_into
 from aolink.numerics.arrays import FloatArray
 
@@ -272,7 +270,7 @@ def log_densities_and_gradients(
 
 @compiled
 def correct_by_importance(
-    seen: Line | Plane, prior_weight: FloatArray, prior_mean: FloatArray, prior_covariance: FloatArray,
+    seen: Pixels, prior_weight: FloatArray, prior_mean: FloatArray, prior_covariance: FloatArray,
     log_weight: FloatArray, mean: FloatArray, covariance: FloatArray, uniform: FloatArray, normal: FloatArray,
     enough: FloatArray, least_effective: float, halvings: int, prior_points: float, last_prior_points: float,
     tightened: float, loosened: float, negligible: float, effective: FloatArray,
@@ -303,7 +301,7 @@ def correct_by_importance(
             old_weight[r], old_mean[r], old_inverse[r], old_constant[r] = w, x, inverse, constant
             begin, end = r * points, (r + 1) * points
             _draw(w, x, root, uniform[r], normal[r], total, t, begin)
-            log_likelihoods_of_row(seen, axis, t, begin, end, target)
+            log_likelihoods_of_row(seen, axis, t, begin, end, target, np.empty((0, 0)))
             _log_densities(
                 prior_weight[axis], prior_mean[axis], prior_inverse, prior_constant, t, begin, end, some, prior_logs,
                 prior_density,
