@@ -43,35 +43,6 @@ def moments(
 
 
 @compiled
-def mapped(
-    log_weight: FloatArray, mean: FloatArray, covariance: FloatArray, rows: FloatArray, remainder: FloatArray,
-    out_mean: FloatArray, out_covariance: FloatArray,
-) -> None:  # fmt: skip
-    """Components of M t + e, e of covariance ``remainder``; components of weight zero are left alone."""
-    axes, count, n = mean.shape
-    m = len(rows)
-    half = np.empty((m, n))
-    for axis in range(axes):
-        for c in range(count):
-            if log_weight[axis, c] == -math.inf:
-                continue
-            for a in range(m):
-                place = 0.0
-                for j in range(n):
-                    place += rows[a, j] * mean[axis, c, j]
-                    total = 0.0
-                    for i in range(n):
-                        total += rows[a, i] * covariance[axis, c, i, j]
-                    half[a, j] = total
-                out_mean[axis, c, a] = place
-                for b in range(a + 1):
-                    total = remainder[a, b]
-                    for j in range(n):
-                        total += half[a, j] * rows[b, j]
-                    out_covariance[axis, c, a, b] = out_covariance[axis, c, b, a] = total
-
-
-@compiled
 def merge(log_weight: FloatArray, mean: FloatArray, covariance: FloatArray, most: int, free: float) -> None:
     """Components (axes, components, ...) merged by Runnalls' bound, in place; merged ones get weight zero.
 
@@ -211,28 +182,12 @@ def _log_densities(
 
 
 @compiled
-def log_densities(
-    log_weight: FloatArray, mean: FloatArray, covariance: FloatArray, points: FloatArray, out: FloatArray
-) -> None:
-    """Log-densities (axes, points) of mixtures with components (axes, components, ...) at points (axes, points, n)."""
-    axes, count, n = mean.shape
-    many = points.shape[1]
-    root, inverse, constant = np.empty((count, n, n)), np.empty((count, n, n)), np.empty(count)
-    t, white, logs = np.empty((n, many)), np.empty(many), np.empty((count, many))
-    for axis in range(axes):
-        for k in range(many):
-            for i in range(n):
-                t[i, k] = points[axis, k, i]
-        _roots(log_weight[axis], covariance[axis], root, inverse, constant)
-        _log_densities(log_weight[axis], mean[axis], inverse, constant, t, 0, many, white, logs, out[axis])
-
-
-@compiled
 def log_densities_and_gradients(
     log_weight: FloatArray, mean: FloatArray, covariance: FloatArray, points: FloatArray, out: FloatArray,
     gradients: FloatArray,
 ) -> None:  # fmt: skip
-    """As `log_densities`, with their gradients by the points, (axes, points, n)."""
+    """Log-densities (axes, points) of mixtures with components (axes, components, ...) at points (axes, points, n), and
+    their gradients by the points, (axes, points, n)."""
     axes, count, n = mean.shape
     many = points.shape[1]
     root, inverse, constant = np.empty((count, n, n)), np.empty((count, n, n)), np.empty(count)
