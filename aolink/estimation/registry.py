@@ -184,9 +184,7 @@ def _shared_loops(rig: Rig) -> tuple[str, ...]:
 
 
 def _pixels_loops(rig: Rig) -> tuple[str, ...]:
-    if alike_systems(rig.plant) is not None:
-        return ()
-    return ("profile",) if rig.sensor.directions == 1 else ("profile of spots",)
+    return () if alike_systems(rig.plant) is not None else ("profile",)
 
 
 def _built(maker: str, *orders: int) -> Callable[[Rig, Options], Filter]:

@@ -106,6 +106,17 @@ def information_matrix(covariance: FloatArray) -> FloatArray:
     return np.asarray(inverse_by_cholesky(scaled) / sd / sd[:, None])
 
 
+@by_one_thread
+def root_of_covariance(covariance: FloatArray) -> FloatArray:
+    """L with L L' a covariance that may be singular, (n, rank), by Cholesky's method with pivots."""
+    sd = np.sqrt(np.maximum(np.diagonal(covariance), 0.0))
+    scale = np.where(sd > 0, sd, 1.0)
+    L, order, rank, _ = scipy.linalg.lapack.dpstrf(covariance / scale / scale[:, None], lower=1)
+    root = np.empty((len(L), rank))
+    root[order - 1] = np.tril(L[:, :rank])
+    return np.asarray(root * scale[:, None])
+
+
 def covariance_of_information(precision: FloatArray) -> FloatArray:
     """Inverse of an information matrix, (n, n), which is scaled to a diagonal of one before."""
     scaled, scale = _scaled(precision)

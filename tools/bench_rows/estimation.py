@@ -18,7 +18,6 @@ from aolink.estimation import Driver, make_estimator, run, score
 from aolink.estimation.frames.frame_data import Measurement
 from aolink.estimation.kalman.filter import PathFilter
 from aolink.estimation.kalman.gaussian import Gaussian
-from aolink.estimation.kalman.information_form import information_update
 from aolink.estimation.kalman.path_moments import PathMoments
 from aolink.estimation.kalman.update import blocked_update, joseph_update
 from aolink.estimation.model.dense import DenseModel
@@ -75,26 +74,21 @@ def o3_step(effort: Effort) -> Row:
 
 
 def update_forms(effort: Effort) -> list[Row]:
-    """Each form of the Kalman update beside Joseph's, with as many axes, states and measurements as it is for."""
+    """The Kalman update in blocks beside Joseph's, with as many states and measurements as it is for."""
 
-    def row(form: str, axes: int, n: int, m: int, turns: int) -> Row:
+    def row(axes: int, n: int, m: int, turns: int) -> Row:
         rng = np.random.default_rng(1)
         root, blocks = rng.standard_normal((axes, n, n)), np.tile(0.1 * np.eye(2), (axes, m // 2, 1, 1))
         y, R = rng.standard_normal((axes, m)), np.tile(0.1 * np.eye(m), (axes, 1, 1))
         H = batched.batch_last(rng.standard_normal((axes, m, n)))
         prior = Gaussian(np.zeros((axes, n)), batched.batch_last(root @ batched.transpose(root)))
-        each: dict[str, Callable[[], Any]] = {
-            "in blocks": lambda: blocked_update(prior, y, H, blocks),
-            "in information form": lambda: information_update(prior, y, H, blocks, None),
-        }
-        ours, theirs = median_s(each[form], effort.of(turns, 3), lambda: joseph_update(prior, y, H, R))
-        figure = f"update {form}: {axes} x {n} states, {m} measured"
+        ours, theirs = median_s(
+            lambda: blocked_update(prior, y, H, blocks), effort.of(turns, 3), lambda: joseph_update(prior, y, H, R)
+        )
+        figure = f"update in blocks: {axes} x {n} states, {m} measured"
         return Row(figure, f"{1e3 * ours:.2f} ms", f"Joseph {1e3 * theirs:.2f} ms", theirs / ours, 1.1)
 
-    return [
-        row("in blocks", 1, 48, 192, 60),
-        row("in information form", 1, 288, 400, 15),
-    ]
+    return [row(1, 48, 192, 60), row(1, 288, 400, 15)]
 
 
 def many_lenslets(side: int = 30) -> Rig:

@@ -23,7 +23,6 @@ GROUPS = {
     "larger plants": (("tip-tilt", "o3"),),
     "many spots": (("membrane-12x12", "moments"), ("membrane-12x12", "profile")),
     "profile": (("section-vi-lively", "profile"),),
-    "profile of spots": (("tip-tilt", "profile"),),
 }
 """What is compiled together: the rigs and estimators that use all of a group's loops when they are made."""
 _COMPILE = """

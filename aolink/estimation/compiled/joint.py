@@ -9,7 +9,7 @@ import math
 
 import numpy as np
 
-from aolink.estimation.compiled.line import LARGE
+from aolink.estimation.compiled.pixels import LARGE
 from aolink.estimation.compiled.small import compiled, compiled_sums
 from aolink.numerics.arrays import BoolArray, FloatArray, Indices
 

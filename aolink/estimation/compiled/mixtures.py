@@ -6,9 +6,7 @@ import math
 
 import numpy as np
 
-from aolink.estimation.compiled.likelihoods import log_likelihoods_of_row
-from aolink.estimation.compiled.line import Line
-from aolink.estimation.compiled.plane import Plane
+from aolink.estimation.compiled.pixels import Pixels, log_likelihoods_of_row
 from aolink.estimation.compiled.small import cholesky_into, compiled, compiled_sums, decay, inlined, lower_inverse_into
 from aolink.numerics.arrays import FloatArray
 
@@ -42,35 +40,6 @@ def moments(
         for i in range(n):
             for j in range(i):
                 out_covariance[axis, j, i] = out_covariance[axis, i, j]
-
-
-@compiled
-def mapped(
-    log_weight: FloatArray, mean: FloatArray, covariance: FloatArray, rows: FloatArray, remainder: FloatArray,
-    out_mean: FloatArray, out_covariance: FloatArray,
-) -> None:  # fmt: skip
-    """Components of M t + e, e of covariance ``remainder``; components of weight zero are left alone."""
-    axes, count, n = mean.shape
-    m = len(rows)
-    half = np.empty((m, n))
-    for axis in range(axes):
-        for c in range(count):
-            if log_weight[axis, c] == -math.inf:
-                continue
-            for a in range(m):
-                place = 0.0
-                for j in range(n):
-                    place += rows[a, j] * mean[axis, c, j]
-                    total = 0.0
-                    for i in range(n):
-                        total += rows[a, i] * covariance[axis, c, i, j]
-                    half[a, j] = total
-                out_mean[axis, c, a] = place
-                for b in range(a + 1):
-                    total = remainder[a, b]
-                    for j in range(n):
-                        total += half[a, j] * rows[b, j]
-                    out_covariance[axis, c, a, b] = out_covariance[axis, c, b, a] = total
 
 
 @compiled
@@ -213,28 +182,12 @@ def _log_densities(
 
 
 @compiled
-def log_densities(
-    log_weight: FloatArray, mean: FloatArray, covariance: FloatArray, points: FloatArray, out: FloatArray
-) -> None:
-    """Log-densities (axes, points) of mixtures with components (axes, components, ...) at points (axes, points, n)."""
-    axes, count, n = mean.shape
-    many = points.shape[1]
-    root, inverse, constant = np.empty((count, n, n)), np.empty((count, n, n)), np.empty(count)
-    t, white, logs = np.empty((n, many)), np.empty(many), np.empty((count, many))
-    for axis in range(axes):
-        for k in range(many):
-            for i in range(n):
-                t[i, k] = points[axis, k, i]
-        _roots(log_weight[axis], covariance[axis], root, inverse, constant)
-        _log_densities(log_weight[axis], mean[axis], inverse, constant, t, 0, many, white, logs, out[axis])
-
-
-@compiled
 def log_densities_and_gradients(
     log_weight: FloatArray, mean: FloatArray, covariance: FloatArray, points: FloatArray, out: FloatArray,
     gradients: FloatArray,
 ) -> None:  # fmt: skip
-    """As `log_densities`, with their gradients by the points, (axes, points, n)."""
+    """Log-densities (axes, points) of mixtures with components (axes, components, ...) at points (axes, points, n), and
+    their gradients by the points, (axes, points, n)."""
     axes, count, n = mean.shape
     many = points.shape[1]
     root, inverse, constant = np.empty((count, n, n)), np.empty((count, n, n)), np.empty(count)
@@ -272,7 +225,7 @@ def log_densities_and_gradients(
 
 @compiled
 def correct_by_importance(
-    seen: Line | Plane, prior_weight: FloatArray, prior_mean: FloatArray, prior_covariance: FloatArray,
+    seen: Pixels, prior_weight: FloatArray, prior_mean: FloatArray, prior_covariance: FloatArray,
     log_weight: FloatArray, mean: FloatArray, covariance: FloatArray, uniform: FloatArray, normal: FloatArray,
     enough: FloatArray, least_effective: float, halvings: int, prior_points: float, last_prior_points: float,
     tightened: float, loosened: float, negligible: float, effective: FloatArray,
@@ -303,7 +256,7 @@ def correct_by_importance(
             old_weight[r], old_mean[r], old_inverse[r], old_constant[r] = w, x, inverse, constant
             begin, end = r * points, (r + 1) * points
             _draw(w, x, root, uniform[r], normal[r], total, t, begin)
-            log_likelihoods_of_row(seen, axis, t, begin, end, target)
+            log_likelihoods_of_row(seen, axis, t, begin, end, target, np.empty((0, 0)))
             _log_densities(
                 prior_weight[axis], prior_mean[axis], prior_inverse, prior_constant, t, begin, end, some, prior_logs,
                 prior_density,

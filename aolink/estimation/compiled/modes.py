@@ -6,9 +6,7 @@ import math
 
 import numpy as np
 
-from aolink.estimation.compiled.likelihoods import information_of_row
-from aolink.estimation.compiled.line import Line, path_of
-from aolink.estimation.compiled.plane import Plane
+from aolink.estimation.compiled.pixels import Pixels, information_of_row, path_of
 from aolink.estimation.compiled.small import (
     cholesky_into,
     cholesky_solve,
@@ -57,7 +55,7 @@ def spread_starts(
 
 @compiled
 def innovations(
-    seen: Line | Plane, mean: FloatArray, covariance: FloatArray, t: FloatArray, tells_nothing: float,
+    seen: Pixels, mean: FloatArray, covariance: FloatArray, t: FloatArray, tells_nothing: float,
     value: FloatArray, information: FloatArray, nis: FloatArray, square: FloatArray,
 ) -> None:  # fmt: skip
     """Innovations at points t (rows, n) in k directions, as `pixels.modes.innovation`.
@@ -97,7 +95,7 @@ def innovations(
 
 @compiled
 def find_modes(
-    seen: Line | Plane, mean: FloatArray, covariance: FloatArray, starts: FloatArray, of_row: Indices, whole: int,
+    seen: Pixels, mean: FloatArray, covariance: FloatArray, starts: FloatArray, of_row: Indices, whole: int,
     reversed_precision: float, passes: int, first_damping: float, largest_damping: float, free_damping: float,
     converged: float, out_mean: FloatArray, out_covariance: FloatArray, out_evidence: FloatArray,
     out_distance: FloatArray, out_objective: FloatArray,
@@ -255,7 +253,7 @@ def _near(s: FloatArray, ends: FloatArray, H: FloatArray, count: int) -> int:
 
 @inlined
 def _at(
-    seen: Line | Plane, row: int, rest: FloatArray, B: FloatArray, s: FloatArray, path: FloatArray, H: FloatArray,
+    seen: Pixels, row: int, rest: FloatArray, B: FloatArray, s: FloatArray, path: FloatArray, H: FloatArray,
     pull: FloatArray,
 ) -> float:  # fmt: skip
     """Information H, negative gradient ``pull`` and objective (returned) at whitened coordinates s."""

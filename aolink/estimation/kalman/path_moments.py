@@ -9,11 +9,9 @@ import numpy as np
 
 from aolink.estimation.frames.frame_data import Flux, Measurement, Needs
 from aolink.estimation.kalman.gaussian import Gaussian, Update
-from aolink.estimation.kalman.information_form import information_update
 from aolink.estimation.kalman.update import blocked_update
 from aolink.estimation.model.base import ExposureModel, InputResponse
 from aolink.numerics.arrays import FloatArray
-from aolink.plant.alike import MANY_STATES
 from aolink.rig import Plant
 
 MOST_OUTPUTS = 2
@@ -61,9 +59,8 @@ class PathMoments:
         Plants of one or two outputs have a compiled loop (`aolink.estimation.kalman.filter.PathFilter`).
         """
         expected, slope = predicted_moments(model, response, prior.mean, self.orders)
-        update = information_update if model.plant.n_states > MANY_STATES else blocked_update
         noise = measured.covariance if measured.covariance.ndim == 4 else measured.covariance[:, None]
-        return update(prior, measured.value - expected, slope, noise, self.gain)
+        return blocked_update(prior, measured.value - expected, slope, noise, self.gain)
 
 
 def predicted_moments(

@@ -1,16 +1,18 @@
 """The update of a Kalman filter, in the forms in which it is computed. They agree to rounding.
 
-`aolink.estimation.kalman.path_moments` chooses between them by the sizes: in blocks, or in information form
-(`aolink.estimation.kalman.information_form`). The row `update_forms` of tools/bench times each beside Joseph's.
+Joseph's is for few measurements, the one in blocks for many; the row `update_forms` of tools/bench times both.
 """
 
 from __future__ import annotations
 
 import numpy as np
+from scipy import linalg
 
 from aolink.estimation.kalman.gaussian import MOST_COVARIANCES, Gaussian, Update
 from aolink.numerics import batched
 from aolink.numerics.arrays import FloatArray
+from aolink.numerics.batched import symmetric
+from aolink.numerics.single_thread import by_one_thread, gram, root_of_covariance, root_of_information
 
 
 def joseph_update(
@@ -34,41 +36,44 @@ def joseph_update(
     return Update(Gaussian(mean, covariance), innovation, S, nis)
 
 
+@by_one_thread
 def blocked_update(
     prior: Gaussian, innovation: FloatArray, H: FloatArray, R: FloatArray, gain: FloatArray | None = None
 ) -> Update:
-    """`joseph_update` for few states and many measurements, whose noise is shared within blocks only.
+    """`joseph_update` for many measurements, whose noise is shared within blocks only, axis by axis.
 
-    With G = H' R^-1 H and M = (I + P G)^-1 P, the optimal gain is M H' R^-1 and S^-1 y = R^-1 (y - H K y): nothing has
-    more rows than there are states, and P may be singular. Where S is large, only its diagonal is computed. R is
-    (axes, blocks, size, size).
+    R is (axes, blocks, size, size). Where S is large, only its diagonal is computed.
     """
-    axes, blocks, size, _ = R.shape
-    n = prior.mean.shape[1]
-    H, y = H.reshape(axes, blocks, size, n), innovation.reshape(axes, blocks, size, 1)
-    P, transposed = prior.covariance, batched.transpose(H)
-    weighted = np.linalg.solve(R, np.concatenate([H, y], axis=3))
-    # Sums over blocks of products as small as these do not depend on threads.
-    G = batched.symmetric((transposed @ weighted[..., :n]).sum(axis=1))
-    M = batched.symmetric(np.asarray(np.linalg.solve(np.eye(n) + P @ G, P)))
-    optimal = (M @ (transposed @ weighted[..., n:]).sum(axis=1))[..., 0]
-    if gain is None:
-        moved, keep, from_noise = optimal, np.eye(n) - M @ G, batched.congruence(M, G)
-    else:
-        K = np.moveaxis(gain.reshape(-1, n, blocks, size), 2, 1)  # (1 or axes, blocks, n, size)
-        moved = (K @ y).sum(axis=1)[..., 0]
-        keep = np.eye(n) - (K @ H).sum(axis=1)
-        from_noise = (K @ R @ batched.transpose(K)).sum(axis=1)
-    covariance = batched.symmetric(batched.congruence(keep, P) + from_noise)
-    left = y - H @ optimal[:, None, :, None]
-    nis = (weighted[..., n:] * left).sum(axis=(1, 2, 3))
-    m = blocks * size
-    flat = H.reshape(axes, m, n)
-    if m > MOST_COVARIANCES:
-        S = (flat @ P * flat).sum(axis=2) + np.einsum("abss->abs", R).reshape(axes, m)
-    else:
-        S = flat @ P @ batched.transpose(flat)
-        for k in range(blocks):
-            some = slice(k * size, (k + 1) * size)
-            S[:, some, some] += R[:, k]
+    axes, n = prior.mean.shape
+    gains = [None] * axes if gain is None else np.broadcast_to(gain, (axes, n, innovation.shape[1]))
+    every = map(_in_blocks, prior.covariance, innovation, H, R, gains)
+    moved, covariance, S, nis = (np.stack(each) for each in zip(*every, strict=True))
     return Update(Gaussian(prior.mean + moved, covariance), innovation, S, nis)
+
+
+def _in_blocks(
+    P: FloatArray, y: FloatArray, H: FloatArray, R: FloatArray, gain: FloatArray | None
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Change of the mean, covariance, innovation covariance or its diagonal, and NIS; R is (blocks, size, size).
+
+    With P = L L' and G = R^(-1/2) H L the covariance is L (I + G' G)^-1 L': nothing that is factored has more rows than
+    there are states, and P may be singular.
+    """
+    blocks, size, _ = R.shape
+    L = root_of_covariance(P)
+    HL = H @ L
+    white = np.linalg.solve(
+        np.linalg.cholesky(R), np.concatenate([HL, y[:, None]], axis=1).reshape(blocks, size, -1)
+    ).reshape(len(y), -1)
+    G, y_white = white[:, :-1], white[:, -1]
+    score = G.T @ y_white
+    W = root_of_information(np.eye(L.shape[1]) + gram(G)) @ np.column_stack([L.T, score])
+    nis = np.asarray(y_white @ y_white - W[:, -1] @ W[:, -1])
+    if len(y) > MOST_COVARIANCES:
+        S = (HL * HL).sum(axis=1) + np.einsum("bss->bs", R).ravel()
+    else:
+        S = gram(HL.T) + linalg.block_diag(*R)
+    if gain is None:
+        return W[:, :-1].T @ W[:, -1], gram(W[:, :-1]), S, nis
+    kept, K = L - gain @ HL, gain.reshape(len(P), blocks, size).swapaxes(0, 1)
+    return gain @ y, gram(kept.T) + symmetric((K @ R @ K.swapaxes(1, 2)).sum(axis=0)), S, nis

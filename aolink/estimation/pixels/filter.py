@@ -99,8 +99,7 @@ class MixtureFilter(Filter):
         """Update one axis with a dark exposure, so that what this compiles is compiled before the session."""
         one = slice(0, 1)
         twice = joined(self.prior.part(one), self.prior.part(one))
-        n = self.plant.n_states
-        twice.mapped(np.eye(n), np.zeros((n, n))).reduced(1).log_density(twice.mean)
+        twice.reduced(1)
         drop_repeats(twice.mean, twice.covariance, 1.0, *(np.zeros((1, 2)) for _ in range(3)))
         model, outputs, pixels = exposure_model(self.plant, 2), self.plant.n_outputs, self.sensor.profile.pixels
         kind = Profile if outputs == 1 else SpotWindows
@@ -224,8 +223,8 @@ def _spread(parts: Sequence[Innovation], seen: Indices, axes: int) -> Innovation
 
 def _moved(h: GaussianMixture, transition: FloatArray, noise: FloatArray, kick: FloatArray) -> GaussianMixture:
     """x -> A x + d, P -> A P A' + Q for each component."""
-    after = Gaussian(h.mean, h.covariance).mapped(transition, noise)
-    return GaussianMixture(h.log_weight, after.mean + kick[:, None], after.covariance)
+    after = h.mapped(transition, noise)
+    return after._replace(mean=after.mean + kick[:, None])
 
 
 def _chosen(which: BoolArray, first: GaussianMixture, second: GaussianMixture) -> GaussianMixture:

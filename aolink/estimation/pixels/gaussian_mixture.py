@@ -50,18 +50,12 @@ class GaussianMixture(NamedTuple):
 
     def mapped(self, rows: FloatArray, remainder: FloatArray) -> GaussianMixture:
         """The mixture of M t + e: M is ``rows`` (m, n), e independent of t with covariance ``remainder`` (m, m)."""
-        (axes, count, _), m = self.mean.shape, len(rows)
-        out = GaussianMixture(self.log_weight, np.zeros((axes, count, m)), np.zeros((axes, count, m, m)))
-        compiled_mixtures.mapped(
-            *self.contiguous, np.ascontiguousarray(rows), np.ascontiguousarray(remainder), out.mean, out.covariance
-        )
-        return out
+        after = Gaussian(self.mean, self.covariance).mapped(rows, remainder)
+        return GaussianMixture(self.log_weight, after.mean, after.covariance)
 
     def log_density(self, points: FloatArray) -> FloatArray:
         """Log-density of the mixture, (axes, points, n) -> (axes, points)."""
-        out = np.empty(points.shape[:2])
-        compiled_mixtures.log_densities(*self.contiguous, np.ascontiguousarray(points), out)
-        return out
+        return log_sum(self.component_log_densities(points), axis=1)
 
     def component_log_densities(self, points: FloatArray) -> FloatArray:
         """The log-density of each component times its weight, (axes, components, points)."""

@@ -26,8 +26,8 @@ from aolink.estimation.frames.frame_data import SpotWindows
 from aolink.estimation.kalman.gaussian import Gaussian
 from aolink.estimation.model.joint_paths import JointPaths, compiled_loops
 from aolink.estimation.moments.joint_moments import JointMoments, JointObservation
-from aolink.estimation.pixels.levenberg_marquardt import Points, minimise
-from aolink.numerics.arrays import FloatArray, Indices
+from aolink.estimation.pixels.levenberg_marquardt import Place, minimise
+from aolink.numerics.arrays import FloatArray
 from aolink.numerics.batched import symmetric
 from aolink.numerics.single_thread import covariance_of_information, gram, matmul_one_thread, solve_information
 from aolink.optics.camera import effective_noise_density, shot_gain
@@ -104,40 +104,17 @@ class Linearised:
     """(spots, 2)"""
 
 
-@dataclass(frozen=True, eq=False)
-class Mode:
-    """A mode of the posterior."""
-
-    t: FloatArray
-    """(size,)"""
-    precision: FloatArray
-    """(size, size)"""
-    objective: float
-    """-log p(t, y) up to a constant."""
-    at: Linearised
-
-
-def find_mode(view: JointPixels, mean: FloatArray, precision: FloatArray, start: FloatArray) -> Mode:
-    """The mode that a start leads to, for a prior with this mean and precision, by Levenberg and Marquardt's method."""
+def find_mode(view: JointPixels, mean: FloatArray, precision: FloatArray, start: FloatArray) -> Place:
+    """The mode that a start leads to, for a prior with this mean and precision; it keeps the `Linearised` pixels."""
     paths = view.paths
 
-    def at(t: FloatArray, _: Indices) -> Points:
-        near = view.at(t[0])
-        pull = matmul_one_thread(precision, t[0] - mean)
-        objective = 0.5 * float((t[0] - mean) @ pull) - near.log_likelihood
-        kept = np.empty(1, dtype=object)
-        kept[0] = near
-        H = precision + paths.information(near.information)
-        return Points(np.array([objective]), (paths.score(near.score) - pull)[None], H[None], kept)
+    def at(t: FloatArray) -> Place:
+        near, pull = view.at(t), matmul_one_thread(precision, t - mean)
+        objective, H = 0.5 * float((t - mean) @ pull) - near.log_likelihood, paths.information(near.information)
+        return Place(t, objective, paths.score(near.score) - pull, precision + H, near)
 
     # The expected gain of a step shows when the search is at a mode, before the pixels are linearised again.
-    (t,), found = minimise(at, start[None], _PASSES - 1, CONVERGED, foreseen=CONVERGED, solve=_solve)
-    assert found.linearised is not None
-    return Mode(t, found.hessian[0], float(found.objective[0]), found.linearised[0])
-
-
-def _solve(a: FloatArray, x: FloatArray) -> FloatArray:
-    return np.stack([solve_information(*each) for each in zip(a, x, strict=True)])
+    return minimise(at, start, _PASSES - 1, CONVERGED, foreseen=CONVERGED, solve=solve_information)
 
 
 class JointProfile(JointObservation):
@@ -157,7 +134,7 @@ class JointProfile(JointObservation):
         before, P, view = prior.mean, prior.covariance, JointPixels(self.sensor, paths, windows)
         if paths.rms_spread(P) <= LARGEST_SPREAD * np.sqrt(view.kernel_variance):
             mode = find_mode(view, before, paths.prior_information(P), before)
-            t, after, at = mode.t, covariance_of_information(mode.precision), mode.at
+            t, after, at = mode.x, covariance_of_information(mode.hessian), mode.seen
         else:
             t, after, *_ = self._moments.corrected(paths, prior, windows)
             at = view.at(t)

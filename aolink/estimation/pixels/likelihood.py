@@ -21,7 +21,6 @@ The mean over the fast steps is taken by quadrature with few nodes (`aolink.esti
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -30,9 +29,7 @@ from typing import Any
 import numpy as np
 
 from aolink.errors import EstimatorError
-from aolink.estimation.compiled.likelihoods import log_likelihoods_and_gradients
-from aolink.estimation.compiled.line import Line
-from aolink.estimation.compiled.plane import Plane
+from aolink.estimation.compiled.pixels import Pixels, log_likelihoods_and_gradients
 from aolink.estimation.frames.frame_data import Profile, SpotWindows
 from aolink.estimation.kalman.gaussian import Gaussian
 from aolink.estimation.model import quadrature
@@ -291,7 +288,7 @@ class PixelView:
         return np.asarray((self.rows * np.tile(self.nodes.weights, self.outputs)[:, None]).T @ self.rows)
 
     def moments(self, about: Gaussian) -> tuple[FloatArray, FloatArray, Regression]:
-        """Windowed moments about a Gaussian of t, their noise and regression, as `Windowed.look`; of all axes."""
+        """Windowed moments about a Gaussian of t, their noise and regression, as `WindowedSpots.look`; of all axes."""
         assert isinstance(self.sensor, SpotSensor)
         assert isinstance(self.measured, SpotWindows)
         return WindowedSpots(self.sensor, self.outputs // 2).look(self.nodes, about, self.measured)
@@ -304,25 +301,10 @@ class PixelView:
         return out, batched.transpose(gradients).astype(np.float64)
 
     @property
-    def seen(self) -> Line | Plane:
+    def seen(self) -> Pixels:
         """The frame for compiled code."""
-        return self._line if self.on_line else self._plane
-
-    @property
-    def _line(self) -> Line:
-        """The frame of a line sensor for compiled code."""
-        nodes, pixel = self.nodes, self.optics.pixel_size
-        return Line(
-            y=self._array(self.y), usable=np.ascontiguousarray(self.mask), inputs=self._array(nodes.inputs),
-            basis=self._array(batched.transpose(nodes.basis)), weights=self._array(nodes.weights),
-            table=_light_table(float(self.kernel[0, 0]), pixel, 0, self._reach, 1.0, self._number),
-            low=float(self.optics.profile.edges[0]), per_unit=1 / pixel, read_noise=self.read_noise, gain=self.gain,
-        )  # fmt: skip
-
-    @property
-    def _plane(self) -> Plane:
-        """The frame of spots for compiled code."""
-        profile, nodes, terms = self.optics.profile, self.nodes, np.array(mehler_series(self.kernel))
+        profile, nodes = self.sensor.profile, self.nodes
+        terms = np.ones(1) if self.on_line else np.array(mehler_series(self.kernel))
         # In single precision, high derivatives are too large and their factors too small for it.
         scale = np.sqrt(np.abs(terms)) if self._number == np.float32 else np.ones_like(terms)
         across, down = (
@@ -333,14 +315,16 @@ class PixelView:
             for d in (0, 1)
         )  # fmt: skip
         windows = (len(self.y), self.outputs // 2, profile.pixels, profile.pixels)
-        return Plane(
+        if self.on_line:
+            windows, down = (len(self.y), 1, 1, profile.pixels), self._array([[[[1.0], [0.0], [0.0], [0.0]]]])
+        return Pixels(
             y=self._array(self.y).reshape(windows), usable=np.ascontiguousarray(self.mask).reshape(windows),
             inputs=self._array(nodes.inputs), basis=self._array(batched.transpose(nodes.basis)),
             weights=self._array(nodes.weights), across=across, down=down, terms=self._array(terms / scale**2),
             low=float(profile.edges[0]), per_unit=1 / profile.pixel_size, read_noise=self.read_noise, gain=self.gain,
         )  # fmt: skip
 
-    def _array(self, values: FloatArray | Sequence[float]) -> FloatArray:
+    def _array(self, values: Any) -> FloatArray:
         """Contiguous, of the view's type."""
         return np.ascontiguousarray(values, self._number)
 

@@ -54,8 +54,7 @@ class TemperedUpdater:
         starts = whitened(before, fit.ordered(_SEARCHED).mean)
         modes = without_repeats(find_modes(view, before, starts, reversals=True))
         new = innovation(view, before, modes)
-        end = Gaussian(fit.mean, fit.covariance).mapped(reduced.end_rows, reduced.end_remainder)
-        carried = GaussianMixture(fit.log_weight, end.mean, end.covariance)
+        carried = fit.mapped(reduced.end_rows, reduced.end_remainder)
         return MixtureUpdate(fit, after, carried, new, evidence, has_several(modes), np.zeros(len(mean), dtype=bool))
 
     def sample(self, view: PixelView, prior: GaussianMixture) -> Particles:

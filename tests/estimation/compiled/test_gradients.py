@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from aolink.estimation.compiled.likelihoods import gradients_of_row, log_likelihoods_and_gradients
+from aolink.estimation.compiled.pixels import log_likelihoods_and_gradients, log_likelihoods_of_row
 from tests.estimation.compiled.test_pixels import (
     KINDS,
     MANY,
@@ -54,8 +54,8 @@ def test_points_have_the_same_gradient_wherever_they_are_among_others(kind):
     t = np.ascontiguousarray(drawn(view, state)[-1].T)
     whole, part = np.zeros_like(t), np.zeros_like(t)
     out = np.empty(MANY)
-    gradients_of_row(view.seen, len(view.y) - 1, t, 0, MANY, out, whole)
-    gradients_of_row(view.seen, len(view.y) - 1, t, 37, 133, out, part)
+    log_likelihoods_of_row(view.seen, len(view.y) - 1, t, 0, MANY, out, whole)
+    log_likelihoods_of_row(view.seen, len(view.y) - 1, t, 37, 133, out, part)
     np.testing.assert_allclose(part[:, 37:133], whole[:, 37:133], rtol=1e-12, atol=1e-9 * np.abs(whole).max())
     assert not part[:, :37].any()
     assert not part[:, 133:].any()

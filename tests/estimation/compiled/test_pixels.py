@@ -9,8 +9,7 @@ from scipy import linalg, stats
 
 from aolink.estimation import exposure_model, make_estimator
 from aolink.estimation.compiled import modes as compiled_modes
-from aolink.estimation.compiled.likelihoods import information_of_row, log_likelihoods_of_row
-from aolink.estimation.compiled.line import place, places_of
+from aolink.estimation.compiled.pixels import information_of_row, log_likelihoods_of_row, places_of
 from aolink.estimation.frames.frame_data import Needs, Profile, SpotWindows
 from aolink.estimation.frames.measure import measure
 from aolink.estimation.kalman.filter import GATE_PROBABILITY
@@ -97,9 +96,9 @@ def looked_at(kind):
 
 def log_likelihoods(seen, t):
     """Log-likelihoods of points (rows, points, n), (rows, points)."""
-    out = np.empty(t.shape[:2])
-    for row, points in enumerate(t):
-        log_likelihoods_of_row(seen, row, np.ascontiguousarray(points.T, seen.y.dtype), 0, len(points), out[row])
+    out, none = np.empty(t.shape[:2]), np.empty((0, 0), seen.y.dtype)
+    for row, points in enumerate(np.ascontiguousarray(t.transpose(0, 2, 1), seen.y.dtype)):
+        log_likelihoods_of_row(seen, row, points, 0, t.shape[1], out[row], none)
     return out
 
 
@@ -121,22 +120,19 @@ def test_the_likelihood_of_many_points_is_that_of_the_twin(pair):
     assert np.all(np.abs(ours - theirs) < 2e-7 * f.max() / noise * (residual + 1) + 1e-9 * np.abs(theirs))
 
 
-def test_places_are_the_same_one_by_one_and_several_at_a_time():
-    """At and beside the edges of pixels and of the sensor, beyond it, and without a number."""
+def test_places_beside_the_edges_of_pixels_beyond_the_sensor_and_without_a_number():
     edges = np.linspace(-0.8, 1.2, 41)
     beside = np.nextafter(edges, -9), np.nextafter(edges, 9)
     paths = np.concatenate([edges, *beside, [np.nan, np.inf, -1e300, 1e19]])[None]
     firsts, nearest = np.empty(paths.shape, np.int64), np.empty(paths.shape, np.int64)
-    away, count = np.empty(paths.shape), paths.shape[1]
-    places_of(paths, count, -0.3, 20.0, 16, 12, 8, firsts, nearest, away)
-    lit = 0
-    for theta, first, point, d in zip(paths[0], firsts[0], nearest[0], away[0], strict=True):
-        expected = place(theta, -0.3, 20.0, 16, 12, 8)
-        assert first == expected[0]
-        if first >= 0:
-            lit += 1
-            assert (point, d) == (expected[1], pytest.approx(expected[2], abs=1e-14))
-    assert 20 < lit < count - 20
+    away = np.empty(paths.shape)
+    places_of(paths, paths.shape[1], -0.3, 20.0, 16, 12, 8, firsts, nearest, away)
+    v = (paths + 0.3) * 20.0
+    lit = (v > -4) & (v < 20)
+    assert 20 < lit.sum() < paths.size - 20
+    np.testing.assert_array_equal(firsts >= 0, lit)
+    np.testing.assert_allclose((firsts - 4 + (nearest + 0.5) / 12 + away)[lit], v[lit], atol=1e-13)
+    assert np.abs(away[lit]).max() < 0.5 / 12 + 1e-12
 
 
 def test_the_windowed_moments_are_those_of_the_twin(pair):
@@ -369,9 +365,9 @@ def test_points_have_the_same_likelihood_wherever_they_are_among_others(kind):
     view, _, state = looked_at_plane(kind, 0) if kind in PLANES else looked_at(kind)
     t = np.random.default_rng(7).standard_normal((view.reduced.size, MANY)) * 0.3
     t += view.reduced.prior(state).mean[1 if view.on_line else 0, :, None]
-    whole, part = np.empty(MANY), np.full(MANY, np.nan)
-    log_likelihoods_of_row(view.seen, len(view.y) - 1, t, 0, MANY, whole)
-    log_likelihoods_of_row(view.seen, len(view.y) - 1, t, 37, 133, part)
+    whole, part, none = np.empty(MANY), np.full(MANY, np.nan), np.empty((0, 0))
+    log_likelihoods_of_row(view.seen, len(view.y) - 1, t, 0, MANY, whole, none)
+    log_likelihoods_of_row(view.seen, len(view.y) - 1, t, 37, 133, part, none)
     assert np.isfinite(whole).all()
     assert part[37:133].tobytes() == whole[37:133].tobytes()
     assert np.isnan(part[:37]).all()

@@ -8,7 +8,7 @@ from aolink.estimation import Profile
 from aolink.estimation.pixels import importance, modes
 from aolink.estimation.pixels.constants import PROFILE
 from aolink.estimation.pixels.gaussian_mixture import GaussianMixture, log_sum
-from aolink.estimation.pixels.levenberg_marquardt import Points, minimise
+from aolink.estimation.pixels.levenberg_marquardt import Place, minimise
 from aolink.estimation.pixels.likelihood import PixelView
 from aolink.estimation.pixels.modes import whitened
 from aolink.numerics import batched
@@ -133,18 +133,23 @@ def find_modes(view, prior, starts):
     rows = view.part(np.repeat(np.arange(axes), count))
     m, L = np.repeat(prior.mean, count, axis=0)[:, None], cholesky(np.repeat(prior.covariance, count, axis=0))
 
-    def at(s, which):
-        return _at(rows.part(which), m[which], L[which], s)
+    def at(one):
+        seen = rows.part(one), m[one], L[one]
+        return lambda s: _at(*seen, s[None])
 
-    s, found = minimise(at, starts.reshape(-1, n), PROFILE.passes, PROFILE.converged)
-    covariance = batched.congruence(L, batched.symmetric(np.asarray(np.linalg.inv(found.hessian), dtype=np.float64)))
-    _, log_H = np.linalg.slogdet(found.hessian)
-    evidence = -found.objective - 0.5 * log_H
+    each = [
+        minimise(at(slice(k, k + 1)), start, PROFILE.passes, PROFILE.converged)
+        for k, start in enumerate(starts.reshape(-1, n))
+    ]
+    s, objective, _, hessian = (np.array(values) for values in list(zip(*each, strict=True))[:4])
+    covariance = batched.congruence(L, batched.symmetric(np.asarray(np.linalg.inv(hessian), dtype=np.float64)))
+    _, log_H = np.linalg.slogdet(hessian)
+    evidence = -objective - 0.5 * log_H
     mean = m[:, 0] + batched.matvec(L, s)
     shape = (axes, count)
     return modes.Modes(
         mean.reshape(*shape, n), batched.symmetric(covariance).reshape(*shape, n, n), evidence.reshape(shape),
-        batched.dot(s, s).reshape(shape), found.objective.reshape(shape),
+        batched.dot(s, s).reshape(shape), objective.reshape(shape),
     )  # fmt: skip
 
 
@@ -174,7 +179,8 @@ def _at(rows, m, L, s):
     J = batched.long_matmul(J[:, 0], L)
     H = batched.long_matmul(batched.transpose(J) * information, J) + np.eye(s.shape[1])
     g = batched.matvec(batched.transpose(J), score[:, 0]) - s
-    return Points(0.5 * batched.dot(s, s) - rows.log_likelihood(f)[:, 0], g, batched.symmetric(H))
+    objective = 0.5 * batched.dot(s, s) - rows.log_likelihood(f)[:, 0]
+    return Place(s[0], float(objective[0]), g[0], batched.symmetric(H)[0])
 
 
 def spread_starts(view, prior, wide):

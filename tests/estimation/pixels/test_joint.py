@@ -164,12 +164,12 @@ def test_the_mode_and_its_covariance_are_those_of_the_dense_search(rig, frame):
     theirs = find_mode(view, before.mean[0], precision, modes.mean[0, 0])
     # It stays where the dense search has ended, for one of Newton's steps from there goes nowhere.
     sd = np.sqrt(np.diag(modes.covariance[0, 0]))
-    np.testing.assert_array_equal(theirs.t, modes.mean[0, 0])
-    uphill = paths.score(theirs.at.score) - precision @ (theirs.t - before.mean[0])
-    np.testing.assert_allclose(np.linalg.solve(theirs.precision, uphill) / sd, 0, atol=0.05)
+    np.testing.assert_array_equal(theirs.x, modes.mean[0, 0])
+    uphill = paths.score(theirs.seen.score) - precision @ (theirs.x - before.mean[0])
+    np.testing.assert_allclose(np.linalg.solve(theirs.hessian, uphill) / sd, 0, atol=0.05)
     own = find_mode(view, before.mean[0], precision, before.mean[0])
     assert own.objective == pytest.approx(theirs.objective, abs=joint_pixels.CONVERGED)
-    spread = np.linalg.inv(theirs.precision)
+    spread = np.linalg.inv(theirs.hessian)
     np.testing.assert_allclose(spread / sd / sd[:, None], modes.covariance[0, 0] / sd / sd[:, None], atol=0.03)
 
 

@@ -1,0 +1,443 @@
+"""The pixels of spots: expected light, its derivatives, likelihood and Fisher information. A line sensor is a window of
+one row.
+
+The share of a Gaussian spot's light that a row of pixels gets, or a column, depends only on where the spot is within
+its own pixel: a short table of Taylor series, right to 2e-7 of the brightest pixel, replaces the error function. A
+pixel's light is the product of the two; where the kernel lies aslant, the sum of a few such products.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from aolink.estimation.compiled.small import compiled, compiled_sums, inlined
+from aolink.numerics.arrays import BoolArray, FloatArray, IntArray
+
+_AT_ONCE = 64
+"""Points whose paths are computed together."""
+LARGE = 1e200
+"""A product of variance ratios is replaced by its logarithm when it exceeds this."""
+
+
+class Pixels(NamedTuple):
+    """Frames and the data needed to predict them, one row for each axis of the plant."""
+
+    y: FloatArray
+    """Densities, (rows, spots, height, width), the last one along x; the height of a line is one."""
+    usable: BoolArray
+    """Mask of the usable pixels, of the same shape."""
+    inputs: FloatArray
+    """Response of the path to the inputs at its nodes, (rows, outputs, nodes): x and y of each spot in turn; x of a
+    line."""
+    basis: FloatArray
+    """The exposure basis at the nodes, (outputs, n, nodes)."""
+    weights: FloatArray
+    """Each node's share of the exposure, (nodes,)."""
+    across: FloatArray
+    """Taylor coefficients of the densities of columns of pixels about points of a pixel, (terms, points, 4, reach)."""
+    down: FloatArray
+    """The same coefficients for rows of pixels; of a line, the one row that has all the light, (1, 1, 4, 1)."""
+    terms: FloatArray
+    """Factors of the products, (terms,)."""
+    low: float
+    """Edge at which the first pixel begins, in both directions, slope units."""
+    per_unit: float
+    """Pixels in a slope unit."""
+    read_noise: float
+    """Variance of a pixel's density."""
+    gain: float
+    """Shot noise: increase of that variance with the density."""
+
+
+@compiled
+def places_of(
+    paths: FloatArray, count: int, low: float, per_unit: float, pixels: int, points: int, reach: int,
+    firsts: IntArray, nearest: IntArray, away: FloatArray,
+) -> None:  # fmt: skip
+    """First pixel in a padded row that a spot lights, or -1; nearest point of the table; distance from it in pixels.
+
+    Of each node of ``count`` paths (nodes, points), without a branch, so that several are computed at a time; all
+    results are (nodes, points). Where the first pixel is -1 the others mean nothing.
+    """
+    number = paths.dtype.type  # of constants as well: otherwise single precision would be left here
+    least, most, nowhere, half = number(-0.5 * reach), number(pixels + 0.5 * reach), number(0.0), number(0.5)
+    low, per_unit, density = number(low), number(per_unit), number(points)
+    for node in range(len(paths)):
+        for k in range(count):
+            v = (paths[node, k] - low) * per_unit
+            lit = v > least and v < most
+            v = v if lit else nowhere
+            cell = number(math.floor(v))
+            u = v - cell
+            point = min(int(u * density), points - 1)
+            firsts[node, k] = int(cell) + reach // 2 if lit else -1
+            nearest[node, k] = point
+            away[node, k] = u - (number(point) + half) / density
+
+
+@inlined
+def path_of(offset: FloatArray, basis: FloatArray, t: FloatArray, path: FloatArray) -> None:
+    """The path at the nodes, (nodes,), of coefficients t (n,) of a basis (n, nodes)."""
+    for k in range(len(path)):
+        path[k] = offset[k]
+    for i in range(len(t)):
+        x = t[i]
+        for k in range(len(path)):
+            path[k] += x * basis[i, k]
+
+
+@compiled
+def _paths_of(offset: FloatArray, basis: FloatArray, t: FloatArray, first: int, count: int, paths: FloatArray) -> None:
+    """Paths at the nodes, (nodes, points), of ``count`` points from ``first`` on of t (n, points)."""
+    for node in range(len(offset)):
+        for k in range(count):
+            paths[node, k] = offset[node]
+        for i in range(len(t)):
+            for k in range(count):
+                paths[node, k] += basis[i, node] * t[i, np.uintp(first) + np.uintp(k)]
+
+
+@inlined
+def _padding(seen: Pixels) -> tuple[int, int]:
+    """Rows and columns about a window that hold the light of a spot outside of it."""
+    return 0 if seen.y.shape[2] == 1 else seen.down.shape[3], seen.across.shape[3]
+
+
+@compiled
+def log_likelihoods_of_row(
+    seen: Pixels, row: int, t: FloatArray, begin: int, end: int, out: FloatArray, gradients: FloatArray
+) -> None:
+    """Log-likelihoods of the points ``begin`` to ``end`` of t (n, points) in one row.
+
+    Their gradients by t are added to ``gradients``, (n, points), unless it is empty. In the loop over points no part of
+    an array and no field of the `Pixels` is taken: each would be counted as another reference, and that would take as
+    long as all the rest.
+    """
+    weights, terms, low, per_unit = seen.weights, seen.terms, seen.low, seen.per_unit
+    across, down, read_noise, gain = seen.across, seen.down, seen.read_noise, seen.gain
+    (_, spots, height, width), (high, wide) = seen.y.shape, _padding(seen)
+    number, nodes, directions = across.dtype, len(weights), len(seen.basis) // spots
+    f = np.zeros((height + 2 * high, width + 2 * wide), number)
+    columns, rows = np.empty((2, wide), number), np.empty((2, down.shape[3]), number)
+    path, pulls = np.empty((nodes, _AT_ONCE), number), np.empty((2, nodes, _AT_ONCE), number)
+    firsts, nearest = np.zeros((2, nodes, _AT_ONCE), np.int64), np.zeros((2, nodes, _AT_ONCE), np.int64)
+    away = np.zeros((2, nodes, _AT_ONCE), number)
+    for first in range(begin, end, _AT_ONCE):
+        count = min(_AT_ONCE, end - first)
+        for k in range(count):
+            out[first + k] = 0.0
+        for spot in range(spots):
+            for d in range(directions):
+                o, table, size = directions * spot + d, (down if d else across), (height if d else width)
+                _paths_of(seen.inputs[row, o], seen.basis[o], t, first, count, path)
+                places_of(
+                    path, count, low, per_unit, size, table.shape[1], table.shape[3], firsts[d], nearest[d], away[d]
+                )
+            light, usable = seen.y[row, spot], seen.usable[row, spot]
+            dark = _squares(light, usable)
+            for k in range(count):
+                top, bottom, left, right = _add_light(
+                    k, firsts, nearest, away, weights, terms, across, down, columns, rows, f
+                )
+                out[first + k] += _scores(
+                    light, usable, f, high, wide, top, bottom, left, right, dark, read_noise, gain
+                )
+                if len(gradients):
+                    _put_pulls(
+                        k, firsts, nearest, away, weights, terms, across, down, columns, rows, f, per_unit, pulls
+                    )
+                for r in range(top, bottom):
+                    for c in range(left, right):
+                        f[r, c] = 0.0
+            if len(gradients):
+                for d in range(directions):
+                    _add_gradients(seen.basis[directions * spot + d], pulls[d], first, count, gradients)
+
+
+@compiled
+def log_likelihoods_and_gradients(seen: Pixels, t: FloatArray, out: FloatArray, gradients: FloatArray) -> None:
+    """Log-likelihoods (rows, points) of points t (rows, n, points); their gradients by t are added to ``gradients``,
+    (rows, n, points)."""
+    for row in range(len(t)):
+        log_likelihoods_of_row(seen, row, t[row], 0, t.shape[2], out[row], gradients[row])
+
+
+@inlined
+def _add_light(
+    point: int, firsts: IntArray, nearest: IntArray, away: FloatArray, weights: FloatArray, terms: FloatArray,
+    across: FloatArray, down: FloatArray, columns: FloatArray, rows: FloatArray, f: FloatArray,
+) -> tuple[int, int, int, int]:  # fmt: skip
+    """Densities without noise of one of the paths that `places_of` has placed, added to padded densities f.
+
+    The results are the first row and the one after the last that get light, and the same for columns.
+    """
+    wide, high = across.shape[3], down.shape[3]
+    begin, end, first, last = len(f), 0, f.shape[1], 0
+    for j in range(len(terms)):
+        for k in range(len(weights)):
+            left, top = firsts[0, k, point], firsts[1, k, point]
+            if left < 0 or top < 0:
+                continue
+            begin, end, first, last = min(begin, top), max(end, top + high), min(first, left), max(last, left + wide)
+            weight, column, dx = terms[j] * weights[k], np.uintp(nearest[0, k, point]), away[0, k, point]
+            if high == 1:  # at once: a row of its own would take half as long again
+                for m in range(wide):
+                    c = np.uintp(m)
+                    slope = across[j, column, 1, c] + dx * (across[j, column, 2, c] + dx * across[j, column, 3, c])
+                    f[top, np.uintp(left) + c] += weight * (across[j, column, 0, c] + dx * slope)
+                continue
+            _taylor(across, j, nearest[0, k, point], dx, weight, columns)
+            _taylor(down, j, nearest[1, k, point], away[1, k, point], 1.0, rows)
+            _add_product(f, top, left, rows, columns)
+    return begin, end, first, last
+
+
+@inlined
+def _add_product(f: FloatArray, top: int, left: int, rows: FloatArray, columns: FloatArray) -> None:
+    for k in range(rows.shape[1]):
+        r, light = np.uintp(top) + np.uintp(k), rows[0, k]
+        for m in range(columns.shape[1]):
+            f[r, np.uintp(left) + np.uintp(m)] += light * columns[0, m]
+
+
+@inlined
+def _taylor(table: FloatArray, term: int, point: int, d: float, factor: float, out: FloatArray) -> None:
+    """The light of a spot at a distance d from a point of the table, out[0]."""
+    weight, row = out.dtype.type(factor), np.uintp(point)  # without a sign: nothing asks if it counts from the end
+    for k in range(out.shape[1]):
+        p = np.uintp(k)
+        slope = table[term, row, 1, p] + d * (table[term, row, 2, p] + d * table[term, row, 3, p])
+        out[0, p] = weight * (table[term, row, 0, p] + d * slope)
+
+
+@inlined
+def _taylor_slope(table: FloatArray, term: int, point: int, d: float, factor: float, out: FloatArray) -> None:
+    """The derivative of `_taylor` by d, out[1]."""
+    number, row = out.dtype.type, np.uintp(point)
+    weight, two, three = number(factor), number(2.0), number(3.0)
+    for k in range(out.shape[1]):
+        p = np.uintp(k)
+        steeper = two * table[term, row, 2, p] + three * d * table[term, row, 3, p]
+        out[1, p] = weight * (table[term, row, 1, p] + d * steeper)
+
+
+@compiled_sums
+def _squares(y: FloatArray, usable: BoolArray) -> float:
+    total = 0.0
+    for r in range(len(y)):
+        for c in range(y.shape[1]):
+            total += y[r, c] * y[r, c] if usable[r, c] else 0.0
+    return total
+
+
+@compiled_sums
+def _scores(
+    y: FloatArray, usable: BoolArray, f: FloatArray, down: int, across: int, top: int, bottom: int, left: int,
+    right: int, dark: float, read_noise: float, gain: float,
+) -> float:  # fmt: skip
+    """Log-likelihood of the usable pixels of y (height, width) with padded expected densities f.
+
+    Only the padded rows ``top`` to ``bottom`` and columns ``left`` to ``right`` have light; there the log-likelihood's
+    derivatives take the place of the densities, and zeros that of the padding. ``dark`` are the `_squares` of y.
+    """
+    (height, width), number = y.shape, f.dtype.type
+    nothing, one, noise, growth, half = number(0.0), number(1.0), number(read_noise), number(gain), number(0.5)
+    squares, logs, quiet, still = dark, 0.0, 1.0 / read_noise, number(1.0 / read_noise)
+    first, end = max(left - across, 0), min(right - across, width)
+    for padded in range(top, bottom):
+        r = padded - down
+        if r < 0 or r >= height:
+            for c in range(left, right):
+                f[padded, c] = nothing
+            continue
+        for c in range(left, across):
+            f[padded, c] = nothing
+        for c in range(across + width, right):
+            f[padded, c] = nothing
+        if gain:
+            product = 1.0
+            for c in range(first, end):
+                if usable[r, c] and f[padded, across + c] > nothing:
+                    # One logarithm of a product is taken: one a pixel would take longer than everything else here.
+                    product *= 1.0 + gain * quiet * f[padded, across + c]
+                    if product > LARGE:
+                        logs += math.log(product)
+                        product = 1.0
+            logs += math.log(product)
+        less, base, line = nothing, np.uintp(across), np.uintp(r)
+        for k in range(first, end):
+            c = np.uintp(k)
+            light, seen = f[padded, base + c], one if usable[line, c] else nothing
+            grows = growth if light > nothing else nothing
+            information = one / (noise + grows * light) if gain else still
+            e = seen * (y[line, c] - light)
+            score = e * information
+            less += seen * y[line, c] * y[line, c] - noise * e * score
+            f[padded, base + c] = score + half * grows * information * (e * score - seen)
+        squares -= less
+    return -0.5 * (squares * quiet + logs)
+
+
+@compiled
+def _put_pulls(
+    point: int, firsts: IntArray, nearest: IntArray, away: FloatArray, weights: FloatArray, terms: FloatArray,
+    across: FloatArray, down: FloatArray, columns: FloatArray, rows: FloatArray, scores: FloatArray, per_unit: float,
+    pulls: FloatArray,
+) -> None:  # fmt: skip
+    """Derivatives of the log-likelihood by the path at the nodes, (2, nodes, points), of the point of `_add_light`,
+    from those by the densities: its adjoint."""
+    for k in range(len(weights)):
+        left, top = firsts[0, k, point], firsts[1, k, point]
+        pulls[0, k, point] = pulls[1, k, point] = 0.0
+        if left < 0 or top < 0:
+            continue
+        for j in range(len(terms)):
+            weight = terms[j] * weights[k] * per_unit
+            _taylor(down, j, nearest[1, k, point], away[1, k, point], 1.0, rows)
+            _taylor_slope(down, j, nearest[1, k, point], away[1, k, point], 1.0, rows)
+            _taylor(across, j, nearest[0, k, point], away[0, k, point], weight, columns)
+            _taylor_slope(across, j, nearest[0, k, point], away[0, k, point], weight, columns)
+            by_x, by_y = _slopes(scores, top, left, rows, columns)
+            pulls[0, k, point] += by_x
+            pulls[1, k, point] += by_y
+
+
+@compiled_sums
+def _slopes(scores: FloatArray, top: int, left: int, rows: FloatArray, columns: FloatArray) -> tuple[float, float]:
+    """Sums of scores times the slopes of `_add_product` by x and by y."""
+    nothing = scores.dtype.type(0.0)
+    by_x = by_y = nothing
+    for k in range(rows.shape[1]):
+        r, along, aside = np.uintp(top) + np.uintp(k), nothing, nothing
+        for m in range(columns.shape[1]):
+            score = scores[r, np.uintp(left) + np.uintp(m)]
+            along += score * columns[1, m]
+            aside += score * columns[0, m]
+        by_x += rows[0, k] * along
+        by_y += rows[1, k] * aside
+    return by_x, by_y
+
+
+@compiled
+def _add_gradients(basis: FloatArray, pulls: FloatArray, first: int, count: int, gradients: FloatArray) -> None:
+    """Add gradients by t, (n, points), of ``count`` points from ``first`` on: derivatives by the path at the nodes,
+    (nodes, points), times those of the path. The adjoint of `_paths_of`."""
+    for i in range(len(gradients)):
+        for node in range(len(pulls)):
+            for k in range(count):
+                gradients[i, np.uintp(first) + np.uintp(k)] += basis[i, node] * pulls[node, k]
+
+
+@compiled
+def information_of_row(
+    seen: Pixels, row: int, path: FloatArray, basis: FloatArray, H: FloatArray, pull: FloatArray
+) -> tuple[float, float]:
+    """Fisher information of the pixels of one row about their path (outputs, nodes), by coefficients of a basis
+    (outputs, n, nodes): its lower half is added to H, and the score to ``pull``.
+
+    Returns the log-likelihood and the sum of score^2 / information over the pixels.
+    """
+    (_, spots, height, width), (high, wide), n = seen.y.shape, _padding(seen), len(pull)
+    f, J = np.empty((height + 2 * high, width + 2 * wide)), np.empty((n, height + 2 * high, width + 2 * wide))
+    scores = np.empty((2, height, width))
+    log_likelihood = square = 0.0
+    for spot in range(spots):
+        _linearise(seen, spot, path, basis, f, J)
+        own, squares = _fisher_information(
+            seen.y[row, spot], seen.usable[row, spot], f, J, high, wide, seen.read_noise, seen.gain, scores, H, pull
+        )
+        log_likelihood += own
+        square += squares
+    return log_likelihood, square
+
+
+@inlined
+def _linearise(seen: Pixels, spot: int, path: FloatArray, basis: FloatArray, f: FloatArray, J: FloatArray) -> None:
+    """Padded densities f of one spot, and their Jacobian J, (n, ...), by coefficients of a basis (outputs, n,
+    nodes)."""
+    (_, spots, height, width), nodes = seen.y.shape, path.shape[1]
+    across, down, directions = seen.across, seen.down, len(basis) // spots
+    columns, rows = np.empty((2, across.shape[3])), np.empty((2, down.shape[3]))
+    firsts, nearest = np.zeros((2, nodes, 1), np.int64), np.zeros((2, nodes, 1), np.int64)
+    away = np.zeros((2, nodes, 1))
+    x = directions * spot
+    for d in range(directions):
+        table, size = (down if d else across), (height if d else width)
+        places_of(
+            path[x + d].reshape(nodes, 1), 1, seen.low, seen.per_unit, size, table.shape[1], table.shape[3],
+            firsts[d], nearest[d], away[d],
+        )  # fmt: skip
+    f[:] = 0.0
+    J[:] = 0.0
+    for node in range(nodes):
+        left, top = firsts[0, node, 0], firsts[1, node, 0]
+        if left < 0 or top < 0:
+            continue
+        for j in range(len(seen.terms)):
+            weight = seen.terms[j] * seen.weights[node]
+            _taylor(across, j, nearest[0, node, 0], away[0, node, 0], weight, columns)
+            _taylor(down, j, nearest[1, node, 0], away[1, node, 0], 1.0, rows)
+            _taylor_slope(across, j, nearest[0, node, 0], away[0, node, 0], weight * seen.per_unit, columns)
+            _taylor_slope(down, j, nearest[1, node, 0], away[1, node, 0], seen.per_unit, rows)
+            _add_product(f, top, left, rows, columns)
+            for d in range(directions):
+                for i in range(len(J)):
+                    for k in range(rows.shape[1]):
+                        slope, r = basis[x + d, i, node] * rows[d, k], np.uintp(top) + np.uintp(k)
+                        for m in range(columns.shape[1]):
+                            J[i, r, np.uintp(left) + np.uintp(m)] += slope * columns[1 - d, m]
+
+
+@inlined
+def _fisher_information(
+    y: FloatArray, usable: BoolArray, f: FloatArray, J: FloatArray, down: int, across: int, read_noise: float,
+    gain: float, scores: FloatArray, H: FloatArray, pull: FloatArray,
+) -> tuple[float, float]:  # fmt: skip
+    """Lower half of J' I J, I each pixel's Fisher information, added to H, and J' score to ``pull``.
+
+    f and J (n, ...) are padded expected densities and their Jacobian; ``scores`` is room for (2, height, width).
+    Returns as `information_of_row`.
+    """
+    height, width = y.shape
+    total = square = 0.0
+    product, quiet = 1.0, 1.0 / read_noise
+    for r in range(height):
+        for c in range(width):
+            expected, seen = f[down + r, across + c], 1.0 if usable[r, c] else 0.0
+            light = max(expected, 0.0)
+            information = 1.0 / (read_noise + gain * light)
+            relative = 0.5 * gain * information if expected > 0.0 else 0.0
+            e = seen * (y[r, c] - expected)
+            score = e * information
+            total += e * score
+            score += relative * (e * score - seen)
+            information = seen * (information + 2.0 * relative * relative)
+            square += score * score / (information if usable[r, c] else 1.0)
+            scores[0, r, c], scores[1, r, c] = score, information
+        if gain:
+            for c in range(width):
+                product *= 1.0 + gain * quiet * (max(f[down + r, across + c], 0.0) if usable[r, c] else 0.0)
+                if product > LARGE:
+                    total += math.log(product)
+                    product = 1.0
+    first = np.uintp(across)
+    for i in range(len(J)):
+        summed = 0.0
+        for r in range(height):
+            line, padded = np.uintp(r), np.uintp(down + r)
+            for k in range(width):
+                c = np.uintp(k)
+                summed += J[i, padded, first + c] * scores[0, line, c]
+                f[padded, first + c] = J[i, padded, first + c] * scores[1, line, c]
+        pull[i] += summed
+        for j in range(i + 1):
+            summed = 0.0
+            for r in range(height):
+                padded = np.uintp(down + r)
+                for k in range(width):
+                    summed += J[j, padded, first + np.uintp(k)] * f[padded, first + np.uintp(k)]
+            H[i, j] += summed
+    return -0.5 * (total + math.log(product)), square
