@@ -269,14 +269,14 @@ def _scores(
             logs += math.log(product)
         less, base, line = nothing, np.uintp(across), np.uintp(r)
         for k in range(first, end):
-            c = np.uintp(k)
-            light, seen = f[padded, base + c], one if usable[line, c] else nothing
+            p = np.uintp(k)
+            light, seen = f[padded, base + p], one if usable[line, p] else nothing
             grows = growth if light > nothing else nothing
             information = one / (noise + grows * light) if gain else still
-            e = seen * (y[line, c] - light)
+            e = seen * (y[line, p] - light)
             score = e * information
-            less += seen * y[line, c] * y[line, c] - noise * e * score
-            f[padded, base + c] = score + half * grows * information * (e * score - seen)
+            less += seen * y[line, p] * y[line, p] - noise * e * score
+            f[padded, base + p] = score + half * grows * information * (e * score - seen)
         squares -= less
     return -0.5 * (squares * quiet + logs)
 
@@ -429,9 +429,9 @@ def _fisher_information(
         for r in range(height):
             line, padded = np.uintp(r), np.uintp(down + r)
             for k in range(width):
-                c = np.uintp(k)
-                summed += J[i, padded, first + c] * scores[0, line, c]
-                f[padded, first + c] = J[i, padded, first + c] * scores[1, line, c]
+                p = np.uintp(k)
+                summed += J[i, padded, first + p] * scores[0, line, p]
+                f[padded, first + p] = J[i, padded, first + p] * scores[1, line, p]
         pull[i] += summed
         for j in range(i + 1):
             summed = 0.0

@@ -29,7 +29,7 @@ def window_weights(
     row: int, usable: BoolArray, first: float, end: float, pixel: float, orders: IntArray,
     path: FloatArray, variance: FloatArray, path_reach: float, margin: float, W: FloatArray,
 ) -> None:  # fmt: skip
-    """Weights of the pixels in a window about the path: as `WindowedSpots.window`, monomials."""
+    """Weights of the pixels in a window about the path: as `Windowed.window`, monomials."""
     room = max(margin, 2.0 * pixel)
     low, high = math.inf, -math.inf
     for k in range(len(path)):
@@ -208,7 +208,7 @@ def _light(values: FloatArray) -> float:
 
 @compiled
 def divide_by_first(values: FloatArray, covariance: FloatArray) -> None:
-    """Sums after the first one divided by it, and their covariance, to first order: as `WindowedSpots.ratios`."""
+    """Sums after the first one divided by it, and their covariance, to first order: as `Windowed.ratios`."""
     light, sums = _light(values), len(values)
     for a in range(1, sums):
         values[a] /= light

@@ -21,7 +21,7 @@ from aolink.estimation.model.base import ExposureModel, InputResponse
 from aolink.estimation.model.factored import FactoredModel
 from aolink.estimation.model.joint_paths import LEFT_OUT, JointPaths, joint_paths
 from aolink.estimation.moments.spots import WindowedSpots
-from aolink.estimation.moments.windowed import MOST_MEMORY, NOT_BELIEVED, PASSES, Regression, error_memory, slowest
+from aolink.estimation.moments.windowed import NOT_BELIEVED, PASSES, Regression, Windowed, error_memory, slowest
 from aolink.numerics import batched
 from aolink.numerics.arrays import FloatArray
 from aolink.numerics.single_thread import by_one_thread, covariance_of_information, matmul_one_thread, solve_information
@@ -71,8 +71,8 @@ class JointMoments(JointObservation):
     """The estimator `moments` of a plant with hundreds of states: iterated statistical linearisation. Orders and flux
     are as in `WindowedSpots`."""
 
-    most_memory = MOST_MEMORY
-    """As in `WindowedSpots`."""
+    most_memory = Windowed.most_memory
+    """As in `Windowed`."""
 
     def __init__(
         self, sensor: SpotSensor, n_outputs: int, orders: Sequence[int] = (0, 1, 2, 3), *, flux: Flux = "known"

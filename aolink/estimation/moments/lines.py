@@ -35,7 +35,7 @@ _AXES_OF_A_THREAD = 16
 class WindowedMoments:
     """Windowed moments of line-sensor profiles, one output for each axis.
 
-    ``orders`` are those of the moments; 0 is the light in the window. ``flux`` is as in `WindowedSpots`.
+    ``orders`` are those of the moments; 0 is the light in the window. ``flux`` is as in `Windowed`.
     """
 
     models_noise = True

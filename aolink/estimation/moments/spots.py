@@ -18,31 +18,15 @@ from collections.abc import Sequence
 import numpy as np
 
 from aolink.estimation.frames.frame_data import HALF, Flux, Needs, SpotWindows
-from aolink.estimation.frames.moments import LEAST_FLUX
-from aolink.estimation.kalman.gaussian import Gaussian, Update
-from aolink.estimation.kalman.update import joseph_update
-from aolink.estimation.model.base import ExposureModel, InputResponse
-from aolink.estimation.model.quadrature import QuadraturePaths, equal_parts, quadrature_paths
-from aolink.estimation.moments.windowed import (
-    KERNEL_REACH,
-    MOST_MEMORY,
-    NOT_BELIEVED,
-    PASSES,
-    PATH_REACH,
-    Regression,
-    error_memory,
-    expected_response,
-    slowest,
-    weighted_sums,
-)
+from aolink.estimation.kalman.gaussian import Gaussian
+from aolink.estimation.model.quadrature import QuadraturePaths
+from aolink.estimation.moments.windowed import Regression, Windowed, expected_response, weighted_sums
 from aolink.numerics import batched
 from aolink.numerics.arrays import BoolArray, FloatArray
-from aolink.optics.sensor import Sensor, SpotSensor
+from aolink.optics.sensor import SpotSensor
 
 # Covariances are between every two nodes, directions and spots: so there are fewer nodes than for a line sensor.
 _MOST_NODES = 40
-# Axes together: more of them do not fit into the processor's cache.
-_AT_ONCE = 8
 # Terms of Mehler's series: what the fifth adds is in the rounding unless the two directions are one.
 _TERMS = 5
 _HIGHEST = 7
@@ -50,21 +34,15 @@ _HIGHEST = 7
 _LEAST_OF_A_ROW = 0.5
 
 
-class WindowedSpots:
+class WindowedSpots(Windowed[SpotWindows]):
     """Windowed moments of all spots that one copy of the plant moves; its outputs are spot 0's x and y, spot 1's x and
     y, ...
 
     ``orders`` are those of the moments along x and along y; 0 is the light in the window. The first along both belongs
-    to the sums as well, y_11.
-
-    ``flux`` is "known" where the light of a frame sums to one; where it is "measured", a spot's sums are divided by
-    the light in its window, and order 0 is left out.
+    to the sums as well, y_11. Flux is as in `Windowed`.
     """
 
-    models_noise = True
     most_nodes = _MOST_NODES
-    most_memory = MOST_MEMORY
-    """Bound of `error_memory`; with 1, errors of an exposure count as independent of those before."""
 
     def __init__(
         self, sensor: SpotSensor, spots: int, orders: Sequence[int] = (0, 1, 2, 3), *, flux: Flux = "known"
@@ -73,43 +51,10 @@ class WindowedSpots:
         beyond = [p for p in orders if p]
         light = [(0, 0)] if flux == "measured" or 0 in orders else []
         self.orders = [*light, *((p, 0) for p in beyond), *((0, p) for p in beyond), (1, 1)]
-        self.needs, self.flux = Needs(what="windows", least_usable=HALF), flux
-        self.n_measurements = spots * (len(self.orders) - (flux == "measured"))
-
-    def update(self, model: ExposureModel, response: InputResponse, prior: Gaussian, measured: SpotWindows) -> Update:
-        """Iterated statistical linearisation, from the prior to the posterior."""
-        nodes = quadrature_paths(model, response, equal_parts(model.n_steps, self.most_nodes))
-        parts = [
-            self._update(model, nodes.part(s), prior.part(s), measured.part(s))
-            for s in (slice(k, k + _AT_ONCE) for k in range(0, len(prior.mean), _AT_ONCE))
-        ]
-        if len(parts) == 1:
-            return parts[0]
-        joined = [np.concatenate(arrays) for arrays in zip(*(_arrays(part) for part in parts), strict=True)]
-        return Update(Gaussian(joined[0], joined[1]), *joined[2:])
-
-    def _update(self, model: ExposureModel, nodes: QuadraturePaths, prior: Gaussian, measured: SpotWindows) -> Update:
-        about, rho = prior, np.full(len(prior.mean), slowest(model.transition[None])[0])
-        memory = error_memory(rho, self.most_memory)
-        for to_come in reversed(range(PASSES)):
-            y, noise, fit = self.look(nodes, about, measured)
-            if self.flux == "measured":
-                light = (y / np.sqrt(np.einsum("akk->ak", noise)))[:, :: len(self.orders)].min(axis=1)
-                y, noise, fit = self.ratios(y, noise, fit)
-            innovation = y - fit.expected - batched.matvec(fit.slope, prior.mean - about.mean)
-            R = noise + memory[:, None, None] * fit.remainder
-            done = joseph_update(prior, innovation, fit.slope, R)
-            about = done.posterior
-            if to_come:
-                rho_here = np.sqrt(rho * slowest(_closed_loop(model, prior, fit.slope, R)))
-                memory = error_memory(rho_here, self.most_memory)
-        # The covariance of this one innovation is without the memory.
-        HP = batched.matmul(fit.slope, prior.covariance)
-        S = batched.symmetric(batched.matmul(HP, batched.transpose(fit.slope)) + noise + fit.remainder)
-        nis = batched.dot(innovation, batched.matvec(batched.inverse(S), innovation))
-        if self.flux == "measured":
-            nis = np.where(light < LEAST_FLUX, NOT_BELIEVED, nis)
-        return Update(about, innovation, S, nis)
+        each = len(self.orders)
+        lights = [k * each for k in range(spots)]
+        self.needs = Needs(what="windows", least_usable=HALF)
+        super().__init__(flux, lights=lights, light_of=[k for k in lights for _ in range(each)])
 
     def look(
         self, nodes: QuadraturePaths, about: Gaussian, measured: SpotWindows
@@ -219,46 +164,6 @@ class WindowedSpots:
             joint[:, k, :, k] = noise[:, k]
         return y.reshape(axes, -1), joint.reshape(axes, spots * size, spots * size)
 
-    def window(
-        self, sensor: Sensor, kernel: float, mean: FloatArray, variance: FloatArray, mask: BoolArray
-    ) -> tuple[FloatArray, BoolArray]:
-        """u in [-1, 1] across the window about a path, and the pixels that are in it, both (axes, pixels).
-
-        ``kernel`` is the variance of the kernel in this direction, slope units squared; mean and variance are those of
-        the path at its nodes, (axes, nodes); ``mask``, (axes, pixels), is True where a pixel can be used.
-        """
-        sd = np.sqrt(np.maximum(variance, 0.0))
-        margin = KERNEL_REACH * math.sqrt(kernel + sensor.pixel_width**2 / 12)
-        # A window needs room on the sensor, wherever the path is expected.
-        room = max(margin, 2 * sensor.pixel_width)
-        low = np.minimum((mean - PATH_REACH * sd).min(axis=1) - margin, sensor.field[1] - room)
-        high = np.maximum((mean + PATH_REACH * sd).max(axis=1) + margin, sensor.field[0] + room)
-        low, high = np.maximum(low, sensor.field[0]), np.minimum(high, sensor.field[1])
-        edges = sensor.edges
-        inside = (edges[1:] > low[:, None]) & (edges[:-1] < high[:, None]) & mask
-        return (sensor.centres - (low + high)[:, None] / 2) / ((high - low)[:, None] / 2), inside
-
-    def ratios(self, y: FloatArray, noise: FloatArray, fit: Regression) -> tuple[FloatArray, FloatArray, Regression]:
-        """All sums divided by the light that belongs to each, to first order."""
-        every, size = np.arange(y.shape[1]), len(self.orders)
-        kept = every[every % size > 0]
-        lights = kept - kept % size
-
-        def divided(values: FloatArray) -> tuple[FloatArray, FloatArray]:
-            light = values[:, lights]
-            # Without any light there is no ratio; the NIS says so.
-            light = np.where(light == 0, 1.0, light)
-            ratio = values[:, kept] / light
-            J = np.zeros((*ratio.shape, values.shape[1]))
-            rows = np.arange(len(kept))
-            J[:, rows, kept], J[:, rows, lights] = 1 / light, -ratio / light
-            return ratio, J
-
-        (ratio, at_measured), (expected, at_expected) = divided(y), divided(fit.expected)
-        remainder = batched.congruence(at_expected, fit.remainder)
-        slope = batched.matmul(at_expected, fit.slope)
-        return ratio, batched.congruence(at_measured, noise), Regression(expected, slope, remainder)
-
 
 def _meetings(C: FloatArray, order: int) -> FloatArray:
     """Terms of Mehler's series between two spots at every two nodes: weights of products of their n-th derivatives.
@@ -288,18 +193,3 @@ def _meetings(C: FloatArray, order: int) -> FloatArray:
                 total += (yy * xx) * (yx * xy) / math.prod(math.factorial(k) for k in pairs)
             out[:, :, i, :, j] = total
     return out.reshape(axes, nodes * (order + 1), others * (order + 1))
-
-
-def _arrays(correction: Update) -> tuple[FloatArray, ...]:
-    after = correction.posterior
-    rest = correction.innovation, correction.innovation_covariance, correction.nis
-    return (after.mean, after.covariance, *rest)
-
-
-def _closed_loop(model: ExposureModel, prior: Gaussian, H: FloatArray, R: FloatArray) -> FloatArray:
-    """How an error of the start state goes on to the next exposure's, A (I - K H), (axes, n_states, n_states)."""
-    n = len(model.transition)
-    PH = batched.matmul(prior.covariance, batched.transpose(H))
-    K = batched.matmul(PH, batched.inverse(batched.symmetric(batched.matmul(H, PH)) + R))
-    kept = np.eye(prior.mean.shape[1])[:, :n] - batched.matmul(K, H[:, :, :n])
-    return batched.matmul(np.broadcast_to(model.end_rows, (len(kept), *model.end_rows.shape)), kept)

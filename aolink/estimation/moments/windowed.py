@@ -1,7 +1,6 @@
 """Moments in a window about the spot, used by iterated statistical linearisation.
 
-Line sensors have compiled code for it (`aolink.estimation.moments.lines`); `aolink.estimation.moments.spots` is for
-spots on a plane.
+Line sensors have compiled code for it (`aolink.estimation.moments.lines`); the class here is for spots on a plane.
 
 A moment, with any window or mask, is a weighted sum of pixels, y = sum_i W_i Y_i D. A
 spot resting at theta makes g(theta) = sum_i W_i (kernel integrated over pixel i) of it, so that
@@ -23,15 +22,25 @@ small a covariance where several paths explain the blur.
 
 from __future__ import annotations
 
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Generic, TypeVar
 
 import numpy as np
 
+from aolink.estimation.frames.frame_data import Densities, Flux
+from aolink.estimation.frames.moments import LEAST_FLUX
+from aolink.estimation.kalman.gaussian import Gaussian, Update
+from aolink.estimation.kalman.update import joseph_update
+from aolink.estimation.model.base import ExposureModel, InputResponse
+from aolink.estimation.model.quadrature import QuadraturePaths, equal_parts, quadrature_paths
 from aolink.numerics import batched
-from aolink.numerics.arrays import FloatArray
+from aolink.numerics.arrays import BoolArray, FloatArray
 from aolink.optics.camera import effective_noise_density
 from aolink.optics.kernel import gaussian_below
-from aolink.optics.sensor import BaseSensor
+from aolink.optics.sensor import BaseSensor, Sensor
 
 PASSES = 3
 # Half width of the window beyond the path's mean, in standard deviations of the path, and of the kernel beyond that.
@@ -40,8 +49,13 @@ KERNEL_REACH = 2.0
 # The path is averaged over equal parts of the steps so that there are no more than this; a mean over it stays exact.
 MOST_NODES = 100
 MOST_MEMORY = 1e3
+# Axes together: more of them do not fit into the processor's cache.
+_AT_ONCE = 8
 # NIS of moments that are divided by a light that its noise hides: they are gated.
 NOT_BELIEVED = 1e12
+
+
+Data = TypeVar("Data", bound=Densities)
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,6 +68,111 @@ class Regression:
     """H, (axes, m, n_coefficients)."""
     remainder: FloatArray
     """Omega, covariance of what is not linear, (axes, m, m)."""
+
+
+class Windowed(ABC, Generic[Data]):
+    """Iterated statistical linearisation: the common part for line sensors and spots on a plane.
+
+    Parameters
+    ----------
+    flux:
+        "known": the light of a frame sums to one; "measured": all is divided by the light in the window,
+        and order 0 left out.
+    lights:
+        Which of the sums are the light in a window.
+    light_of:
+        Index of the light that each sum is divided by, (sums,).
+    """
+
+    models_noise = True
+    most_nodes = MOST_NODES
+    most_memory = MOST_MEMORY
+    """Bound of `error_memory`; with 1, errors of an exposure count as independent of those before."""
+
+    def __init__(self, flux: Flux, lights: Sequence[int], light_of: Sequence[int]) -> None:
+        self.flux = flux
+        self._lights, self._light_of = list(lights), np.array(light_of)
+        self.n_measurements = len(light_of) - (len(self._lights) if flux == "measured" else 0)
+
+    def update(self, model: ExposureModel, response: InputResponse, prior: Gaussian, measured: Data) -> Update:
+        """Iterated statistical linearisation, from the prior to the posterior."""
+        nodes = quadrature_paths(model, response, equal_parts(model.n_steps, self.most_nodes))
+        parts = [
+            self._update(model, nodes.part(s), prior.part(s), measured.part(s))
+            for s in (slice(k, k + _AT_ONCE) for k in range(0, len(prior.mean), _AT_ONCE))
+        ]
+        if len(parts) == 1:
+            return parts[0]
+        joined = [np.concatenate(arrays) for arrays in zip(*(_arrays(part) for part in parts), strict=True)]
+        return Update(Gaussian(joined[0], joined[1]), *joined[2:])
+
+    def _update(self, model: ExposureModel, nodes: QuadraturePaths, prior: Gaussian, measured: Data) -> Update:
+        about, rho = prior, np.full(len(prior.mean), slowest(model.transition[None])[0])
+        memory = error_memory(rho, self.most_memory)
+        for to_come in reversed(range(PASSES)):
+            y, noise, fit = self.look(nodes, about, measured)
+            if self.flux == "measured":
+                light = (y / np.sqrt(np.einsum("akk->ak", noise)))[:, self._lights].min(axis=1)
+                y, noise, fit = self.ratios(y, noise, fit)
+            innovation = y - fit.expected - batched.matvec(fit.slope, prior.mean - about.mean)
+            R = noise + memory[:, None, None] * fit.remainder
+            done = joseph_update(prior, innovation, fit.slope, R)
+            about = done.posterior
+            if to_come:
+                rho_here = np.sqrt(rho * slowest(_closed_loop(model, prior, fit.slope, R)))
+                memory = error_memory(rho_here, self.most_memory)
+        # The covariance of this one innovation is without the memory.
+        HP = batched.matmul(fit.slope, prior.covariance)
+        S = batched.symmetric(batched.matmul(HP, batched.transpose(fit.slope)) + noise + fit.remainder)
+        nis = batched.dot(innovation, batched.matvec(batched.inverse(S), innovation))
+        if self.flux == "measured":
+            nis = np.where(light < LEAST_FLUX, NOT_BELIEVED, nis)
+        return Update(about, innovation, S, nis)
+
+    @abstractmethod
+    def look(
+        self, nodes: QuadraturePaths, about: Gaussian, measured: Data
+    ) -> tuple[FloatArray, FloatArray, Regression]:
+        """The sums (axes, sums), their noise (axes, sums, sums), and their regression on the coefficients."""
+
+    def window(
+        self, sensor: Sensor, kernel: float, mean: FloatArray, variance: FloatArray, mask: BoolArray
+    ) -> tuple[FloatArray, BoolArray]:
+        """u in [-1, 1] across the window about a path, and the pixels that are in it, both (axes, pixels).
+
+        ``kernel`` is the variance of the kernel in this direction, slope units squared; mean and variance are those of
+        the path at its nodes, (axes, nodes); ``mask``, (axes, pixels), is True where a pixel can be used.
+        """
+        sd = np.sqrt(np.maximum(variance, 0.0))
+        margin = KERNEL_REACH * math.sqrt(kernel + sensor.pixel_width**2 / 12)
+        # A window needs room on the sensor, wherever the path is expected.
+        room = max(margin, 2 * sensor.pixel_width)
+        low = np.minimum((mean - PATH_REACH * sd).min(axis=1) - margin, sensor.field[1] - room)
+        high = np.maximum((mean + PATH_REACH * sd).max(axis=1) + margin, sensor.field[0] + room)
+        low, high = np.maximum(low, sensor.field[0]), np.minimum(high, sensor.field[1])
+        edges = sensor.edges
+        inside = (edges[1:] > low[:, None]) & (edges[:-1] < high[:, None]) & mask
+        return (sensor.centres - (low + high)[:, None] / 2) / ((high - low)[:, None] / 2), inside
+
+    def ratios(self, y: FloatArray, noise: FloatArray, fit: Regression) -> tuple[FloatArray, FloatArray, Regression]:
+        """All sums divided by the light that belongs to each, to first order."""
+        kept = [k for k in range(y.shape[1]) if k not in self._lights]
+        lights = self._light_of[kept]
+
+        def divided(values: FloatArray) -> tuple[FloatArray, FloatArray]:
+            light = values[:, lights]
+            # Without any light there is no ratio; the NIS says so.
+            light = np.where(light == 0, 1.0, light)
+            ratio = values[:, kept] / light
+            J = np.zeros((*ratio.shape, values.shape[1]))
+            rows = np.arange(len(kept))
+            J[:, rows, kept], J[:, rows, lights] = 1 / light, -ratio / light
+            return ratio, J
+
+        (ratio, at_measured), (expected, at_expected) = divided(y), divided(fit.expected)
+        remainder = batched.congruence(at_expected, fit.remainder)
+        slope = batched.matmul(at_expected, fit.slope)
+        return ratio, batched.congruence(at_measured, noise), Regression(expected, slope, remainder)
 
 
 def weighted_sums(
@@ -94,6 +213,12 @@ def expected_response(
     return [batched.matmul(each, steps) for each in below]
 
 
+def _arrays(correction: Update) -> tuple[FloatArray, ...]:
+    after = correction.posterior
+    rest = correction.innovation, correction.innovation_covariance, correction.nis
+    return (after.mean, after.covariance, *rest)
+
+
 def slowest(transition: FloatArray) -> FloatArray:
     """Spectral radius: the modulus of the largest eigenvalue, (axes, n, n) -> (axes,)."""
     finite = np.isfinite(transition).all(axis=(1, 2), keepdims=True)
@@ -111,3 +236,12 @@ def error_memory(rho: FloatArray, most: float) -> FloatArray:
     """Variance of a mean of errors correlated by rho, over that of independent ones: (1 + rho) / (1 - rho), at most
     ``most``."""
     return np.asarray(np.minimum(most, (1 + rho) / np.maximum(1 - rho, 1e-9)))
+
+
+def _closed_loop(model: ExposureModel, prior: Gaussian, H: FloatArray, R: FloatArray) -> FloatArray:
+    """How an error of the start state goes on to the next exposure's, A (I - K H), (axes, n_states, n_states)."""
+    n = len(model.transition)
+    PH = batched.matmul(prior.covariance, batched.transpose(H))
+    K = batched.matmul(PH, batched.inverse(batched.symmetric(batched.matmul(H, PH)) + R))
+    kept = np.eye(prior.mean.shape[1])[:, :n] - batched.matmul(K, H[:, :, :n])
+    return batched.matmul(np.broadcast_to(model.end_rows, (len(kept), *model.end_rows.shape)), kept)

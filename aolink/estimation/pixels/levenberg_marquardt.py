@@ -37,7 +37,7 @@ class Place(NamedTuple):
 
 def minimise(
     at: Callable[[FloatArray], Place], start: FloatArray, passes: int, converged: float, *,
-    foreseen: float = 0.0, solve: Callable[[FloatArray, FloatArray], FloatArray] = np.linalg.solve,
+    foreseen: float = 0.0, solve: Callable[..., Any] = np.linalg.solve,
 ) -> Place:  # fmt: skip
     """The minimum that a start (n,) leads to, in at most so many ``passes``.
 

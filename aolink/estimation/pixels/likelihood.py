@@ -288,7 +288,7 @@ class PixelView:
         return np.asarray((self.rows * np.tile(self.nodes.weights, self.outputs)[:, None]).T @ self.rows)
 
     def moments(self, about: Gaussian) -> tuple[FloatArray, FloatArray, Regression]:
-        """Windowed moments about a Gaussian of t, their noise and regression, as `WindowedSpots.look`; of all axes."""
+        """Windowed moments about a Gaussian of t, their noise and regression, as `Windowed.look`; of all axes."""
         assert isinstance(self.sensor, SpotSensor)
         assert isinstance(self.measured, SpotWindows)
         return WindowedSpots(self.sensor, self.outputs // 2).look(self.nodes, about, self.measured)

@@ -2,20 +2,19 @@
 
 import numpy as np
 
+from aolink.estimation.frames.frame_data import Profile
 from aolink.estimation.moments.lines import WindowedMoments
-from aolink.estimation.moments.spots import WindowedSpots
-from aolink.estimation.moments.windowed import MOST_NODES, Regression, expected_response, weighted_sums
+from aolink.estimation.moments.windowed import Regression, Windowed, expected_response, weighted_sums
 from aolink.numerics import batched
 
 
-class PlainMoments(WindowedSpots):
-    """`WindowedMoments` with the arithmetic of `WindowedSpots`."""
-
-    most_nodes = MOST_NODES
+class PlainMoments(Windowed[Profile]):
+    """`WindowedMoments` with the arithmetic of `Windowed`."""
 
     def __init__(self, sensor, orders=(0, 1, 2, 3), *, flux="known"):
         twin = WindowedMoments(sensor, orders, flux=flux)
-        self.sensor, self.orders, self.flux = twin.sensor, twin.orders, flux
+        self.sensor, self.orders, self.needs = twin.sensor, twin.orders, twin.needs
+        super().__init__(flux, lights=[0], light_of=[0] * len(self.orders))
 
     def look(self, nodes, about, measured):
         """The weighted sums, their noise, and their regression on the coefficients."""
