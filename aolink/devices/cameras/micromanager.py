@@ -73,7 +73,7 @@ class MicroManagerCamera(ThreadCamera):
             for name, value in (properties or {}).items():
                 self._core.setProperty(self._label, name, int(value) if isinstance(value, bool) else value)
             self._set_up(row, column)
-        except RuntimeError as error:
+        except (RuntimeError, OSError) as error:
             self._core.reset()
             reason = " ".join(str(error).split())
             raise DeviceError(f"{self._name} cannot be opened: {reason}; is {_PATH} its folder?") from None

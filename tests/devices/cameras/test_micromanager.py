@@ -71,6 +71,7 @@ def test_a_frame_has_the_cameras_own_count(tmp_path: Path) -> None:
         (table(adapter="NoSuch"), "cannot be opened: .*NoSuch"),
         (table('{ PixelType = "32bitRGB" }'), "gives 4 colour"),
         (table("{ Nonsense = 1 }"), "cannot be opened: .*Nonsense"),
+        ('driver = "micromanager"\nconfig = "none.cfg"', "none.cfg cannot be opened"),
         (table(more='config = "my.cfg"'), "needs config .* or adapter and device"),
         (table().replace("[3, 5]", "[600, 5]"), r"gives \(512, 512\) pixels, .*corner"),
         (table().replace("[3, 5]", "[3, 500]"), r"gives \(512, 512\) pixels, .*corner"),
