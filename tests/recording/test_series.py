@@ -20,6 +20,7 @@ from aolink.recording import scan
 from aolink.recording.reader import Recording
 from aolink.recording.reestimate import scored_and_compared, write_reestimated
 from aolink.viewing import save_rrd
+from tests.needs import needed
 
 LIVELY = Path(__file__).parents[2] / "recordings" / "section-vi-lively.mcap"
 
@@ -61,8 +62,8 @@ def test_a_series_is_read_forwards_and_by_its_own_numbers(index: Any, error: typ
 
 
 def test_new_estimates_are_drawn_and_tabled_without_a_file() -> None:
-    pytest.importorskip("pandas")
-    pytest.importorskip("xarray")
+    needed("pandas")
+    needed("xarray")
     series = aolink.estimate(aolink.simulate("section-vi-lively", 6, seed=1), ["o1", "moments"])
     assert series.estimators == ["o1", "moments"]
     table = series[1:5].to_pandas()
@@ -80,7 +81,7 @@ def test_new_estimates_are_drawn_and_tabled_without_a_file() -> None:
 
 
 def test_a_long_table_has_the_paths() -> None:
-    pandas = pytest.importorskip("pandas")
+    pandas = needed("pandas")
     series = aolink.estimate(aolink.simulate("tip-tilt", 2, seed=1), "o1")
     table = series.to_pandas(paths=True)
     steps = series.rig.timing.exposure_steps
