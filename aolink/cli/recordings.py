@@ -71,7 +71,7 @@ def compare(
     from aolink.cli.tables import recordings as tables
     from aolink.recording import topics
     from aolink.recording.compare import compare as compare_recordings
-    from aolink.recording.compare import is_wanted
+    from aolink.recording.compare import first_parting, is_wanted
     from aolink.recording.reestimate import Reestimated, own_estimators
     from aolink.recording.side_files import check_is_side_of
 
@@ -96,7 +96,8 @@ def compare(
         stdout.print(tables.comparison(found))
         if not same_rig:
             stdout.print("the rig files differ")
-        stdout.print("the same" if same else "they differ")
+        parting = first_parting(found)
+        stdout.print("the same" if same else f"they part in {parting}" if parting else "they differ")
     if not same:
         raise typer.Exit(1)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sqlite3
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import count
 from typing import Any, NamedTuple, Self
@@ -126,6 +126,19 @@ def compare(
         for topic, name, is_first in waiting.left():
             result[topic].count_alone(is_first=is_first, text=name)
     return result
+
+
+def first_parting(found: Mapping[str, TopicComparison]) -> str:
+    """The earliest exposure at which two recordings differ, with the fields that differ there; empty if none does."""
+    fields = [
+        (each.first.frame_id, f"{name} of {topic}")
+        for topic, compared in found.items()
+        for name, each in compared.fields.items()
+        if each.first.frame_id is not None
+    ]
+    first = min((frame for frame, _ in fields), default=None)
+    there = [where for frame, where in fields if frame == first]
+    return f"frame {first}: {', '.join(there)}" if there else ""
 
 
 class _Waiting:

@@ -1,6 +1,7 @@
 """Estimators by name: exposures in, estimates out; what bad exposures get; the numbers of the paper's plant."""
 
 import dataclasses
+import pickle
 
 import numpy as np
 import pytest
@@ -112,6 +113,16 @@ def test_the_driver_gives_what_each_estimator_gives_alone(rig, estimates, exposu
     for exposure, together in zip(exposures[:20], estimates["o3"], strict=False):
         for name, value in arrays(alone.step(exposure)).items():
             assert value.tobytes() == getattr(together, name).tobytes(), name
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_an_estimator_that_was_saved_goes_on_where_it_was(rig, exposures, estimates, name):
+    estimator = make_estimator(rig, name)
+    for exposure in exposures[:5]:
+        estimator.step(exposure)
+    restored = pickle.loads(pickle.dumps(estimator))
+    again = [restored.step(exposure) for exposure in exposures[5:10]]
+    assert first_difference(estimates[name][5:10], again) is None
 
 
 def test_the_truth_changes_nothing_and_a_pixel_does(rig, estimates, exposures):

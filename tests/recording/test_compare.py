@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 from aolink.errors import RecordingError
 from aolink.recording import schemas_pb2 as pb
 from aolink.recording import topics
-from aolink.recording.compare import compare
+from aolink.recording.compare import compare, first_parting
 from aolink.recording.reader import Recording
 from aolink.recording.reestimate import Reestimated
 from aolink.recording.writer import RecordingWriter
@@ -59,6 +59,7 @@ def test_one_number_is_found_with_its_frame_and_field(recorded: Session, tmp_pat
     (field,) = found["/estimate/o3"].fields.items()
     assert (field[0], field[1].messages, field[1].first.frame_id) == ("coefficients", 1, 5)
     assert "[1] " in field[1].first.text
+    assert first_parting(found) == "frame 5: coefficients of /estimate/o3"
     np.testing.assert_allclose(field[1].largest, 1e-6, rtol=1e-3)
     assert all(each.same for topic, each in found.items() if topic != "/estimate/o3")
     assert all(each.same for each in compare(one, two, absolute=2e-6).values())
