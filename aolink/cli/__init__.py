@@ -15,6 +15,7 @@ from aolink.cli import (  # noqa: F401  their commands
     films,
     identify,
     look,
+    own_film,
     recordings,
     restore,
     rigs,

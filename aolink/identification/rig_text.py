@@ -56,13 +56,13 @@ def identified_text(
     if wider:
         sigma = math.sqrt(rig.sensor.kernel.sigma**2 + 2 * wider)
         text = with_value(text, "sensor.kernel.sigma", _written(sigma), comment=_COMMENT)
-    tables = for_outputs([[_as_table(process, step) for process in model.processes] for model in models])
+    tables = for_outputs([[as_table(process, step) for process in model.processes] for model in models])
     text = with_tables(text, "disturbance.model", tables, _COMMENT) if tables else text
     parse_rig(text)
     return text
 
 
-def _as_table(process: Process, step_s: float) -> dict[str, Any]:
+def as_table(process: Process, step_s: float) -> dict[str, Any]:
     """A table of ``[[disturbance.model]]``, for a plant of one output."""
     if process.kind == "random-walk":
         return {"kind": "random-walk", "step_sd": _written(math.sqrt(process["intensity"] * step_s))}

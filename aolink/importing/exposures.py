@@ -174,6 +174,16 @@ def _of_slopes(
         yield ImportedExposure(frame=replace(frame, slopes=slopes), inputs=inputs.until(frame.last_step + 1))
 
 
+def film_series(film: Film, rig: Rig, settings: FilmSettings) -> Series:
+    """The exposures of a film in memory. Raises `ImportingError` as `imported`."""
+    assembler, made = Assembler(rig), list[Exposure]()
+    for each in imported(film, rig, settings, FilmAccount()):
+        first = each.frame.last_step + 1 - len(each.inputs)
+        applied = Applied(first_step=first, n_steps=len(each.inputs), u=each.inputs.ravel())
+        made += [*assembler.add_frame(each.frame), *assembler.add_applied(applied)]
+    return in_memory(rig, made + assembler.flush())
+
+
 class _Inputs:
     """The inputs that the mirror held; its parked input where the film has none."""
 

@@ -40,6 +40,8 @@ class Wanted:
     kernel: bool = False
     """Whether the kernel's width, and its changes from exposure to exposure, are fitted as well."""
     highest_hz: float | None = None
+    pixels: bool = True
+    """Whether all pixels distinguish aliases, where they can."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -106,15 +108,28 @@ def identify(recordings: Sequence[Recording], rig: Rig | None, wanted: Wanted, t
 
 def from_readings(
     rig: Rig, seen: Sequence[Readings], exposures: Sequence[Exposure], wanted: Wanted, tell: Tell | None = None,
+    maxima: Sequence[Maximum] = (),
 ) -> Result:  # fmt: skip
-    """Identify models as `identify` does, from the readings of each recording, and the exposures of one."""
+    """Identify models as `identify` does, from the readings of each recording, and the exposures of one.
+
+    ``maxima`` are those of the one model that is wanted, of a rig with one output to a copy, where they are known
+    already.
+    """
     _check_plant(rig, wanted)
-    found = [_of_output(rig, label, each, exposures, wanted, tell) for label, each in _by_output(rig, seen)]
+    found = [_of_output(rig, label, each, exposures, wanted, tell, maxima) for label, each in _by_output(rig, seen)]
     one = found[0]
     text = identification.identified_text(
         rig.toml, rig, [each.model for each in found], plant=one.plant, noise=one.noise, wider=one.wider
     )
     return Result(found=tuple(found), text=text)
+
+
+def space_wanted(rig: Rig, kinds: Sequence[str], seen: Sequence[Readings], wanted: Wanted) -> Space:
+    """The parameters of a sum of kinds, and of all else that is wanted."""
+    return identification.space_of(
+        kinds, seen, rig.sensor.kernel.variance, with_noise=wanted.noise, with_kernel=wanted.kernel,
+        highest_hz=wanted.highest_hz, plant=wanted.plant,
+    )  # fmt: skip
 
 
 def _check_plant(rig: Rig, wanted: Wanted) -> None:
@@ -151,12 +166,10 @@ def outputs_of(seen: Readings, which: Sequence[int]) -> list[int]:
 
 def _of_output(
     rig: Rig, output: str, seen: Sequence[Readings], exposures: Sequence[Exposure], wanted: Wanted, tell: Tell | None,
+    known: Sequence[Maximum],
 ) -> IdentifiedModel:  # fmt: skip
     def space(kinds: Sequence[str]) -> Space:
-        return identification.space_of(
-            kinds, seen, rig.sensor.kernel.variance, with_noise=wanted.noise, with_kernel=wanted.kernel,
-            highest_hz=wanted.highest_hz, plant=wanted.plant,
-        )  # fmt: skip
+        return space_wanted(rig, kinds, seen, wanted)
 
     scored: list[Tried] = []
     if len(wanted.models) > 1:
@@ -170,10 +183,10 @@ def _of_output(
     of = space(kinds_of(name) if name else ())
     if tell:
         tell(f"fit, {output}", 0, len(of.names) + 1)
-    everything = tops = identification.maxima(of, seen)
+    everything = tops = list(known) or identification.maxima(of, seen)
     x = tops[0].x
     left_hz: dict[int, list[tuple[float, float]]] = {}
-    if rig.plant.n_outputs == 1 and rig.plant.axes <= _BY_PIXELS and rig.plant.wandering is None:
+    if wanted.pixels and rig.plant.n_outputs == 1 and rig.plant.axes <= _BY_PIXELS and rig.plant.wandering is None:
 
         def rig_of(x: FloatArray) -> Rig:
             return _with_model(rig, of, x)

@@ -119,7 +119,7 @@ class _Session:
         try:
             figure = new_figure(*size)
             draw(self.view, figure)
-            return _image(figure, caption)
+            return picture_in_page(figure, caption)
         except AolinkError as error:
             return _note(str(error))
 
@@ -139,7 +139,7 @@ class _Session:
         }
         session = facts["session"]
         rows |= {key: str(session[key]) for key in ("note", "camera", "mirror", "seed") if session.get(key)}
-        return _facts(rows)
+        return facts_table(rows)
 
     def lacks(self) -> list[str]:
         """Sentences about the data that the recording lacks."""
@@ -235,6 +235,11 @@ def _page(sessions: Sequence[_Session]) -> str:
             parts += [each.title(), *map(_note, each.lacks()), figures]
     else:
         parts.extend(_sections(sessions))
+    return html_page(title, parts)
+
+
+def html_page(title: str, parts: Sequence[str]) -> str:
+    """A page of parts that are HTML, with everything in it."""
     body = "\n".join(parts)
     head = (
         '<meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">'
@@ -303,7 +308,8 @@ def _table(heads: Sequence[str], rows: Sequence[Sequence[str]], *, text_columns:
     return f'<div class="scroll"><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
 
 
-def _facts(rows: Mapping[str, str]) -> str:
+def facts_table(rows: Mapping[str, str]) -> str:
+    """A table of names and texts."""
     body = "".join(f"<tr><th>{escape(key)}</th><td>{escape(text)}</td></tr>" for key, text in rows.items() if text)
     return f'<div class="scroll"><table><tbody>{body}</tbody></table></div>'
 
@@ -320,7 +326,7 @@ def _row(parts: Sequence[str], kind: str = "row") -> str:
     return f'<div class="{kind}">{"".join(f"<div>{part}</div>" for part in parts)}</div>'
 
 
-def _image(figure: Figure, caption: str) -> str:
+def picture_in_page(figure: Figure, caption: str) -> str:
     """A figure inside the page."""
     file = io.BytesIO()
     figure.savefig(file, format="svg", dpi=_DPI, metadata={"Date": None})

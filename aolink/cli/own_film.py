@@ -1,0 +1,119 @@
+"""The command look: from a film of spots to what moves in it, without a rig file."""
+
+import json
+import math
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from aolink.cli.common import JsonOption, OverwriteOption, app, local_file, progress, program, stdout
+from aolink.cli.films import ColourOption, GammaOption, InvertOption, RateOption, TopicOption, film_settings
+from aolink.errors import ImportingError, RecordingError
+
+
+@app.command(
+    epilog="Example: aolink look film.tif --rate 50 --exposure 0.018  |  aolink look film.avi --exposure 0.02 --gamma 2.2"
+)
+def look(
+    source: Annotated[
+        Path, typer.Argument(metavar="FILM", parser=local_file, help="A film of bright spots, as `aolink import` takes.")
+    ],
+    rate: RateOption = None,
+    exposure: Annotated[
+        float | None, typer.Option(metavar="S", help="Exposure time of a frame, s, where the film lacks it.")
+    ] = None,
+    output: Annotated[
+        Path | None,
+        typer.Option("--output", "-o", metavar="DIR", help="Folder for rig file, recording and page. [FILM-look]"),
+    ] = None,
+    kernel: Annotated[
+        float | None,
+        typer.Option(metavar="PIXELS", help="Standard deviation of a resting spot; without it the frames tell."),
+    ] = None,
+    quick: Annotated[bool, typer.Option("--quick", help="End with the first answer: one process moves a spot.")] = False,
+    invert: InvertOption = False,
+    gamma: GammaOption = 1.0,
+    topic: TopicOption = None,
+    colour: ColourOption = None,
+    overwrite: OverwriteOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Say what moves in a film of up to four spots, and how well its blur tells the path inside each exposure.
+
+    Writes a rig file to go on with, a recording with estimates, and a page with pictures. The first answer comes within
+    a minute; then sums of processes are tried. Ctrl-C keeps what there is.
+    """
+    from aolink.films.film import one_colour
+    from aolink.films.formats import open_film
+    from aolink.importing.recording import import_film
+    from aolink.jobs.look import as_json as numbers
+    from aolink.jobs.look import look as look_at
+    from aolink.jobs.look import paragraph
+    from aolink.jobs.look_page import write_page
+    from aolink.recording.reader import Recording
+    from aolink.recording.reestimate import write_reestimated
+    from aolink.rig import parse_rig
+
+    for name, value in (("--exposure", exposure), ("--kernel", kernel)):
+        if value is not None and not 0 < value < math.inf:
+            raise ImportingError(f"{name} {value:g} must be above 0{' and finite' if value > 0 else ''}")
+    settings = film_settings(rate, 1, 0, None, invert, gamma, exposure_s=exposure)
+    film = open_film(source, topic)
+    if colour is not None:
+        film = one_colour(film, colour)
+    folder = output or Path(f"{source.stem}-look")
+    rig_file, recording, page = folder / "rig.toml", folder / "film.mcap", folder / "page.html"
+    if not overwrite and (there := [each for each in (rig_file, recording, page) if each.exists()]):
+        raise RecordingError(f"{there[0]} exists already: give another -o DIR, or --overwrite")
+    looked = None
+    for thorough in (False, True)[: 1 if quick else 2]:
+        try:
+            with progress("look", None) as tell:
+                said = look_at(
+                    film, settings, source.stem, kernel=kernel, thorough=thorough,
+                    tell=lambda what, done, of: tell(done, f"{what}: {done} of {of}"),
+                )  # fmt: skip
+        except KeyboardInterrupt:
+            if looked is None:
+                raise
+            stdout.print("stopped: the first answer is kept", markup=False)
+            break
+        first, looked = looked, said
+        if not as_json and (first is None or paragraph(first) != paragraph(looked)):
+            stdout.print(f"{'' if first is None else 'After more models: '}{paragraph(looked)}", markup=False)
+        if not looked.moves:
+            break
+    assert looked is not None
+    folder.mkdir(parents=True, exist_ok=True)
+    rig = parse_rig(looked.text)
+    rig_file.write_text(looked.text, encoding="utf-8")
+    imported = folder / "film.partial.mcap"
+    try:
+        import_film(looked.cut, rig, looked.settings, imported, overwrite=True, sources=[source])
+        names = ["moments"] if looked.moves else []
+        with progress("estimate", len(looked.spots.light)) as tell:
+            if names:
+                write_reestimated(Recording(imported), names, recording, only=False, overwrite=overwrite, progress=tell)
+            else:
+                imported.replace(recording)
+    finally:
+        imported.unlink(missing_ok=True)
+    commands = [
+        f"{program()} view {recording}",
+        f"{program()} estimate {recording} -e profile",
+        f"{program()} report {recording} -o {folder / 'report.html'}",
+    ]
+    write_page(looked, page, source.name, commands, overwrite=overwrite)
+    if as_json:
+        files = {"rig": str(rig_file), "recording": str(recording), "page": str(page)}
+        print(json.dumps({"text": paragraph(looked), **numbers(looked), **files}, allow_nan=False))
+        return
+    for each in looked.doubts:
+        stdout.print(f"{each}.", markup=False)
+    stdout.print("Assumed:", markup=False)
+    for each in looked.assumed:
+        stdout.print(f"  {each}.", markup=False)
+    stdout.print(f"{page}: the pictures. To go on:", markup=False)
+    for each in commands:
+        stdout.print(f"  {each}", markup=False)

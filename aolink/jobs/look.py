@@ -1,0 +1,561 @@
+"""The job of `aolink look`: what moves in a film of spots, without a rig file.
+
+The spots are found and cut out, their kernel is taken from the frames (`aolink.importing.blurred`), a model of the
+motion is identified along x and along y, and the path inside each exposure is estimated with it.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from aolink.errors import IdentificationError, ImportingError
+from aolink.estimation import make_estimator, run
+from aolink.exposure import Exposure
+from aolink.films.film import Film
+from aolink.identification import FEWEST, Identified, Maximum, Piece, Readings, kinds_of, maxima, readings
+from aolink.identification.models import ProcessSum
+from aolink.identification.pixels import log_evidence
+from aolink.identification.rig_text import as_table
+from aolink.importing.blurred import Spots, find_spots
+from aolink.importing.exposures import film_series
+from aolink.importing.frames import FilmSettings, FrameTimes, film_times, nonlinear_note
+from aolink.jobs.identify import IdentifiedModel, Wanted, from_readings, space_wanted
+from aolink.numerics.arrays import FloatArray
+from aolink.rig import Rig, parse_rig
+from aolink.rig.edit import with_tables
+
+FRAMES = 300
+"""Frames that are looked at, from the first on."""
+_SEARCHED = 96
+"""Exposures that a model is searched with."""
+_SINGLE = ("random-walk", "ornstein-uhlenbeck", "resonance")
+_SUMS = ("ornstein-uhlenbeck+resonance", "random-walk+resonance", "resonance+resonance")
+"""Models that are tried for the first answer, and those that are tried after it."""
+LEAST_MOTION = 0.02
+"""Smallest motion that is spoken of, pixels rms."""
+_CERTAIN = 2.0
+"""Motion that chance does not show, in `Direction.sure`: its square is then four standard deviations away."""
+LEAST_BLUR = 1 / 3
+"""Blur, in standard deviations of the kernel, from which on it shows the motion inside an exposure."""
+_STEPS, _MOST_STEPS = 16, 48
+"""Fast steps in an exposure, at least where the exposure is short, and at most."""
+_NOTHING = 1e6
+"""Variance of readings that say nothing."""
+_SETTLED = 8
+"""Exposures after which an estimator has found the path."""
+_KERNELS = np.array([0.92, 1.0, 1.08])
+"""Kernels over that of the frames between which the pixels decide."""
+_UNEVEN = 0.003
+"""Share by which the exposure may differ from a whole number of fast steps."""
+_REST = 2.0
+"""Standard deviation of where a spot rests about the middle of its window, pixels."""
+_COUNTS, _NOISE_SDS = 50_000, 6
+"""Counts of the brightest pixel of a resting spot, and standard deviations of noise below black."""
+DIRECTIONS = ("x", "y")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Direction:
+    """What is known of the motion along one direction."""
+
+    name: str
+    moved: float
+    """Standard deviation of the spots' mean places in the frames, pixels."""
+    blur: float
+    """Root mean square of the path about its mean in a frame, pixels."""
+    blurred: bool
+    """Whether the blur is large enough against the kernel to be told from it."""
+    sure: float
+    """Root of the standard deviation of the square of ``moved`` by noise alone, pixels."""
+    found: IdentifiedModel | None = None
+    """The model of the motion; None where nothing moves."""
+    known: float = math.nan
+    """Standard deviation of the error of the path inside an exposure, by the pixels, pixels rms."""
+    held: float = math.nan
+    """The same of the centroid, taken for the whole exposure."""
+    path: FloatArray | None = None
+    """The path in each exposure, pixels of the window, (frames, n, steps)."""
+    nis: float = math.nan
+    """NIS of the path's estimates, over what it is where the model is right."""
+
+    @property
+    def size(self) -> float:
+        """Standard deviation of the path, pixels."""
+        return math.hypot(self.moved, self.blur if self.blurred else 0.0)
+
+    @property
+    def moves(self) -> bool:
+        """Whether it moves at all."""
+        return self.moved > self.least or self.blurred
+
+    @property
+    def least(self) -> float:
+        """Motion of the mean places that noise alone could be, pixels rms."""
+        return max(LEAST_MOTION, _CERTAIN * self.sure)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Looked:
+    """What a film shows."""
+
+    spots: Spots
+    rate_hz: float
+    exposure_s: float
+    sd: float
+    """Standard deviation of the kernel, pixels."""
+    together: bool
+    """Whether several spots have one motion in common."""
+    directions: tuple[Direction, ...]
+    text: str
+    """The rig file."""
+    cut: Film
+    """The spots' windows as a film for that rig file."""
+    settings: FilmSettings
+    """The settings to import it with."""
+    assumed: tuple[str, ...]
+    """What was assumed, and what follows where it is wrong."""
+    doubts: tuple[str, ...]
+    """Why something cannot be told, and what would help."""
+
+    @property
+    def blurred(self) -> bool:
+        """Whether the blur shows the motion inside an exposure."""
+        return any(each.blurred for each in self.directions)
+
+    @property
+    def moves(self) -> bool:
+        """Whether anything moves."""
+        return any(each.moves for each in self.directions)
+
+
+Tell = Callable[[str, int, int], None]
+
+
+def look(
+    film: Film, settings: FilmSettings, name: str, *, kernel: float | None = None, frames: int = FRAMES,
+    thorough: bool = False, tell: Tell = lambda what, done, of: None,
+) -> Looked:  # fmt: skip
+    """Find out what moves in a film of up to four spots, and how.
+
+    Parameters
+    ----------
+    name:
+        The name of the rig.
+    kernel:
+        Standard deviation of a resting spot, pixels, where it is known.
+    frames:
+        Number of frames that are looked at, from the first on.
+
+    Raises
+    ------
+    ImportingError
+        Rate or exposure time are not known, there is no spot, or there are too few frames.
+    """
+    times = film_times(film, settings)
+    rate, exposure_s = times.rate_hz, settings.exposure_s or film.exposure_s
+    if missing := [f"--{what}" for what, value in (("rate HZ", rate), ("exposure S", exposure_s)) if value is None]:
+        raise ImportingError(
+            f"{film.name} does not say {'how many frames a second it has' if rate is None else ''}"
+            f"{' and ' if len(missing) == 2 else ''}{'how long each was exposed' if exposure_s is None else ''}:"
+            f" give {' and '.join(missing)}"
+        )
+    assert rate is not None
+    assert exposure_s is not None
+    if not 0 < exposure_s * rate <= 1.01:
+        raise ImportingError(f"frames of {exposure_s:g} s do not fit into {1 / rate:g} s from one to the next")
+    if film.count < FEWEST:
+        raise ImportingError(f"{film.name} has {film.count} frame(s): {FEWEST} are needed to tell what moves")
+    spots = find_spots(film, settings, frames, lambda done: tell("read", done, 2 * min(frames, film.count)))
+    sd = spots.sd if kernel is None else kernel
+    if not math.isfinite(sd):
+        raise ImportingError(
+            f"{film.name}: the frames are too dim to tell how wide a spot at rest is: give its standard deviation with"
+            " --kernel PIXELS, or take brighter frames"
+        )
+    scene = _Scene(film, spots, times, rate, exposure_s, name)
+    everything = range(len(spots.corners))
+    seen = [readings(*scene.along(d, everything, sd)) for d in (0, 1)]
+    measured = [_direction(DIRECTIONS[d], each, scene.unit, sd) for d, each in enumerate(seen)]
+    together = len(everything) > 1 and _one_motion(seen)
+    which = [0] if together else everything
+    directions = []
+    # The direction of more motion first: it tells more of the kernel.
+    for d in sorted((0, 1), key=lambda d: -measured[d].blur):
+        each = measured[d]
+        if each.moves:
+            names = (*_SINGLE, *_SUMS) if thorough else _SINGLE
+            told = partial(_say, tell, each.name)
+            each, sd = _identified(scene, d, each, which, sd, names, told, fixed=kernel is not None)
+        directions.append(each)
+    directions.sort(key=lambda each: each.name)
+    return Looked(
+        spots=spots, rate_hz=rate, exposure_s=exposure_s, sd=sd, together=together, directions=tuple(directions),
+        text=scene.text(sd, directions, together=together), cut=scene.cut(sd),
+        settings=scene.settings,
+        assumed=tuple(_assumed(film, settings, scene, kernel)), doubts=tuple(_doubts(spots, directions, sd)),
+    )  # fmt: skip
+
+
+def _say(tell: Tell, direction: str, what: str, done: int, of: int) -> None:
+    tell(f"{what.split(',')[0]} along {direction}", done, of)
+
+
+def _direction(name: str, seen: Readings, unit: float, sd: float) -> Direction:
+    """How far the spots move from frame to frame and within one."""
+    good = seen.usable
+    if not good.any():
+        return Direction(name=name, moved=0.0, blur=0.0, blurred=False, sure=0.0)
+    mean = np.where(good, seen.mean + seen.centre, np.nan)
+    moved = float(np.nanmean(np.nanvar(mean, axis=1)))
+    noise = float(seen.mean_noise[good].mean())
+    # The square about c of the mean has the noise of the mean in it.
+    blur = float((seen.square - seen.mean**2 + seen.mean_noise)[good].mean())
+    return Direction(
+        name=name, moved=unit * math.sqrt(max(moved - noise, 0.0)), blur=unit * math.sqrt(max(blur, 0.0)),
+        sure=unit * math.sqrt(noise * math.sqrt(2 / good.sum())),
+        blurred=unit * math.sqrt(max(blur, 0.0)) >= LEAST_BLUR * sd,
+    )  # fmt: skip
+
+
+def _one_motion(seen: Sequence[Readings]) -> bool:
+    """Whether the mean places of several spots are one motion and noise, or motions of their own: by the likelihood,
+    with the Bayesian information criterion."""
+    gain = 0.0
+    for each in seen:
+        shown = (each.mean + each.centre)[:, each.usable.all(axis=0)]
+        n, count = shown.shape
+        if count < FEWEST:
+            return False
+        S = np.cov(shown, bias=True)
+        common = max(float((S.sum() - np.trace(S)) / (n * (n - 1))), 0.0)
+        C = common + np.diag(np.maximum(np.diag(S) - common, each.mean_noise.mean(axis=1)))
+        fit = np.log(np.diag(S)).sum() + n - np.linalg.slogdet(C)[1] - np.trace(np.linalg.solve(C, S))
+        gain += count / 2 * float(fit) - math.log(count) / 2
+    return gain > 0
+
+
+def _identified(
+    scene: _Scene, d: int, direction: Direction, which: Sequence[int], sd: float, names: Sequence[str],
+    tell: Callable[[str, int, int], None], *, fixed: bool,
+) -> tuple[Direction, float]:  # fmt: skip
+    """The direction with the model of its motion and the errors of its path, and the kernel that the pixels prefer."""
+    rig, exposures = scene.along(d, which, sd)
+    some = exposures[:_SEARCHED]
+    wanted, seen = Wanted(), readings(rig, some)
+    if not direction.blurred:
+        # Sharp frames show places, and of the width only how well the kernel is known.
+        wanted = Wanted(highest_hz=scene.settings.rate_hz / 2, pixels=False)
+        seen = replace(seen, square_noise=np.full_like(seen.square_noise, _NOTHING))
+    name, tops = _best_model(rig, seen, names, wanted, tell)
+    found = from_readings(rig, [seen], some, replace(wanted, models=(name,)), tell, tops).found[0]
+    if not direction.blurred:
+        found = _with_aliases(found, scene, LEAST_BLUR * sd)
+    if direction.blurred and not fixed:
+        sd *= _kernel_by_pixels(lambda factor: parse_rig(scene.line_text(sd * factor, which, found.model)), some)
+    rig = parse_rig(scene.line_text(sd, which, found.model))
+    estimates = run(rig, exposures, ["profile"])["profile"]
+    path = np.array([each.path for each in estimates])
+    error = float(np.mean(np.square([each.path_sd for each in estimates[_SETTLED:]])))
+    within = float(np.mean((path[_SETTLED:] - path[_SETTLED:].mean(axis=2, keepdims=True)) ** 2))
+    nis = np.concatenate([each.nis[each.nis > 0] / each.innovation.shape[1] for each in estimates[_SETTLED:]])
+    return replace(
+        direction, found=found, known=scene.unit * math.sqrt(error), held=scene.unit * math.sqrt(within + error),
+        path=scene.unit * (path + 1) - 0.5, nis=float(np.median(nis)) if len(nis) else math.nan,
+    ), sd
+
+
+def _with_aliases(found: IdentifiedModel, scene: _Scene, most_blur: float) -> IdentifiedModel:
+    """The model with all aliases of a frequency in its set that would blur the spot by no more than ``most_blur``,
+    pixels rms: sharp frames cannot tell them apart."""
+    rate, exposure_s, highest = scene.settings.rate_hz or 1.0, scene.settings.exposure_s or 0.0, 0.5 / scene.step_s
+    sds = {each.name: each.best * scene.unit for each in found.parameters if each.name.endswith("sd")}
+
+    def aliases(each: Identified) -> Identified:
+        if not each.name.endswith("frequency_hz"):
+            return each
+        shown = sds.get(each.name.replace("frequency_hz", "sd"), 0.0) * abs(float(np.sinc(each.best * exposure_s)))
+
+        def possible(hz: float) -> bool:
+            left = abs(float(np.sinc(hz * exposure_s)))
+            return hz < highest and shown * math.sqrt(max(1 - left**2, 0.0)) <= most_blur * left
+
+        pieces = list(each.pieces)
+        for multiple in np.arange(rate, highest + rate, rate).tolist():
+            for piece in each.pieces:
+                low, best, high = multiple - piece.high, multiple - piece.best, multiple - piece.low
+                pieces.append(Piece(low, high, best, open_low=piece.open_high, open_high=piece.open_low))
+                above = (multiple + piece.low, multiple + piece.high, multiple + piece.best)
+                pieces.append(Piece(*above, open_low=piece.open_low, open_high=piece.open_high))
+        return replace(each, pieces=tuple(one for one in pieces if one in each.pieces or possible(one.best)))
+
+    return replace(found, parameters=tuple(map(aliases, found.parameters)))
+
+
+def _best_model(
+    rig: Rig, seen: Readings, names: Sequence[str], wanted: Wanted, tell: Callable[[str, int, int], None]
+) -> tuple[str, list[Maximum]]:
+    """The sum of kinds that explains readings best by the Bayesian information criterion, and its local maxima."""
+    best: tuple[float, str, list[Maximum]] = (-math.inf, "", [])
+    count = 2 * int(seen.usable.sum())
+    for number, name in enumerate(names):
+        tell("models", number, len(names))
+        space = space_wanted(rig, kinds_of(name), [seen], wanted)
+        try:
+            found = maxima(space, [seen])
+        except IdentificationError:
+            continue
+        value = found[0].log_likelihood - len(space.names) * math.log(count) / 2
+        best = max(best, (value, name, found), key=lambda each: each[0])
+    if not best[1]:
+        raise ImportingError("no model of the motion can be fitted to these frames: they show too little")
+    return best[1:]
+
+
+def _kernel_by_pixels(rig_of: Callable[[float], Rig], exposures: Sequence[Exposure]) -> float:
+    """The factor of the kernel where the pixels' evidence is highest: the vertex of a parabola through three."""
+    each = []
+    for factor in _KERNELS:
+        estimator = make_estimator(rig_of(float(factor)), "profile:draws=5")
+        each.append([log_evidence(exposure, estimator) for exposure in exposures])
+    evidence = np.array(each)[:, _SETTLED:]
+    gains = np.clip(np.nan_to_num(evidence - evidence[1]), -10.0, 10.0).sum(axis=1)
+    square, slope, _ = np.polyfit(_KERNELS - 1, gains, 2)
+    vertex = -slope / (2 * square) if square < 0 else _KERNELS[gains.argmax()] - 1
+    return 1 + float(np.clip(vertex, _KERNELS[0] - 1, _KERNELS[-1] - 1))
+
+
+class _Scene:
+    """The spots of a film as frames of rigs: one for their sums along one direction, and one for the windows."""
+
+    def __init__(
+        self, film: Film, spots: Spots, times: FrameTimes, rate: float, exposure_s: float, name: str
+    ) -> None:
+        self.spots, self.name, self.film = spots, name, film
+        self.side = spots.light.shape[-1]
+        self.unit = self.side / 2
+        """Pixels of a slope unit."""
+        self.settings = FilmSettings(rate_hz=rate, exposure_s=exposure_s, scale=1.0)
+        share = min(exposure_s * rate, 1.0)
+        # The first number of steps with which the period has nearly a whole number too.
+        self.steps = min(
+            range(_STEPS, _MOST_STEPS + 1), key=lambda n: (abs(n / round(n / share) / share - 1) > _UNEVEN, n)
+        )
+        self.period = round(self.steps / share)
+        self.step_s = round(1e9 / rate / self.period) / 1e9
+        self._times = None if film.times_ns is None else film.times_ns[: len(spots.light)]
+
+    def _film(self, values: FloatArray) -> Film:
+        return Film(
+            name=self.film.name, shape=(values.shape[1], values.shape[2]), dtype=values.dtype, count=len(values),
+            pictures=lambda: iter(values), rate_hz=self.film.rate_hz, exposure_s=self.settings.exposure_s,
+            start_ns=self.film.start_ns, times_ns=self._times,
+        )  # fmt: skip
+
+    def along(self, d: int, which: Sequence[int], sd: float) -> tuple[Rig, list[Exposure]]:
+        """A rig of line sensors that see some spots' sums along a direction, and its exposures."""
+        rig = parse_rig(self.line_text(sd, which))
+        sums = self.spots.light[:, list(which)].sum(axis=2 + d) * self.unit
+        counts = rig.sensor.black_level + rig.sensor.counts_per_density * sums
+        return rig, list(film_series(self._film(counts), rig, self.settings))
+
+    def cut(self, sd: float) -> Film:
+        """The windows side by side."""
+        rig = parse_rig(self.text(sd, (), together=False))
+        density = self.spots.light * self.unit**2
+        frames = np.moveaxis(density, 1, 2).reshape(len(density), self.side, -1)
+        return self._film(rig.sensor.black_level + rig.sensor.counts_per_density * frames)
+
+    def line_text(self, sd: float, which: Sequence[int], model: ProcessSum | None = None) -> str:
+        """A rig file for some spots' sums along a direction."""
+        tables = [] if model is None else [as_table(each, self.step_s) for each in model.processes]
+        return self._rig(
+            sd, f"kind = \"line\"\npixels = {self.side}", 2 * self.spots.noise**2 * self.unit**2, len(which), 1, tables
+        )
+
+    def text(self, sd: float, directions: Sequence[Direction], *, together: bool) -> str:
+        """The rig file for the windows."""
+        n = len(self.spots.corners)
+        outputs = 2 * n if together else 2
+        tables: list[dict[str, Any]] = []
+        for d, each in enumerate(directions):
+            processes = [] if each.found is None else [as_table(one, self.step_s) for one in each.found.model.processes]
+            still = {"kind": "ornstein-uhlenbeck", "correlation_s": 1 / self.settings.rate_hz, "sd": LEAST_MOTION / self.unit}
+            for table in processes or [still]:
+                size = {key: [table[key]] for key in ("sd", "step_sd") if key in table}
+                tables.append(table | size | {"modes": [[float(o % 2 == d)] for o in range(outputs)]})
+        kind = f"kind = \"spots\"\ngrid = [1, {n}]\nwindow = [{self.side}, {self.side}]"
+        return self._rig(sd, kind, self.spots.noise**2 * self.unit**2, 1 if together else n, outputs, tables)
+
+    def _rig(
+        self, sd: float, kind: str, noise_density: float, axes: int, outputs: int, tables: list[dict[str, Any]]
+    ) -> str:
+        """The text of a rig file. The plant is where each spot rests, which is not known: the disturbance moves it."""
+        sigma, pixel = sd * math.sqrt(2) / self.unit, 1 / self.unit
+        plane = kind.startswith('kind = "spots"')
+        wide = math.sqrt(2 * math.pi * (sigma**2 / 2 + pixel**2 / 12))
+        area = pixel ** (1 + plane)
+        noise = math.sqrt(noise_density / area)
+        counts = _COUNTS / (1 / wide ** (1 + plane) + 2 * _NOISE_SDS * noise)
+        one, nothing = json.dumps(np.eye(outputs).tolist()), json.dumps([[0.0]] * outputs)
+        rest = json.dumps((np.eye(outputs) * _REST**2 / self.unit**2).tolist())
+        text = f"""# Written by `aolink look {self.film.name}`.
+name = {json.dumps(self.name)}
+
+[plant]               # where each spot rests, which is constant; the disturbance moves it about there
+axes = {axes}
+A = {one}
+B = {nothing}
+B_w = {one}
+C = {one}
+process_noise = {json.dumps(np.zeros((outputs, outputs)).tolist())}
+initial_covariance = {rest}
+
+[timing]
+fast_step_s = {self.step_s!r}
+exposure_steps = {self.steps}
+frame_period_steps = {self.period}
+
+[sensor]              # slope unit: {self.unit:g} pixels
+{kind}
+field = [-1.0, 1.0]
+noise_density = {noise_density:.6g}
+bit_depth = 16
+black_level = {math.ceil(_NOISE_SDS * noise * counts)}
+counts_per_density = {counts:.6g}
+photoelectrons = {self.spots.electrons:.4g}
+
+[sensor.kernel]
+shape = "gaussian"
+sigma = {sigma:.6g}  # {sd:.4g} pixels rms in one direction
+"""
+        return with_tables(text, "disturbance.model", tables, "by `aolink look`") if tables else text
+
+
+def _assumed(film: Film, settings: FilmSettings, scene: _Scene, kernel: float | None) -> Iterator[str]:
+    """What was taken for granted, each with what follows where it is wrong."""
+    spots = scene.spots
+    yield (
+        f"each frame is exposed for {scene.settings.exposure_s:g} s of {1 / scene.settings.rate_hz:.4g} s: if it is"
+        " not, frequencies that the blur tells from their aliases are wrong"
+    )
+    yield "all rows are exposed at the same time: with a rolling shutter the lower rows are later, and the blur is bent"
+    if kernel is None:
+        yield (
+            f"a spot at rest is round, {spots.sd:.3g} pixels wide (sd), the widest that explains the frames: if it is"
+            " wider or narrower, so is the motion that is left; --kernel gives another"
+        )
+    if film.nonlinear and settings.gamma == 1.0:
+        yield f"{nonlinear_note(film)}: if it is not linear, spots look wider than they are"
+    if spots.left_out:
+        yield f"{spots.left_out} fainter spot(s) are left out: they may move in another way"
+    if len(spots.light) < film.count:
+        yield f"the first {len(spots.light)} of {film.count} frames are looked at: later motion may be another"
+
+
+def _doubts(spots: Spots, directions: Sequence[Direction], sd: float) -> Iterator[str]:
+    """Why something cannot be told, and what would help."""
+    if not any(each.blurred for each in directions):
+        yield (
+            f"cannot tell what happens inside an exposure: the blur, {max(each.blur for each in directions):.2g} pixels"
+            f" rms, is below a third of the kernel, {sd:.2g} pixels: expose longer"
+        )
+    if spots.saturated > 0.001:
+        yield f"{spots.saturated:.1%} of the pixels about the spots are saturated or hot and are left out: expose less"
+    if spots.at_edge:
+        yield "a spot is at the edge of the picture: what it does beyond is not seen"
+
+
+def paragraph(looked: Looked) -> str:
+    """What moves, how, and how well it is known, in a few sentences."""
+    n = len(looked.spots.corners)
+    what = f"{n} spots, each" if n > 1 else "One spot,"
+    said = [f"{what} {looked.sd:.3g} pixels wide at rest (standard deviation)."]
+    if n > 1:
+        said.append("They move together." if looked.together else "Each moves on its own, all in the same way.")
+    moving = [each for each in looked.directions if each.moves]
+    for each in looked.directions:
+        if each.found is None:
+            said.append(f"Along {each.name} nothing moves by more than {_digits(each.least)} pixels rms.")
+        else:
+            said.append(f"Along {each.name}: {described(each, looked)}.")
+    for each in moving:
+        where = f" along {each.name}" if len(moving) > 1 else ""
+        if each.blurred:
+            better = each.held / each.known
+            tells = f"the blur tells {better:.2g} times more than the centroid here" if better > 1.2 else (
+                "the blur tells hardly more than the centroid here"
+            )
+            said.append(
+                f"Inside an exposure the path{where} is known to {_digits(each.known)} pixels rms; the centroid alone"
+                f" leaves {_digits(each.held)}: {tells}."
+            )
+    return " ".join(said)
+
+
+def described(direction: Direction, looked: Looked) -> str:
+    """The motion along one direction in words, with the sets of its frequencies."""
+    assert direction.found is not None
+    parts, sets = [], {each.name: each for each in direction.found.parameters}
+    processes = direction.found.model.processes
+    for number, process in enumerate(processes):
+        if process.kind != "resonance":
+            kind = "it walks at random" if process.kind == "random-walk" else "it wanders at random and returns within"
+            parts.append(kind if process.kind == "random-walk" else f"{kind} {process['correlation_s']:.2g} s")
+            continue
+        names = [name for name in sets if name.endswith("frequency_hz")]
+        one = sets[names[sum(each.kind == "resonance" for each in processes[:number])]]
+        size = f", {_digits(direction.size)} pixels rms" if len(processes) == 1 else ""
+        parts.append(f"it vibrates at {in_set(one)}{size}")
+    alone = "" if processes[0].kind == "resonance" and len(processes) == 1 else f", {_digits(direction.size)} pixels rms in all"
+    return " and ".join(parts) + alone
+
+
+def in_set(each: Identified, most: int = 4) -> str:
+    """A frequency with its set in words; of many pieces the first ones."""
+    finest = min((piece.high - piece.low for piece in each.pieces), default=0.0)
+    digits = max(0, min(3, 1 - math.floor(math.log10(max(finest, 1e-3)))))
+    if not each.pieces:
+        return f"{each.best:.{digits}f} Hz, though no frequency explains both the width and the shape of the blur"
+    own = next((piece for piece in each.pieces if piece.low <= each.best <= piece.high), each.pieces[0])
+    others = [piece for piece in each.pieces if piece is not own]
+    said = f"{each.best:.{digits}f} Hz [{own.low:.{digits}f}, {own.high:.{digits}f}]"
+    if not others:
+        return said
+    named = ", ".join(f"{piece.best:.{digits}f}" for piece in others[:most])
+    more = " and so on" if len(others) > most else ""
+    return f"{said} or an alias of it, {named} Hz{more}, which these frames cannot tell from it,"
+
+
+def _digits(value: float) -> str:
+    return f"{value:.2g}" if value < 1 else f"{value:.3g}"
+
+
+def as_json(looked: Looked) -> dict[str, Any]:
+    """The numbers of `paragraph`."""
+    return {
+        "spots": looked.spots.corners.tolist(), "window": int(looked.spots.light.shape[-1]), "kernel_sd": looked.sd,
+        "rate_hz": looked.rate_hz, "exposure_s": looked.exposure_s, "together": looked.together,
+        "blurred": looked.blurred, "moves": looked.moves,
+        "directions": {each.name: _direction_as_json(each) for each in looked.directions},
+        "assumed": list(looked.assumed), "doubts": list(looked.doubts),
+    }  # fmt: skip
+
+
+def _direction_as_json(each: Direction) -> dict[str, Any]:
+    found = None if each.found is None else each.found.model.name
+    parameters = {} if each.found is None else {
+        one.name: {"value": one.best, "set": [[piece.low, piece.high] for piece in one.pieces]}
+        for one in each.found.parameters
+    }
+    return {
+        "moves": each.moves, "rms_pixels": each.size, "model": found, "parameters": parameters,
+        "path_sd_pixels": None if math.isnan(each.known) else each.known,
+        "centroid_sd_pixels": None if math.isnan(each.held) else each.held,
+    }  # fmt: skip
