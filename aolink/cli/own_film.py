@@ -7,17 +7,20 @@ from typing import Annotated
 
 import typer
 
-from aolink.cli.common import JsonOption, OverwriteOption, app, local_file, progress, program, stdout
+from aolink.cli.common import JsonOption, OverwriteOption, app, local_file, program, progress, stderr, stdout
 from aolink.cli.films import ColourOption, GammaOption, InvertOption, RateOption, TopicOption, film_settings
 from aolink.errors import ImportingError, RecordingError
+from aolink.signals import Interrupted
 
 
 @app.command(
-    epilog="Example: aolink look film.tif --rate 50 --exposure 0.018  |  aolink look film.avi --exposure 0.02 --gamma 2.2"
+    epilog="Example: aolink look film.tif --rate 50 --exposure 0.018"
+    "  |  aolink look film.avi --exposure 0.02 --gamma 2.2"
 )
 def look(
     source: Annotated[
-        Path, typer.Argument(metavar="FILM", parser=local_file, help="A film of bright spots, as `aolink import` takes.")
+        Path,
+        typer.Argument(metavar="FILM", parser=local_file, help="A film of spots, as `aolink import` takes."),
     ],
     rate: RateOption = None,
     exposure: Annotated[
@@ -31,7 +34,9 @@ def look(
         float | None,
         typer.Option(metavar="PIXELS", help="Standard deviation of a resting spot; without it the frames tell."),
     ] = None,
-    quick: Annotated[bool, typer.Option("--quick", help="End with the first answer: one process moves a spot.")] = False,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="End with the first answer: one process moves a spot.")
+    ] = False,
     invert: InvertOption = False,
     gamma: GammaOption = 1.0,
     topic: TopicOption = None,
@@ -47,9 +52,9 @@ def look(
     from aolink.films.film import one_colour
     from aolink.films.formats import open_film
     from aolink.importing.recording import import_film
+    from aolink.jobs.look import Looked, paragraph
     from aolink.jobs.look import as_json as numbers
     from aolink.jobs.look import look as look_at
-    from aolink.jobs.look import paragraph
     from aolink.jobs.look_page import write_page
     from aolink.recording.reader import Recording
     from aolink.recording.reestimate import write_reestimated
@@ -66,7 +71,8 @@ def look(
     rig_file, recording, page = folder / "rig.toml", folder / "film.mcap", folder / "page.html"
     if not overwrite and (there := [each for each in (rig_file, recording, page) if each.exists()]):
         raise RecordingError(f"{there[0]} exists already: give another -o DIR, or --overwrite")
-    looked = None
+    looked: Looked | None = None
+    interrupted: Interrupted | None = None
     for thorough in (False, True)[: 1 if quick else 2]:
         try:
             with progress("look", None) as tell:
@@ -74,10 +80,11 @@ def look(
                     film, settings, source.stem, kernel=kernel, thorough=thorough,
                     tell=lambda what, done, of: tell(done, f"{what}: {done} of {of}"),
                 )  # fmt: skip
-        except KeyboardInterrupt:
+        except Interrupted as stopped:
             if looked is None:
                 raise
-            stdout.print("stopped: the first answer is kept", markup=False)
+            stderr.print("stopped: the first answer is kept and written", markup=False)
+            interrupted = stopped
             break
         first, looked = looked, said
         if not as_json and (first is None or paragraph(first) != paragraph(looked)):
@@ -108,12 +115,9 @@ def look(
     if as_json:
         files = {"rig": str(rig_file), "recording": str(recording), "page": str(page)}
         print(json.dumps({"text": paragraph(looked), **numbers(looked), **files}, allow_nan=False))
-        return
-    for each in looked.doubts:
-        stdout.print(f"{each}.", markup=False)
-    stdout.print("Assumed:", markup=False)
-    for each in looked.assumed:
-        stdout.print(f"  {each}.", markup=False)
-    stdout.print(f"{page}: the pictures. To go on:", markup=False)
-    for each in commands:
-        stdout.print(f"  {each}", markup=False)
+    else:
+        lines = [*(f"{each}." for each in looked.doubts), "Assumed:", *(f"  {each}." for each in looked.assumed)]
+        lines += [f"{page}: the pictures. To go on:", *(f"  {each}" for each in commands)]
+        stdout.print("\n".join(lines), markup=False)
+    if interrupted is not None:
+        raise interrupted

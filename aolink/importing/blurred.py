@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from itertools import islice
 
 import numpy as np
@@ -24,7 +25,6 @@ from aolink.importing.defects import find_defects
 from aolink.importing.frames import FilmLight, FilmSettings
 from aolink.numerics.arrays import BoolArray, FloatArray, IntArray
 from aolink.optics.kernel import pixel_masses
-from aolink.optics.maxima import cut_windows
 
 MOST_SPOTS = 4
 _SHOWING = 150
@@ -48,7 +48,7 @@ _WIDTHS = 1.02 ** np.arange(-40, 92)
 """Standard deviations of the kernels that are tried, pixels: .45 to 6."""
 _FINE = 3
 """Places in a pixel at which a density may be: with one, a sharp spot between two pixels looks wider than it is."""
-_NARROWER, _WORSE, _SURE = 8, 0.4, 2.5
+_NARROWER, _WORSE, _SURE = 8, 1.0, 2.5
 """A kernel is too wide where the squares of a profile's residuals exceed those with one so many steps narrower by so
 many squares of the noise, and by so many standard deviations of chance."""
 _BRIGHT, _TAKEN, _SHOT = 0.3, 1.5, 0.3
@@ -116,9 +116,10 @@ def find_spots(
     sd = _kernel(profiles)
     rows, columns = film.shape
     ends = corners + side
+    electrons = _electrons(profiles, sd, noise * math.sqrt(side))
     return Spots(
         light=windows, corners=corners, sd=sd, noise=noise,
-        electrons=_electrons(profiles, sd, noise * math.sqrt(side)), mean=mean, saturated=float(bad.mean()), left_out=left_out,
+        electrons=electrons, mean=mean, saturated=float(bad.mean()), left_out=left_out,
         at_edge=bool((corners < 0).any() or (ends > (columns, rows)).any()),
     )  # fmt: skip
 
@@ -128,7 +129,8 @@ def _seen(
 ) -> tuple[FloatArray, FloatArray, float]:
     """The brightest value of each pixel in smoothed frames, the mean frame, both (rows, columns) without their ground,
     and the noise of a pixel."""
-    every, brightest, total, last, differences = max(1, count // _SHOWING), None, None, None, []
+    every, differences = max(1, count // _SHOWING), list[float]()
+    brightest = total = last = None
     for k, frame in enumerate(islice(film.frames(), count)):
         progress(k)
         shown, _ = light.of(frame)
@@ -240,21 +242,28 @@ def _kernel(profiles: list[FloatArray]) -> float:
     some = np.unique(np.linspace(0, len(profiles[0]) - 1, _KERNEL_FRAMES).round().astype(int))
     widest = math.inf
     for profile in profiles:
-        squares, taken = np.empty((2, len(_WIDTHS), len(some)))
-        for k, sd in enumerate(_WIDTHS):
-            density, left = _densities(profile[some], sd)
-            squares[k] = (left**2).sum(axis=(1, 2))
-            taken[k] = np.count_nonzero(density > 0, axis=(1, 2))
-        noise = float((squares.mean(axis=1) / (profile[0].size - taken.mean(axis=1))).min())
-        # A density that is not zero takes a square of the noise from the residuals.
-        misfit = squares / noise + taken
-        more = misfit[_NARROWER:] - misfit[:-_NARROWER]
-        chance = _SURE * more.std(axis=1) / math.sqrt(len(some))
-        over = more.mean(axis=1) - np.maximum(_WORSE, chance)
-        right = np.flatnonzero(over <= 0)
-        if len(right) and (last := right[-1]) < len(over) - 1:
-            part = float(over[last] / (over[last] - over[last + 1]))
-            widest = min(widest, float(_WIDTHS[last + _NARROWER] * (_WIDTHS[1] / _WIDTHS[0]) ** part))
+
+        @cache
+        def misfit(k: int, profile: FloatArray = profile[some]) -> tuple[FloatArray, FloatArray]:
+            """Squares of the residuals of each frame, and how many densities are not zero."""
+            density, left = _densities(profile, float(_WIDTHS[k]))
+            return (left**2).sum(axis=(1, 2)), np.count_nonzero(density > 0, axis=(1, 2))
+
+        coarse = range(0, len(_WIDTHS), _NARROWER)
+        noise = min(float(square.mean() / (profile[0].size - taken.mean())) for square, taken in map(misfit, coarse))
+
+        def too_wide(k: int, noise: float = noise) -> float:
+            # A density that is not zero takes a square of the noise from the residuals.
+            (square, taken), (narrower, by_it) = misfit(k), misfit(k - _NARROWER)
+            more = (square - narrower) / noise + taken - by_it
+            return float(more.mean() - max(_WORSE, _SURE * more.std() / math.sqrt(len(more))))
+
+        right = [k for k in coarse[1:] if too_wide(k) <= 0]
+        if not right or right[-1] == coarse[-1]:
+            continue
+        last = max(k for k in range(right[-1], right[-1] + _NARROWER) if too_wide(k) <= 0)
+        part = too_wide(last) / (too_wide(last) - too_wide(last + 1))
+        widest = min(widest, float(_WIDTHS[last] * (_WIDTHS[1] / _WIDTHS[0]) ** part))
     return widest
 
 

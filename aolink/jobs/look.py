@@ -46,6 +46,8 @@ LEAST_BLUR = 1 / 3
 """Blur, in standard deviations of the kernel, from which on it shows the motion inside an exposure."""
 _STEPS, _MOST_STEPS = 16, 48
 """Fast steps in an exposure, at least where the exposure is short, and at most."""
+_SHARPEST = 0.05
+"""Share of the frames that are the sharpest."""
 _NOTHING = 1e6
 """Variance of readings that say nothing."""
 _SETTLED = 8
@@ -72,6 +74,8 @@ class Direction:
     """Root mean square of the path about its mean in a frame, pixels."""
     blurred: bool
     """Whether the blur is large enough against the kernel to be told from it."""
+    least_blur: float
+    """Blur of the sharpest frames, pixels."""
     sure: float
     """Root of the standard deviation of the square of ``moved`` by noise alone, pixels."""
     found: IdentifiedModel | None = None
@@ -181,25 +185,29 @@ def look(
         )
     scene = _Scene(film, spots, times, rate, exposure_s, name)
     everything = range(len(spots.corners))
-    seen = [readings(*scene.along(d, everything, sd)) for d in (0, 1)]
-    measured = [_direction(DIRECTIONS[d], each, scene.unit, sd) for d, each in enumerate(seen)]
-    together = len(everything) > 1 and _one_motion(seen)
+
+    def measured(d: int, sd: float) -> tuple[Direction, list[Readings]]:
+        seen = [readings(*scene.along(d, k, sd)) for k in everything]
+        return _direction(DIRECTIONS[d], seen, scene.unit, sd), seen
+
+    both = [measured(d, sd) for d in (0, 1)]
+    together = len(everything) > 1 and _one_motion([seen for _, seen in both])
     which = [0] if together else everything
-    directions = []
-    # The direction of more motion first: it tells more of the kernel.
-    for d in sorted((0, 1), key=lambda d: -measured[d].blur):
-        each = measured[d]
+    names = (*_SINGLE, *_SUMS) if thorough else _SINGLE
+    directions = list[Direction]()
+    # The direction of more blur first: it tells most of the kernel.
+    for d in sorted((0, 1), key=lambda d: -both[d][0].blur):
+        each = measured(d, sd)[0]
         if each.moves:
-            names = (*_SINGLE, *_SUMS) if thorough else _SINGLE
             told = partial(_say, tell, each.name)
-            each, sd = _identified(scene, d, each, which, sd, names, told, fixed=kernel is not None)
+            each, sd = _identified(scene, d, each, which, sd, names, told, fixed=kernel is not None or bool(directions))
         directions.append(each)
     directions.sort(key=lambda each: each.name)
+    doubts = tuple(_doubts(spots, directions, sd, given=kernel is not None))
     return Looked(
         spots=spots, rate_hz=rate, exposure_s=exposure_s, sd=sd, together=together, directions=tuple(directions),
-        text=scene.text(sd, directions, together=together), cut=scene.cut(sd),
-        settings=scene.settings,
-        assumed=tuple(_assumed(film, settings, scene, kernel)), doubts=tuple(_doubts(spots, directions, sd)),
+        text=scene.text(sd, directions, together=together), cut=scene.cut(sd), settings=scene.settings,
+        assumed=tuple(_assumed(film, settings, scene, kernel)), doubts=doubts,
     )  # fmt: skip
 
 
@@ -207,35 +215,42 @@ def _say(tell: Tell, direction: str, what: str, done: int, of: int) -> None:
     tell(f"{what.split(',')[0]} along {direction}", done, of)
 
 
-def _direction(name: str, seen: Readings, unit: float, sd: float) -> Direction:
+def _direction(name: str, seen: Sequence[Readings], unit: float, sd: float) -> Direction:
     """How far the spots move from frame to frame and within one."""
-    good = seen.usable
-    if not good.any():
-        return Direction(name=name, moved=0.0, blur=0.0, blurred=False, sure=0.0)
-    mean = np.where(good, seen.mean + seen.centre, np.nan)
-    moved = float(np.nanmean(np.nanvar(mean, axis=1)))
-    noise = float(seen.mean_noise[good].mean())
+    usable = [each for each in seen if each.usable.any()]
+    if not usable:
+        return Direction(name=name, moved=0.0, blur=0.0, blurred=False, least_blur=0.0, sure=0.0)
+
+    def mean(of: Callable[[Readings], FloatArray]) -> float:
+        return float(np.mean([of(each)[each.usable].mean() for each in usable]))
+
+    noise = mean(lambda each: each.mean_noise)
+    moved = float(np.mean([(each.mean + each.centre)[each.usable].var() for each in usable])) - noise
     # The square about c of the mean has the noise of the mean in it.
-    blur = float((seen.square - seen.mean**2 + seen.mean_noise)[good].mean())
+    blur = unit * math.sqrt(max(mean(lambda each: each.square - each.mean**2 + each.mean_noise), 0.0))
+    count = sum(int(each.usable.sum()) for each in usable)
+    within = np.concatenate([(each.square - each.mean**2 + each.mean_noise)[each.usable] for each in usable])
     return Direction(
-        name=name, moved=unit * math.sqrt(max(moved - noise, 0.0)), blur=unit * math.sqrt(max(blur, 0.0)),
-        sure=unit * math.sqrt(noise * math.sqrt(2 / good.sum())),
-        blurred=unit * math.sqrt(max(blur, 0.0)) >= LEAST_BLUR * sd,
+        name=name, moved=unit * math.sqrt(max(moved, 0.0)), blur=blur, blurred=blur >= LEAST_BLUR * sd,
+        least_blur=unit * math.sqrt(max(float(np.quantile(within, _SHARPEST)), 0.0)),
+        sure=unit * math.sqrt(noise * math.sqrt(2 / count)),
     )  # fmt: skip
 
 
-def _one_motion(seen: Sequence[Readings]) -> bool:
+def _one_motion(seen: Sequence[Sequence[Readings]]) -> bool:
     """Whether the mean places of several spots are one motion and noise, or motions of their own: by the likelihood,
     with the Bayesian information criterion."""
     gain = 0.0
-    for each in seen:
-        shown = (each.mean + each.centre)[:, each.usable.all(axis=0)]
+    for spots in seen:
+        usable = np.all([each.usable[0] for each in spots], axis=0)
+        shown = np.array([(each.mean + each.centre)[0, usable] for each in spots])
         n, count = shown.shape
         if count < FEWEST:
             return False
         S = np.cov(shown, bias=True)
         common = max(float((S.sum() - np.trace(S)) / (n * (n - 1))), 0.0)
-        C = common + np.diag(np.maximum(np.diag(S) - common, each.mean_noise.mean(axis=1)))
+        noise = np.array([each.mean_noise[0, usable].mean() for each in spots])
+        C = common + np.diag(np.maximum(np.diag(S) - common, noise))
         fit = np.log(np.diag(S)).sum() + n - np.linalg.slogdet(C)[1] - np.trace(np.linalg.solve(C, S))
         gain += count / 2 * float(fit) - math.log(count) / 2
     return gain > 0
@@ -246,35 +261,40 @@ def _identified(
     tell: Callable[[str, int, int], None], *, fixed: bool,
 ) -> tuple[Direction, float]:  # fmt: skip
     """The direction with the model of its motion and the errors of its path, and the kernel that the pixels prefer."""
-    rig, exposures = scene.along(d, which, sd)
-    some = exposures[:_SEARCHED]
-    wanted, seen = Wanted(), readings(rig, some)
+    films = [scene.along(d, k, sd)[1] for k in which]
+    rig, some = parse_rig(scene.line_text(sd)), films[0][:_SEARCHED]
+    wanted, seen = Wanted(), [readings(rig, each[:_SEARCHED]) for each in films]
     if not direction.blurred:
         # Sharp frames show places, and of the width only how well the kernel is known.
-        wanted = Wanted(highest_hz=scene.settings.rate_hz / 2, pixels=False)
-        seen = replace(seen, square_noise=np.full_like(seen.square_noise, _NOTHING))
+        wanted = Wanted(highest_hz=scene.rate_hz / 2, pixels=False)
+        seen = [replace(each, square_noise=np.full_like(each.square_noise, _NOTHING)) for each in seen]
     name, tops = _best_model(rig, seen, names, wanted, tell)
-    found = from_readings(rig, [seen], some, replace(wanted, models=(name,)), tell, tops).found[0]
+    found = from_readings(rig, seen, some, replace(wanted, models=(name,)), tell, tops).found[0]
     if not direction.blurred:
         found = _with_aliases(found, scene, LEAST_BLUR * sd)
     if direction.blurred and not fixed:
-        sd *= _kernel_by_pixels(lambda factor: parse_rig(scene.line_text(sd * factor, which, found.model)), some)
-    rig = parse_rig(scene.line_text(sd, which, found.model))
-    estimates = run(rig, exposures, ["profile"])["profile"]
-    path = np.array([each.path for each in estimates])
-    error = float(np.mean(np.square([each.path_sd for each in estimates[_SETTLED:]])))
+        sd *= _kernel_by_pixels(lambda factor: parse_rig(scene.line_text(sd * factor, found.model)), some)
+    rig = parse_rig(scene.line_text(sd, found.model))
+    each_film = [run(rig, each, ["profile"])["profile"] for each in films]
+    path = np.array([[one.path[0] for one in each] for each in each_film]).swapaxes(0, 1)
+    settled = [one for each in each_film for one in each[_SETTLED:]]
+    error = float(np.mean(np.square([each.path_sd for each in settled])))
     within = float(np.mean((path[_SETTLED:] - path[_SETTLED:].mean(axis=2, keepdims=True)) ** 2))
-    nis = np.concatenate([each.nis[each.nis > 0] / each.innovation.shape[1] for each in estimates[_SETTLED:]])
+    nis = np.concatenate([each.nis[each.nis > 0] / each.innovation.shape[1] for each in settled])
     return replace(
-        direction, found=found, known=scene.unit * math.sqrt(error), held=scene.unit * math.sqrt(within + error),
-        path=scene.unit * (path + 1) - 0.5, nis=float(np.median(nis)) if len(nis) else math.nan,
+        direction,
+        found=found,
+        known=scene.unit * math.sqrt(error),
+        held=scene.unit * math.sqrt(within + error),
+        path=scene.unit * (path + 1) - 0.5,
+        nis=float(np.median(nis)) if len(nis) else math.nan,
     ), sd
 
 
 def _with_aliases(found: IdentifiedModel, scene: _Scene, most_blur: float) -> IdentifiedModel:
     """The model with all aliases of a frequency in its set that would blur the spot by no more than ``most_blur``,
     pixels rms: sharp frames cannot tell them apart."""
-    rate, exposure_s, highest = scene.settings.rate_hz or 1.0, scene.settings.exposure_s or 0.0, 0.5 / scene.step_s
+    rate, exposure_s, highest = scene.rate_hz, scene.exposure_s, 0.5 / scene.step_s
     sds = {each.name: each.best * scene.unit for each in found.parameters if each.name.endswith("sd")}
 
     def aliases(each: Identified) -> Identified:
@@ -299,16 +319,16 @@ def _with_aliases(found: IdentifiedModel, scene: _Scene, most_blur: float) -> Id
 
 
 def _best_model(
-    rig: Rig, seen: Readings, names: Sequence[str], wanted: Wanted, tell: Callable[[str, int, int], None]
+    rig: Rig, seen: Sequence[Readings], names: Sequence[str], wanted: Wanted, tell: Callable[[str, int, int], None]
 ) -> tuple[str, list[Maximum]]:
     """The sum of kinds that explains readings best by the Bayesian information criterion, and its local maxima."""
     best: tuple[float, str, list[Maximum]] = (-math.inf, "", [])
-    count = 2 * int(seen.usable.sum())
+    count = 2 * sum(int(each.usable.sum()) for each in seen)
     for number, name in enumerate(names):
         tell("models", number, len(names))
-        space = space_wanted(rig, kinds_of(name), [seen], wanted)
+        space = space_wanted(rig, kinds_of(name), seen, wanted)
         try:
-            found = maxima(space, [seen])
+            found = maxima(space, seen)
         except IdentificationError:
             continue
         value = found[0].log_likelihood - len(space.names) * math.log(count) / 2
@@ -334,13 +354,12 @@ def _kernel_by_pixels(rig_of: Callable[[float], Rig], exposures: Sequence[Exposu
 class _Scene:
     """The spots of a film as frames of rigs: one for their sums along one direction, and one for the windows."""
 
-    def __init__(
-        self, film: Film, spots: Spots, times: FrameTimes, rate: float, exposure_s: float, name: str
-    ) -> None:
+    def __init__(self, film: Film, spots: Spots, times: FrameTimes, rate: float, exposure_s: float, name: str) -> None:
         self.spots, self.name, self.film = spots, name, film
         self.side = spots.light.shape[-1]
         self.unit = self.side / 2
         """Pixels of a slope unit."""
+        self.rate_hz, self.exposure_s = rate, exposure_s
         self.settings = FilmSettings(rate_hz=rate, exposure_s=exposure_s, scale=1.0)
         share = min(exposure_s * rate, 1.0)
         # The first number of steps with which the period has nearly a whole number too.
@@ -354,14 +373,14 @@ class _Scene:
     def _film(self, values: FloatArray) -> Film:
         return Film(
             name=self.film.name, shape=(values.shape[1], values.shape[2]), dtype=values.dtype, count=len(values),
-            pictures=lambda: iter(values), rate_hz=self.film.rate_hz, exposure_s=self.settings.exposure_s,
+            pictures=lambda: iter(values), rate_hz=self.film.rate_hz, exposure_s=self.exposure_s,
             start_ns=self.film.start_ns, times_ns=self._times,
         )  # fmt: skip
 
-    def along(self, d: int, which: Sequence[int], sd: float) -> tuple[Rig, list[Exposure]]:
-        """A rig of line sensors that see some spots' sums along a direction, and its exposures."""
-        rig = parse_rig(self.line_text(sd, which))
-        sums = self.spots.light[:, list(which)].sum(axis=2 + d) * self.unit
+    def along(self, d: int, spot: int, sd: float) -> tuple[Rig, list[Exposure]]:
+        """A rig of a line sensor that sees a spot's sums along a direction, and its exposures."""
+        rig = parse_rig(self.line_text(sd))
+        sums = self.spots.light[:, spot, None].sum(axis=2 + d) * self.unit
         counts = rig.sensor.black_level + rig.sensor.counts_per_density * sums
         return rig, list(film_series(self._film(counts), rig, self.settings))
 
@@ -372,11 +391,11 @@ class _Scene:
         frames = np.moveaxis(density, 1, 2).reshape(len(density), self.side, -1)
         return self._film(rig.sensor.black_level + rig.sensor.counts_per_density * frames)
 
-    def line_text(self, sd: float, which: Sequence[int], model: ProcessSum | None = None) -> str:
-        """A rig file for some spots' sums along a direction."""
+    def line_text(self, sd: float, model: ProcessSum | None = None) -> str:
+        """A rig file for a spot's sums along a direction."""
         tables = [] if model is None else [as_table(each, self.step_s) for each in model.processes]
         return self._rig(
-            sd, f"kind = \"line\"\npixels = {self.side}", 2 * self.spots.noise**2 * self.unit**2, len(which), 1, tables
+            sd, f'kind = "line"\npixels = {self.side}', 2 * self.spots.noise**2 * self.unit**2, 1, 1, tables
         )
 
     def text(self, sd: float, directions: Sequence[Direction], *, together: bool) -> str:
@@ -386,11 +405,15 @@ class _Scene:
         tables: list[dict[str, Any]] = []
         for d, each in enumerate(directions):
             processes = [] if each.found is None else [as_table(one, self.step_s) for one in each.found.model.processes]
-            still = {"kind": "ornstein-uhlenbeck", "correlation_s": 1 / self.settings.rate_hz, "sd": LEAST_MOTION / self.unit}
+            still = {
+                "kind": "ornstein-uhlenbeck",
+                "correlation_s": 1 / self.rate_hz,
+                "sd": LEAST_MOTION / self.unit,
+            }
             for table in processes or [still]:
                 size = {key: [table[key]] for key in ("sd", "step_sd") if key in table}
                 tables.append(table | size | {"modes": [[float(o % 2 == d)] for o in range(outputs)]})
-        kind = f"kind = \"spots\"\ngrid = [1, {n}]\nwindow = [{self.side}, {self.side}]"
+        kind = f'kind = "spots"\ngrid = [1, {n}]\nwindow = [{self.side}, {self.side}]'
         return self._rig(sd, kind, self.spots.noise**2 * self.unit**2, 1 if together else n, outputs, tables)
 
     def _rig(
@@ -442,7 +465,7 @@ def _assumed(film: Film, settings: FilmSettings, scene: _Scene, kernel: float | 
     """What was taken for granted, each with what follows where it is wrong."""
     spots = scene.spots
     yield (
-        f"each frame is exposed for {scene.settings.exposure_s:g} s of {1 / scene.settings.rate_hz:.4g} s: if it is"
+        f"each frame is exposed for {scene.exposure_s:g} s of {1 / scene.rate_hz:.4g} s: if it is"
         " not, frequencies that the blur tells from their aliases are wrong"
     )
     yield "all rows are exposed at the same time: with a rolling shutter the lower rows are later, and the blur is bent"
@@ -459,12 +482,18 @@ def _assumed(film: Film, settings: FilmSettings, scene: _Scene, kernel: float | 
         yield f"the first {len(spots.light)} of {film.count} frames are looked at: later motion may be another"
 
 
-def _doubts(spots: Spots, directions: Sequence[Direction], sd: float) -> Iterator[str]:
+def _doubts(spots: Spots, directions: Sequence[Direction], sd: float, *, given: bool) -> Iterator[str]:
     """Why something cannot be told, and what would help."""
     if not any(each.blurred for each in directions):
         yield (
             f"cannot tell what happens inside an exposure: the blur, {max(each.blur for each in directions):.2g} pixels"
             f" rms, is below a third of the kernel, {sd:.2g} pixels: expose longer"
+        )
+    elif not given and min(each.least_blur for each in directions) >= LEAST_BLUR * sd:
+        yield (
+            f"no frame shows the spot as narrow as its kernel, {sd:.2g} pixels, along x or along y: this width is known"
+            " from the steep sides of the blur alone, and holds for a Gaussian spot only; if a spot at rest is wider,"
+            " frequencies may be wrong: give its width with --kernel"
         )
     if spots.saturated > 0.001:
         yield f"{spots.saturated:.1%} of the pixels about the spots are saturated or hot and are left out: expose less"
@@ -489,8 +518,10 @@ def paragraph(looked: Looked) -> str:
         where = f" along {each.name}" if len(moving) > 1 else ""
         if each.blurred:
             better = each.held / each.known
-            tells = f"the blur tells {better:.2g} times more than the centroid here" if better > 1.2 else (
-                "the blur tells hardly more than the centroid here"
+            tells = (
+                f"the blur tells {better:.2g} times more than the centroid here"
+                if better > 1.2
+                else ("the blur tells hardly more than the centroid here")
             )
             said.append(
                 f"Inside an exposure the path{where} is known to {_digits(each.known)} pixels rms; the centroid alone"
@@ -513,7 +544,11 @@ def described(direction: Direction, looked: Looked) -> str:
         one = sets[names[sum(each.kind == "resonance" for each in processes[:number])]]
         size = f", {_digits(direction.size)} pixels rms" if len(processes) == 1 else ""
         parts.append(f"it vibrates at {in_set(one)}{size}")
-    alone = "" if processes[0].kind == "resonance" and len(processes) == 1 else f", {_digits(direction.size)} pixels rms in all"
+    alone = (
+        ""
+        if processes[0].kind == "resonance" and len(processes) == 1
+        else f", {_digits(direction.size)} pixels rms in all"
+    )
     return " and ".join(parts) + alone
 
 
@@ -550,10 +585,14 @@ def as_json(looked: Looked) -> dict[str, Any]:
 
 def _direction_as_json(each: Direction) -> dict[str, Any]:
     found = None if each.found is None else each.found.model.name
-    parameters = {} if each.found is None else {
-        one.name: {"value": one.best, "set": [[piece.low, piece.high] for piece in one.pieces]}
-        for one in each.found.parameters
-    }
+    parameters = (
+        {}
+        if each.found is None
+        else {
+            one.name: {"value": one.best, "set": [[piece.low, piece.high] for piece in one.pieces]}
+            for one in each.found.parameters
+        }
+    )
     return {
         "moves": each.moves, "rms_pixels": each.size, "model": found, "parameters": parameters,
         "path_sd_pixels": None if math.isnan(each.known) else each.known,

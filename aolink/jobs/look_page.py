@@ -43,7 +43,10 @@ def write_page(looked: Looked, path: Path, name: str, commands: Sequence[str], *
             figures.append(picture_in_page(_profile(looked), caption))
             caption = "The spectrum of the path; in grey the sets of its frequencies."
             figures.append(picture_in_page(_spectra(looked), caption))
-        parts += ["<h2>Pictures</h2>", f'<div class="row pairs">{"".join(f"<div>{each}</div>" for each in figures)}</div>']
+        parts += [
+            "<h2>Pictures</h2>",
+            f'<div class="row pairs">{"".join(f"<div>{each}</div>" for each in figures)}</div>',
+        ]
         parts += ["<h2>Numbers</h2>", facts_table(_numbers(looked))]
         parts += ["<h2>What was assumed</h2>", *(f"<p>{escape(each)}.</p>" for each in looked.assumed)]
         parts += ["<h2>To go on</h2>", f"<pre>{escape(chr(10).join(commands))}</pre>"]
@@ -53,7 +56,7 @@ def write_page(looked: Looked, path: Path, name: str, commands: Sequence[str], *
 def _numbers(looked: Looked) -> dict[str, str]:
     """The table of the paragraph."""
     rows = {
-        "frames": f"{len(looked.spots.light)} at {looked.rate_hz:.6g} a second, each exposed for {looked.exposure_s:.4g} s",
+        "frames": f"{len(looked.spots.light)}, {looked.rate_hz:.6g} a second, {looked.exposure_s:.4g} s each",
         "spots": ", ".join(f"at {x},{y}" for x, y in looked.spots.corners + looked.spots.light.shape[-1] // 2),
         "kernel": f"{looked.sd:.3g} pixels (standard deviation)",
     }
@@ -78,10 +81,12 @@ def _whole(looked: Looked) -> Figure:
     axes.imshow(shown, cmap="gray", vmin=0, vmax=float(np.quantile(shown, 0.999)))
     side = looked.spots.light.shape[-1]
     for number, (x, y) in enumerate(looked.spots.corners, 1):
-        box = np.array([[0, 1, 1, 0, 0], [0, 0, 1, 1, 0]]) * side - 0.5
-        axes.plot(*(box + [[x], [y]]), color="tab:orange", linewidth=0.8)
+        across, along = (np.array(corners) * side - 0.5 for corners in ((0, 1, 1, 0, 0), (0, 0, 1, 1, 0)))
+        axes.plot(x + across, y + along, color="tab:orange", linewidth=0.8)
         axes.annotate(str(number), (x, y), color="tab:orange", fontsize=7, ha="right", va="bottom")
-    axes.set(xlabel="x, pixels", ylabel="y, pixels", xlim=(-0.5, shown.shape[1] - 0.5), ylim=(shown.shape[0] - 0.5, -0.5))
+    axes.set(
+        xlabel="x, pixels", ylabel="y, pixels", xlim=(-0.5, shown.shape[1] - 0.5), ylim=(shown.shape[0] - 0.5, -0.5)
+    )
     return figure
 
 
@@ -122,7 +127,7 @@ def _profile(looked: Looked) -> Figure:
     number, d = _chosen(looked)[0], _main(looked)
     light = looked.spots.light[number, 0].sum(axis=d)
     at = np.arange(len(light))
-    masses = pixel_masses(looked.sd**2, np.arange(len(light) + 1) - 0.5, _path(looked, d, number), 0)[0]
+    masses = pixel_masses(looked.sd**2, np.arange(-0.5, len(light)), _path(looked, d, number), 0)[0]
     axes.plot(at, light, "o", markersize=3, color="black", label="measured")
     axes.plot(at, masses.mean(axis=0), color="tab:orange", label="predicted")
     axes.set(xlabel=f"{looked.directions[d].name}, pixels of the window", ylabel="share of the light")
