@@ -5,15 +5,14 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
-from collections.abc import Iterable
 
 import numpy as np
 from numpy.typing import NDArray
 
-from aolink.devices.drivers import Failure
 from aolink.devices.interfaces import lacks_of
 from aolink.devices.outages import Outages
-from aolink.devices.simple import DirectMirror, Held
+from aolink.devices.played import Played
+from aolink.devices.simple import DirectMirror
 from aolink.rig import Rig
 
 _REMEMBERED = 1000
@@ -23,7 +22,7 @@ _LEAST_PERIOD_NS = 1_000_000
 """Least period of checking whether the host is held up, ns: more frequent checks would cost more than they show."""
 
 
-class PacedMirror:
+class PacedMirror(Played):
     """A `SimpleMirror` made of a `DirectMirror`: the host queues the inputs, and sends each when its step begins.
 
     The scheduler and the serial line limit how exact this is. A step for which the device took its input later than
@@ -33,30 +32,19 @@ class PacedMirror:
     """
 
     def __init__(self, rig: Rig, driver: DirectMirror) -> None:
+        super().__init__()
         self.description = driver.description
         self.lacks = lacks_of(driver)
         self._driver, self._park, self._step_ns = driver, rig.mirror.park, rig.timing.fast_step_ns
         self._zero_ns = time.monotonic_ns()
-        self._queue: dict[int, NDArray[np.float64]] = {}
-        self._next = 0
-        """The next step to play."""
         self._now = self._park
         """The input that the device holds."""
-        self._held: list[tuple[NDArray[np.float64], bool]] = []
-        """Inputs of the steps that were not reported yet, and whether they were late."""
-        self._reported = 0
-        """The first step of ``_held``. While the device takes an input, its step has been played, but is not in
-        ``_held`` yet."""
-        self._changed = threading.Condition()
-        """Guards all of the above."""
         self._device = threading.Lock()
         """Held while the driver is called; a thread that holds ``_changed`` never acquires it."""
         self._lateness_ns: deque[int] = deque(maxlen=_REMEMBERED)
         """Times from the beginning of a step until the device's answer to its input was read, for the newest inputs."""
         self._outages = Outages(max(rig.timing.fast_step_ns // 8, _LEAST_PERIOD_NS))
         self._parked = self._closed = False
-        self._failure = Failure()
-        self._thread = threading.Thread(target=self._play, name="aolink-paced-mirror", daemon=True)
         self._thread.start()
 
     def time_ns(self) -> int:
@@ -71,20 +59,8 @@ class PacedMirror:
 
     def send(self, first_step: int, u: NDArray[np.float64]) -> int:
         with self._changed:
-            self._failure.check()
             self._parked = False
-            late = min(max(self._next - first_step, 0), len(u))
-            self._queue.update(enumerate(u[late:], first_step + late))
-        return late
-
-    def applied(self) -> Iterable[Held]:
-        with self._changed:
-            self._failure.check()
-            held, self._held = self._held, []
-            first, self._reported = self._reported, self._reported + len(held)
-        if not held:
-            return []
-        return [Held(first, np.array([u for u, _ in held]), np.array([late for _, late in held]))]
+            return super().send(first_step, u)
 
     def park(self) -> int:
         with self._changed:
@@ -118,12 +94,7 @@ class PacedMirror:
                 if np.array_equal(u, self._now):
                     self._held.append((self._now, False))
                     continue
-            try:
-                self._put(step, u)
-            except Exception as error:  # the session gets the error when it asks next
-                with self._changed:
-                    self._failure.error = error
-                return
+            self._put(step, u)
 
     def _wait_for_step(self) -> int | None:
         """Wait for the step that follows the last one played, and give the present step; None when the mirror is

@@ -5,11 +5,11 @@ from __future__ import annotations
 import os
 import threading
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, ClassVar
+from collections.abc import Iterator
+from typing import Any
 
-from aolink.devices.cameras.pictures import FrameThread, ThreadCamera, as_counts, check_within, checked_corner
-from aolink.devices.simple import Lacks, SimpleFrame
+from aolink.devices.cameras.pictures import as_counts, check_within, checked_corner
+from aolink.devices.simple import FREE_RUNNING, Lacks, SimpleFrame, ThreadCamera, Trigger
 from aolink.errors import DeviceError
 from aolink.extensions import needs_extra
 from aolink.rig import Rig
@@ -22,7 +22,7 @@ _PATH = "MICROMANAGER_PATH"
 
 
 class MicroManagerCamera(ThreadCamera):
-    """A camera that takes frames by itself, one every frame period, with the exposure time of the rig file.
+    """A camera that takes frames with the exposure time of the rig file, by itself one every frame period.
 
     Micro-Manager tells when a frame came to this machine, not when the camera took it.
 
@@ -37,6 +37,8 @@ class MicroManagerCamera(ThreadCamera):
         ``MICROMANAGER_PATH``.
     properties:
         Properties of the camera by their names, set in this order: ``PixelType``, ``Gain``, a trigger, ...
+    trigger:
+        A hardware trigger is set by ``properties``, whose names each adapter has its own; it is declared here.
     corner:
         Row and column of the chip at which the sensor begins.
 
@@ -46,16 +48,18 @@ class MicroManagerCamera(ThreadCamera):
         pymmcore is not installed, the adapter or its camera cannot be opened, or it cannot do what the rig file says.
     """
 
-    lacks: ClassVar[tuple[Lacks, ...]] = (Lacks.TIME, Lacks.TRIGGER)
+    lacks: tuple[Lacks, ...] = (Lacks.TIME, Lacks.TRIGGER)
+    triggers = ("free-running", "hardware")
 
     def __init__(
         self, rig: Rig, *, config: str = "", adapter: str = "", device: str = "", folder: str = "",
-        properties: Mapping[str, bool | int | float | str] | None = None, corner: Sequence[int] = (0, 0),
+        properties: dict[str, Any] | None = None, corner: list[int] | None = None, trigger: Trigger = FREE_RUNNING,
     ) -> None:  # fmt: skip
         with needs_extra("micromanager", DeviceError):
             import pymmcore
         if bool(config) == bool(adapter and device):
             raise DeviceError("devices.camera needs config (a .cfg file of Micro-Manager), or adapter and device")
+        self.lacks = trigger.lacks(self.lacks)
         self._rig, self._metadata = rig, pymmcore.Metadata
         row, column = checked_corner(corner) or (0, 0)
         self._core: Any = pymmcore.CMMCore()
@@ -83,13 +87,6 @@ class MicroManagerCamera(ThreadCamera):
         version = self._core.getVersionInfo()
         self.description = f"{self._name}, {version}, exposure {self._exposure_ns / 1e9:g} s"
 
-    def time_ns(self) -> None:
-        """Micro-Manager gives no time of the camera's."""
-
-    def start(self, start_ns: int, exposures: int) -> None:
-        """Take frames until stopped; those that begin before ``start_ns`` do not belong to the session."""
-        self.thread = FrameThread(self._read)
-
     def close(self) -> None:
         """Release the camera."""
         super().close()
@@ -115,7 +112,7 @@ class MicroManagerCamera(ThreadCamera):
         if abs(core.getExposure() - wanted_ms) > timing.fast_step_s * 1e3:
             raise DeviceError(f"{self._name} exposes for {core.getExposure():g} ms, the rig file says {wanted_ms:g} ms")
 
-    def _read(self, stopped: threading.Event) -> Iterator[SimpleFrame]:
+    def expose(self, start_ns: int, exposures: int, stopped: threading.Event) -> Iterator[SimpleFrame]:
         core, timing = self._core, self._rig.timing
         core.startContinuousSequenceAcquisition(timing.frame_period_steps * timing.fast_step_s * 1e3)
         try:

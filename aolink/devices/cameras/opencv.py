@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 from aolink.devices.cameras import pictures
-from aolink.devices.cameras.pictures import FrameThread, ThreadCamera, check_within, checked_corner
-from aolink.devices.simple import Lacks, SimpleFrame
+from aolink.devices.cameras.pictures import check_within, checked_corner
+from aolink.devices.simple import SimpleFrame, ThreadCamera
 from aolink.errors import DeviceError
 from aolink.extensions import needs_extra
 from aolink.films.film import grey
@@ -43,9 +43,7 @@ class OpenCVCamera(ThreadCamera):
         OpenCV is not installed or cannot open the source, or size or rate of its pictures are not the rig file's.
     """
 
-    lacks: ClassVar[tuple[Lacks, ...]] = (Lacks.TIME, Lacks.COUNT, Lacks.TRIGGER)
-
-    def __init__(self, rig: Rig, *, source: int | str = 0, corner: Sequence[int] | None = None) -> None:
+    def __init__(self, rig: Rig, *, source: int | str = 0, corner: list[int] | None = None) -> None:
         with needs_extra("opencv", DeviceError):
             import cv2
         self._rig, self._corner, timing = rig, checked_corner(corner), rig.timing
@@ -73,16 +71,9 @@ class OpenCVCamera(ThreadCamera):
             self.description = f"OpenCV {cv2.__version__} {self._capture.getBackendName()} {self._name}, {exposure}"
             stack.pop_all()
 
-    def time_ns(self) -> None:
-        """OpenCV gives no time of the camera's."""
-
-    def start(self, start_ns: int, exposures: int) -> None:
-        """Read frames until stopped: those of a file from ``start_ns`` on, others as they come, also before it."""
-        self.thread = FrameThread(lambda stopped: self._read(start_ns, stopped))
-
     def close(self) -> None:
         """Release the camera, once the frame that is under way has come: the thread does it, where there is one."""
-        if self.thread is None:
+        if self._thread is None:
             self._capture.release()
         super().close()
 
@@ -113,14 +104,14 @@ class OpenCVCamera(ThreadCamera):
             )
         self._rate = rate if rate > 0 else self._rate
 
-    def _read(self, begin_ns: int, stopped: threading.Event) -> Iterator[SimpleFrame]:
+    def expose(self, start_ns: int, exposures: int, stopped: threading.Event) -> Iterator[SimpleFrame]:
         """Give frames as they come, those of a file when they are due. The capture belongs to the thread that reads
         it."""
         number = 0
         try:
             while not stopped.is_set():
                 number += 1
-                due_ns = begin_ns + round(number / self._rate * 1e9) if self._is_file else 0
+                due_ns = start_ns + round(number / self._rate * 1e9) if self._is_file else 0
                 if stopped.wait(max(due_ns - time.monotonic_ns(), 0) / 1e9):
                     return
                 grabbed = self._capture.grab()

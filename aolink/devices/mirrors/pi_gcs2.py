@@ -9,14 +9,13 @@ ever awaited, so a controller that is slower than the fast rate makes steps late
 from __future__ import annotations
 
 import time
-from contextlib import ExitStack
 from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from aolink.devices.mirrors.keys import per_input, scale_per_input, seconds, speed, text
-from aolink.devices.mirrors.line import SerialLine, usb_ports
+from aolink.devices.mirrors.keys import Scale
+from aolink.devices.mirrors.line import QUIET_S, SerialLine, usb_ports
 from aolink.devices.simple import Lacks
 from aolink.errors import DeviceError, RigError
 from aolink.rig import Rig
@@ -41,8 +40,6 @@ _UNKNOWN_COMMAND = 2
 _POLL_S = 0.02
 _MOST_LINES = 100
 """The most lines of an answer, or of earlier answers still waiting; more of them are not an answer."""
-_QUIET_S = 0.05
-"""After this time without a byte no late answer is on the line, s."""
 _DECIMALS = 6
 """Decimals of a position: below what the stages resolve, in micrometres, microradians and milliradians."""
 
@@ -73,28 +70,31 @@ class PiMirror:
         offset: float | list[float] = 0.0, baud_rate: int = 115_200, settling_s: float = 5.0,
     ) -> None:  # fmt: skip
         self._axes = _checked_axes(axes, rig.n_inputs)
-        self._scale = scale_per_input("scale", scale, rig.n_inputs)
-        self._offset = per_input("offset", offset, rig.n_inputs)
-        self._park = rig.mirror.park
-        self._settling_s = seconds("settling_s", settling_s)
+        self._scale = Scale(rig.mirror, scale, offset, ("scale", "offset"))
+        self._safe = self._scale.of(rig.mirror.park)
+        if not (50 <= baud_rate <= 10_000_000 and 0 <= settling_s < np.inf):
+            raise RigError(
+                "devices.mirror: expected baud_rate in bits per second and settling_s in seconds, found"
+                f" {baud_rate!r} and {settling_s!r}"
+            )
+        self._settling_s = settling_s
         self._unanswered = ""
         """The command whose ERR? has not been answered."""
-        with ExitStack() as opened:
-            self._line = SerialLine("the PI controller", text("port", port), speed("baud_rate", baud_rate))
-            opened.callback(self._line.close)
+        with SerialLine("the PI controller", port, baud_rate).opening() as self._line:
             self._identity = self._identify()
             self._check_axes()
-            self._check_limits(rig)
+            lowest, highest = self._numbers("TMN?"), self._numbers("TMX?")
+            if lowest is not None and highest is not None:
+                self._scale.check_reach(lowest, highest, [f"the PI axis {axis}" for axis in self._axes])
             self._switch_on()
             self.park()
             self._settle()
-            opened.pop_all()
 
     def put(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
         self._take_answer()
-        positions = np.round(self._offset + self._scale * u, _DECIMALS)
+        positions = np.round(self._scale.of(u), _DECIMALS)
         self._send(self._move_to(positions))
-        return (positions - self._offset) / self._scale
+        return self._scale.inputs(positions)
 
     def park(self) -> None:
         """Stop all motion, including motion that the controller generates by itself, and go to the safe input."""
@@ -102,7 +102,7 @@ class PiMirror:
         # sent before the first of them is awaited, for a controller that hears and does not answer.
         self._unanswered = ""
         self._line.tell(b"STP\n*IDN?\nERR?\n")
-        self._send(self._move_to(self._offset + self._scale * self._park))
+        self._send(self._move_to(self._safe))
         for _ in range(_MOST_LINES):
             if self._next_line().strip() == self._identity:
                 break
@@ -127,7 +127,7 @@ class PiMirror:
         self._line.tell(f"{command}\nERR?\n".encode())
 
     def _identify(self) -> str:
-        self._line.drain(_QUIET_S)
+        self._line.drain(QUIET_S)
         identity = self._answer("*IDN?")
         if "physik instrumente" not in identity.lower():
             raise DeviceError(
@@ -158,21 +158,6 @@ class PiMirror:
                 " devices.mirror.axes"
             )
 
-    def _check_limits(self, rig: Rig) -> None:
-        """Check that the rig's limits lie within the controller's, where it reports them."""
-        ends = self._offset + self._scale * np.array([rig.mirror.input_min, rig.mirror.input_max])
-        low, high = ends.min(axis=0), ends.max(axis=0)
-        lowest, highest = self._numbers("TMN?"), self._numbers("TMX?")
-        if lowest is None or highest is None:
-            return
-        for axis, *reach, first, last in zip(self._axes, low, high, lowest, highest, strict=True):
-            if reach[0] < first - 10**-_DECIMALS or reach[1] > last + 10**-_DECIMALS:
-                raise DeviceError(
-                    f"mirror.input_min .. input_max are positions from {reach[0]:g} to {reach[1]:g} of the PI axis"
-                    f" {axis}, which goes from {first:g} to {last:g}: make the limits or devices.mirror.scale smaller,"
-                    " or correct devices.mirror.offset"
-                )
-
     def _switch_on(self) -> None:
         if (servos := self._numbers("SVO?")) is None or not servos.all():
             self._command(" ".join(["SVO", *(f"{axis} 1" for axis in self._axes)]))
@@ -189,7 +174,7 @@ class PiMirror:
                 positions = self._numbers("POS?")
                 raise DeviceError(
                     f"the PI axes {' '.join(self._axes)} do not reach their safe position"
-                    f" {self._offset + self._scale * self._park} in {self._settling_s:g} s, they are at {positions}:"
+                    f" {self._safe} in {self._settling_s:g} s, they are at {positions}:"
                     " are they zeroed (ATZ) or referenced, and do the stage's parameters fit?"
                 )
             time.sleep(_POLL_S)
