@@ -177,8 +177,9 @@ class ThorlabsPiezo:
                     line = SerialLine("the Thorlabs unit", path, _BAUD_RATE)
                     self._lines[path] = opened.enter_context(line.opening())
             units = [AptUnit(self._lines[path], address) for path, address in places]
-            self.description = "Thorlabs " + "; ".join(dict.fromkeys([each.greeted() for each in units]))
-            self._outputs = [_Output(each, closed_loop, self._prepare(each)) for each in units]
+            greeted = [(each.greeted(), _Output(each, closed_loop, self._prepare(each))) for each in units]
+            self.description = "Thorlabs " + "; ".join(dict.fromkeys(text for text, _ in greeted))
+            self._outputs = [output for _, output in greeted]
             most = np.array([output.most for output in self._outputs])
             self._scale.check_reach(0, most, "the Thorlabs unit", " um" if closed_loop else " V")
             check_resolution(rig.mirror, np.abs(most / _FULL_SCALE / self._scale.unit), "the Thorlabs unit")
