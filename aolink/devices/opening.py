@@ -114,7 +114,7 @@ def _open_mirror(rig: Rig, table: DeviceTable, host: Host, stack: ExitStack) -> 
 def _open_camera(rig: Rig, table: DeviceTable, mirror: Mirror, host: Host, stack: ExitStack) -> AdaptedCamera:
     with _opened("camera", table, rig) as driver:
         _check_whole("camera", table, driver, SimpleCamera)
-        tells_time, period_s = driver.time_ns() is not None, rig.timing.frame_period_steps * rig.timing.fast_step_s
+        tells_time, period_s = driver.time_ns() is not None, rig.timing.frame_period_ns / 1e9
         # Where the delay of frames is not known, a frame may arrive at any time within the frame period after its
         # exposure.
         delay = table.delay or (Delay() if tells_time else Delay(mean_s=period_s / 2, sd_s=period_s / math.sqrt(12)))

@@ -16,7 +16,7 @@ from typing import Any
 
 from aolink.devices.cameras.aravis_library import Aravis, Refused
 from aolink.devices.cameras.aravis_stream import PictureStream, StreamPicture
-from aolink.devices.cameras.pictures import checked_corner
+from aolink.devices.cameras.pictures import check_timing, checked_corner
 from aolink.devices.cameras.pixel_formats import PIXEL_FORMATS, PixelFormat
 from aolink.devices.cameras.requests import Requests
 from aolink.devices.simple import FREE_RUNNING, ClockAnswer, Lacks, SimpleFrame, Trigger
@@ -28,7 +28,6 @@ _PACKET_OVERHEAD, _PACKET_OVERHEAD_EXTENDED = 36, 48
 GVSP."""
 _ID_PERIOD = 65535
 """A 16-bit frame id goes from 65535 to 1: 0 is not valid."""
-_RATE_TOLERANCE = 0.01
 _TIMESTAMP_CONTROL, _TIMESTAMP_LATCH, _TIMESTAMP_VALUE = 0x0944, 2, 0x0948
 """Registers that GigE Vision specifies: the value that is written to latch the clock, and the address of the latched
 value."""
@@ -102,8 +101,7 @@ class AravisCamera:
             raise RigError(f"devices.camera.stamp_at is {stamp_at!r}, expected 'start' or 'end'")
         place = checked_corner(corner)
         self._rig, self._shape, self._stamp_at = rig, rig.sensor.shape, stamp_at
-        timing = rig.timing
-        self._period_ns = timing.frame_period_steps * timing.fast_step_ns
+        self._period_ns = rig.timing.frame_period_ns
         self._aravis = Aravis()
         self._address = address or self._only_camera()
         self._camera = None
@@ -298,32 +296,23 @@ class AravisCamera:
 
     def _set_timing(self) -> int:
         """Exposure time, frame rate or trigger; gives the exposure time that the camera has, ns."""
-        timing = self._rig.timing
-        wanted_ns, rate = timing.exposure_steps * timing.fast_step_ns, 1e9 / self._period_ns
-        for what in ("exposure", "gain"):
+        timing, free = self._rig.timing, self._trigger == FREE_RUNNING
+        rate = 1e9 / timing.frame_period_ns
+        for what, setter in (("exposure", "set_exposure_time_auto"), ("gain", "set_gain_auto")):
             if self._get(f"is_{what}_auto_available"):
-                self._set("set_exposure_time_auto" if what == "exposure" else "set_gain_auto", 0, to=f"fix its {what}")
+                self._set(setter, 0, to=f"fix its {what}")
         if self._get("are_chunks_available"):
             self._set("set_chunk_mode", 0, to="leave out chunks")
         self._set("set_acquisition_mode", 0, to="go on taking frames")
         self._set("clear_triggers", to="run freely")
-        if self._trigger == FREE_RUNNING:
+        if free:
             self._set("set_frame_rate", rate, to=f"take {rate:g} frames a second")
-        self._set("set_exposure_time", wanted_ns / 1e3, to=f"expose for {wanted_ns / 1e9:g} s")
+        self._set("set_exposure_time", timing.exposure_ns / 1e3, to=f"expose for {timing.exposure_ns / 1e9:g} s")
         exposure_ns = round(float(self._get("get_exposure_time")) * 1e3)
-        if abs(exposure_ns - wanted_ns) > timing.fast_step_ns / 2:
-            raise DeviceError(
-                f"the camera {self._address} can expose for {exposure_ns / 1e9:g} s, the rig file asks for"
-                f" {wanted_ns / 1e9:g} s: correct timing.exposure_steps"
-            )
-        if self._trigger != FREE_RUNNING:
+        check_timing(timing, f"the camera {self._address}", exposure_ns, self._get("get_frame_rate") if free else 0.0)
+        if not free:
             source = self._trigger.input or "Software"
             self._set("set_trigger", source.encode(), to=f"be triggered by {source}")
-        elif abs((has := self._get("get_frame_rate")) / rate - 1) > _RATE_TOLERANCE:
-            raise DeviceError(
-                f"the camera {self._address} can take {has:g} frames a second, the rig file asks for {rate:g}: correct"
-                " timing.frame_period_steps"
-            )
         return exposure_ns
 
     def _describe(self) -> str:

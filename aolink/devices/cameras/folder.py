@@ -54,8 +54,7 @@ class FolderCamera(ThreadCamera):
 
     def expose(self, start_ns: int, exposures: int, stopped: threading.Event) -> Iterator[SimpleFrame]:
         """Play the pictures, the first one as if exposed from ``start_ns`` on."""
-        timing = self._rig.timing
-        exposure_ns, period_ns = (n * timing.fast_step_ns for n in (timing.exposure_steps, timing.frame_period_steps))
+        exposure_ns, period_ns = self._rig.timing.exposure_ns, self._rig.timing.frame_period_ns
         pictures = self._pictures()
         for number in range(exposures) if exposures else count():
             begin_ns = start_ns + number * period_ns

@@ -8,7 +8,7 @@ import time
 from collections.abc import Iterator
 from typing import Any
 
-from aolink.devices.cameras.pictures import as_counts, check_within, checked_corner
+from aolink.devices.cameras.pictures import as_counts, check_timing, check_within, checked_corner
 from aolink.devices.simple import FREE_RUNNING, Lacks, SimpleFrame, ThreadCamera, Trigger
 from aolink.errors import DeviceError
 from aolink.extensions import needs_extra
@@ -77,13 +77,12 @@ class MicroManagerCamera(ThreadCamera):
             for name, value in (properties or {}).items():
                 self._core.setProperty(self._label, name, int(value) if isinstance(value, bool) else value)
             self._set_up(row, column)
-        except (RuntimeError, OSError) as error:
+        except BaseException as error:
             self._core.reset()
+            if not isinstance(error, RuntimeError | OSError):
+                raise
             reason = " ".join(str(error).split())
             raise DeviceError(f"{self._name} cannot be opened: {reason}; is {_PATH} its folder?") from None
-        except BaseException:
-            self._core.reset()
-            raise
         version = self._core.getVersionInfo()
         self.description = f"{self._name}, {version}, exposure {self._exposure_ns / 1e9:g} s"
 
@@ -98,23 +97,19 @@ class MicroManagerCamera(ThreadCamera):
         core.clearROI()
         check_within((core.getImageHeight(), core.getImageWidth()), (height, width), (row, column), self._name)
         core.setROI(column, row, width, height)
-        found = core.getImageHeight(), core.getImageWidth()
-        if found != (height, width):
-            raise DeviceError(f"{self._name} gives {found} pixels, the rig file's sensor has {(height, width)}")
+        check_within((core.getImageHeight(), core.getImageWidth()), (height, width), None, self._name)
         if core.getNumberOfComponents() != 1 or core.getImageBitDepth() > sensor.bit_depth:
             raise DeviceError(
                 f"{self._name} gives {core.getNumberOfComponents()} colour(s) of {core.getImageBitDepth()} bits, the"
                 f" rig file's sensor has one of {sensor.bit_depth}: set devices.camera.properties, such as PixelType"
             )
-        wanted_ms = timing.exposure_steps * timing.fast_step_s * 1e3
-        core.setExposure(wanted_ms)
+        core.setExposure(timing.exposure_ns / 1e6)
         self._exposure_ns = round(core.getExposure() * 1e6)
-        if abs(core.getExposure() - wanted_ms) > timing.fast_step_s * 1e3:
-            raise DeviceError(f"{self._name} exposes for {core.getExposure():g} ms, the rig file says {wanted_ms:g} ms")
+        check_timing(timing, self._name, self._exposure_ns)
 
     def expose(self, start_ns: int, exposures: int, stopped: threading.Event) -> Iterator[SimpleFrame]:
-        core, timing = self._core, self._rig.timing
-        core.startContinuousSequenceAcquisition(timing.frame_period_steps * timing.fast_step_s * 1e3)
+        core = self._core
+        core.startContinuousSequenceAcquisition(self._rig.timing.frame_period_ns / 1e6)
         try:
             while not stopped.is_set():
                 if core.isBufferOverflowed():

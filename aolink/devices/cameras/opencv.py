@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from aolink.devices.cameras import pictures
-from aolink.devices.cameras.pictures import check_within, checked_corner
+from aolink.devices.cameras.pictures import check_timing, check_within, checked_corner
 from aolink.devices.simple import SimpleFrame, ThreadCamera
 from aolink.errors import DeviceError
 from aolink.extensions import needs_extra
@@ -55,8 +55,7 @@ class OpenCVCamera(ThreadCamera):
         cv2.utils.logging.setLogLevel(said)
         if not self._capture.isOpened():
             raise DeviceError(f"OpenCV cannot open {self._name}: is it connected, not in use, and may you read it?")
-        self._rate = 1 / (timing.frame_period_steps * timing.fast_step_s)
-        self._exposure_ns = timing.exposure_steps * timing.fast_step_ns
+        self._rate, self._exposure_ns = 1e9 / timing.frame_period_ns, timing.exposure_ns
         with ExitStack() as stack:
             stack.callback(self._capture.release)
             self._is_file = int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT)) > 0
@@ -97,11 +96,7 @@ class OpenCVCamera(ThreadCamera):
         if not (self._is_file or self._capture.getBackendName() == "V4L2"):
             return  # OpenCV only guesses the rate of a stream
         rate = self._capture.get(cv2.CAP_PROP_FPS)
-        if rate > 0 and abs(rate / self._rate - 1) > _RATE_MARGIN:
-            raise DeviceError(
-                f"{self._name} gives {rate:.4g} frames a second, the rig file says {self._rate:.4g}: correct"
-                " timing.frame_period_steps or timing.fast_step_s"
-            )
+        check_timing(self._rig.timing, self._name, self._exposure_ns, rate, _RATE_MARGIN)
         self._rate = rate if rate > 0 else self._rate
 
     def expose(self, start_ns: int, exposures: int, stopped: threading.Event) -> Iterator[SimpleFrame]:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aolink.errors import DeviceError, RigError
+from aolink.rig import Timing
 
 
 def checked_corner(corner: Sequence[int] | None) -> tuple[int, int] | None:
@@ -32,6 +33,25 @@ def check_within(size: tuple[int, int], shape: tuple[int, int], corner: tuple[in
             f"{name} gives {size} pixels, the rig file's sensor has {shape} (rows, columns): correct [sensor], or say"
             " with devices.camera.corner = [row, column] where in the picture the sensor begins"
         )
+
+
+def check_timing(timing: Timing, name: str, exposure_ns: int, rate_hz: float = 0.0, margin: float = 0.01) -> None:
+    """Compare a camera's exposure time, and its frame rate where that is known, with the rig file's.
+
+    Raises
+    ------
+    DeviceError
+        They differ by more than half a fast step, or the part ``margin`` of the rate.
+    """
+    wrong = ""
+    if abs(exposure_ns - timing.exposure_ns) > timing.fast_step_ns / 2:
+        wrong = f"exposes for {exposure_ns / 1e9:g} s, the rig file says {timing.exposure_ns / 1e9:g} s: correct"
+        wrong += " timing.exposure_steps"
+    elif rate_hz > 0 and abs(rate_hz * timing.frame_period_ns / 1e9 - 1) > margin:
+        wrong = f"takes {rate_hz:.5g} frames a second, the rig file says {1e9 / timing.frame_period_ns:.5g}: correct"
+        wrong += " timing.frame_period_steps"
+    if wrong:
+        raise DeviceError(f"{name} {wrong} or the camera's settings")
 
 
 def sensor_part(
