@@ -112,15 +112,11 @@ def check_against_rig(rig: Rig, identities: dict[str, pb.Identity]) -> list[str]
         ]
     if "mirror" in identities:
         limits = identities["mirror"].mirror
-        pairs += [
-            ("number of inputs", limits.n_inputs, rig.n_inputs),
-            ("mirror.input_min", list(limits.input_min), rig.mirror.input_min.tolist()),
-            ("mirror.input_max", list(limits.input_max), rig.mirror.input_max.tolist()),
-            ("mirror.park", list(limits.park), rig.mirror.park.tolist()),
-            ("mirror.dac_bits", limits.dac_bits, rig.mirror.dac_bits),
-            ("mirror.queue_steps", limits.queue_steps, rig.mirror.queue_steps),
-            ("mirror.watchdog_s", limits.watchdog_s, rig.mirror.watchdog_s),
-        ]
+        pairs.append(("number of inputs", limits.n_inputs, rig.n_inputs))
+        for name in ("input_min", "input_max", "park"):
+            pairs.append((f"mirror.{name}", [*getattr(limits, name)], getattr(rig.mirror, name).tolist()))
+        for name in ("dac_bits", "queue_steps", "watchdog_s"):
+            pairs.append((f"mirror.{name}", getattr(limits, name), getattr(rig.mirror, name)))
     for name, found, expected in pairs:
         if found != expected:
             raise DeviceError(

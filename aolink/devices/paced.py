@@ -1,18 +1,17 @@
-"""A mirror without a queue, driven at the fast rate by a thread of the host."""
+"""Mirrors whose inputs wait on the host: a thread of the host plays each in its fast step."""
 
 from __future__ import annotations
 
 import threading
 import time
 from collections import deque
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from aolink.devices.interfaces import lacks_of
-from aolink.devices.outages import Outages
-from aolink.devices.played import Played
-from aolink.devices.simple import DirectMirror
+from aolink.devices.simple import DirectMirror, Held
 from aolink.rig import Rig
 
 _REMEMBERED = 1000
@@ -20,6 +19,100 @@ _LATE = 0.5
 """A step whose input was taken only after this part of the step is late: it held the previous input for longer."""
 _LEAST_PERIOD_NS = 1_000_000
 """Least period of checking whether the host is held up, ns: more frequent checks would cost more than they show."""
+
+
+class Played:
+    """The common part of mirrors whose inputs a thread of the host plays: `send`, `applied`, and the thread's error.
+
+    An input may be kept as the device takes it, (n,); `_inputs` gives the inputs of a run of steps.
+    """
+
+    def __init__(self) -> None:
+        self._queue: dict[int, NDArray[Any]] = {}
+        """Inputs by fast step."""
+        self._next = 0
+        """The first step that has not been played."""
+        self._held: list[tuple[NDArray[Any], bool]] = []
+        """Inputs of the steps that were not reported yet, and whether they were late."""
+        self._reported = 0
+        """The first step of ``_held``."""
+        self._changed = threading.Condition()
+        """Guards all of the above."""
+        self._failure: Exception | None = None
+        self._thread = threading.Thread(target=self._run, name=f"aolink-{type(self).__name__}", daemon=True)
+
+    def send(self, first_step: int, u: NDArray[Any]) -> int:
+        with self._changed:
+            self._check()
+            late = min(max(self._next - first_step, 0), len(u))
+            self._queue.update(enumerate(u[late:], first_step + late))
+        return late
+
+    def applied(self) -> list[Held]:
+        with self._changed:
+            self._check()
+            n_steps = self._n_over()
+            held, self._held = self._held[:n_steps], self._held[n_steps:]
+            first, self._reported = self._reported, self._reported + n_steps
+        if not held:
+            return []
+        return [Held(first, self._inputs(np.array([u for u, _ in held])), np.array([late for _, late in held]))]
+
+    def _n_over(self) -> int:
+        """How many of the steps in ``_held`` are over."""
+        return len(self._held)
+
+    def _inputs(self, held: NDArray[Any]) -> NDArray[np.float64]:
+        return held
+
+    def _check(self) -> None:
+        """Raise the error that has ended the thread, if there is one."""
+        if self._failure is not None:
+            raise self._failure
+
+    def _play(self) -> None:
+        """Play inputs until the mirror is closed."""
+        raise NotImplementedError
+
+    def _run(self) -> None:
+        try:
+            self._play()
+        except Exception as error:  # the session gets it when it asks next
+            with self._changed:
+                self._failure = error
+
+
+class Outages:
+    """A thread that should run every ``period_ns`` measures by its own lateness how long this process did not run.
+
+    It is slightly late without an outage, too: a lateness below one period is not counted.
+    """
+
+    def __init__(self, period_ns: int) -> None:
+        self._period_ns = period_ns
+        self._ended_ns, self._seen_ns = 0, time.monotonic_ns()
+        self._changed = threading.Lock()
+        self._closed = threading.Event()
+        self._thread = threading.Thread(target=self._watch, name="aolink-outages", daemon=True)
+        self._thread.start()
+
+    def total_ns(self) -> int:
+        """Time of all outages so far, including one that has just ended and that the thread has not noticed yet."""
+        with self._changed:
+            return self._ended_ns + self._overdue_ns()
+
+    def close(self) -> None:
+        self._closed.set()
+        self._thread.join()
+
+    def _overdue_ns(self) -> int:
+        return max(0, time.monotonic_ns() - self._seen_ns - 2 * self._period_ns)
+
+    def _watch(self) -> None:
+        while not self._closed.wait(self._period_ns / 1e9):
+            with self._changed:
+                self._ended_ns += self._overdue_ns()
+                self._seen_ns = time.monotonic_ns()
 
 
 class PacedMirror(Played):

@@ -9,16 +9,16 @@ from __future__ import annotations
 import ctypes
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from contextlib import ExitStack, suppress
+from queue import SimpleQueue
 from typing import Any
 
 from aolink.devices.cameras.aravis_library import Aravis, Refused
 from aolink.devices.cameras.aravis_stream import PictureStream, StreamPicture
 from aolink.devices.cameras.pictures import check_timing, checked_corner
 from aolink.devices.cameras.pixel_formats import PIXEL_FORMATS, PixelFormat
-from aolink.devices.cameras.requests import Requests
 from aolink.devices.simple import FREE_RUNNING, ClockAnswer, Lacks, SimpleFrame, Trigger
 from aolink.errors import DeviceError, RigError
 from aolink.rig import Rig
@@ -53,6 +53,32 @@ def discover() -> list[tuple[str, str]]:
         address = aravis("arv_get_device_address" if protocol == "GigEVision" else "arv_get_device_id", k)
         found.append((address.decode(errors="replace"), f"{vendor} {model}, serial number {serial}, {protocol}"))
     return found
+
+
+class _Requests:
+    """Calls functions in their order, one at a time, on a thread that does not hold up the end of the program."""
+
+    def __init__(self, name: str) -> None:
+        self._waiting: SimpleQueue[tuple[Future[Any], Callable[[], Any]] | None] = SimpleQueue()
+        threading.Thread(target=self._run, name=name, daemon=True).start()
+
+    def send(self, request: Callable[[], Any]) -> Future[Any]:
+        """Queue ``request``; the future has its result, or the exception that it raised."""
+        future: Future[Any] = Future()
+        self._waiting.put((future, request))
+        return future
+
+    def end(self) -> None:
+        """Accept no more requests: those queued before are still called."""
+        self._waiting.put(None)
+
+    def _run(self) -> None:
+        while (each := self._waiting.get()) is not None:
+            future, request = each
+            try:
+                future.set_result(request())
+            except BaseException as error:  # the future hands it to whoever asks for the result
+                future.set_exception(error)
 
 
 class AravisCamera:
@@ -105,7 +131,7 @@ class AravisCamera:
         self._aravis = Aravis()
         self._address = address or self._only_camera()
         self._camera = None
-        self._requests = Requests("aolink-aravis")
+        self._requests = _Requests("aolink-aravis")
         self._asked: Future[ClockAnswer] | None = None
         """The answer of the clock that is being awaited."""
         self._running = False

@@ -53,13 +53,13 @@ class Scale:
         """The inputs for the device's numbers."""
         return np.asarray((np.asarray(numbers) - self.zero) / self.unit)
 
-    def check_reach(self, low: Any, high: Any, device: str | Sequence[str], unit: str = "") -> None:
-        """Refuse a rig file whose inputs go beyond what a device reaches. Raises DeviceError.
+    def check(self, low: Any, high: Any, device: str | Sequence[str], unit: str = "", step: Any = 0.0) -> None:
+        """Refuse a rig file whose inputs go beyond what a device reaches, or in finer steps. Raises DeviceError.
 
         Parameters
         ----------
-        low, high:
-            The ends of its range in its own numbers, (n_inputs,) or a number; ``unit`` is their unit.
+        low, high, step:
+            The ends of its range and its steps in its own numbers, (n_inputs,) or a number; ``unit`` is their unit.
         device:
             Its name, or that of each input.
         """
@@ -74,6 +74,8 @@ class Scale:
                 f" {self._keys}, {device if isinstance(device, str) else device[at]} goes from {least:g} to"
                 f" {most:g}{unit}: correct one of them"
             )
+        if np.any(step):
+            check_resolution(self._mirror, np.abs(step / self.unit), str(device))
 
 
 def check_resolution(mirror: MirrorDriver, step: float | NDArray[np.float64], device: str) -> None:

@@ -47,7 +47,7 @@ class MicroscopeMirror:
         zero: float | list[float] = 0.5,
     ) -> None:  # fmt: skip
         self._scale = Scale(rig.mirror, unit, zero)
-        self._scale.check_reach(0, 1, device, " of the range")
+        self._scale.check(0, 1, device, " of the range")
         make = _class_of(device)
         try:
             self._device = make(**(settings or {}))

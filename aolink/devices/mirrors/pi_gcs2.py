@@ -85,7 +85,7 @@ class PiMirror:
             self._check_axes()
             lowest, highest = self._numbers("TMN?"), self._numbers("TMX?")
             if lowest is not None and highest is not None:
-                self._scale.check_reach(lowest, highest, [f"the PI axis {axis}" for axis in self._axes])
+                self._scale.check(lowest, highest, [f"the PI axis {axis}" for axis in self._axes])
             self._switch_on()
             self.park()
             self._settle()

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from aolink.devices.mirrors.keys import check_resolution
 from aolink.devices.mirrors.line import QUIET_S, SerialLine, shown
 from aolink.devices.mirrors.sample_clock import SampleClock
-from aolink.devices.played import Played
+from aolink.devices.paced import Played
 from aolink.devices.simple import Lacks
 from aolink.errors import AolinkError, DeviceError
 from aolink.rig import Rig

@@ -13,7 +13,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from aolink.devices.mirrors.keys import Scale, check_resolution
+from aolink.devices.mirrors.keys import Scale
 from aolink.devices.mirrors.line import QUIET_S, TIMEOUT_S, SerialLine, shown, usb_ports
 from aolink.devices.simple import Lacks
 from aolink.errors import AolinkError, DeviceError, RigError
@@ -181,8 +181,7 @@ class ThorlabsPiezo:
             self.description = "Thorlabs " + "; ".join(dict.fromkeys(text for text, _ in greeted))
             self._outputs = [output for _, output in greeted]
             most = np.array([output.most for output in self._outputs])
-            self._scale.check_reach(0, most, "the Thorlabs unit", " um" if closed_loop else " V")
-            check_resolution(rig.mirror, np.abs(most / _FULL_SCALE / self._scale.unit), "the Thorlabs unit")
+            self._scale.check(0, most, "the Thorlabs unit", " um" if closed_loop else " V", most / _FULL_SCALE)
             self.put(self._park)
             for output in self._outputs:
                 output.enable()
@@ -212,9 +211,8 @@ class ThorlabsPiezo:
 
     def _prepare(self, apt: AptUnit) -> float:
         """Set the control mode and the input source; gives the volts or micrometres of full scale."""
-        unit = "um" if self._closed_loop else "V"
         apt.tell("pz_set_inputvoltssrc", _CHANNEL, 0)  # the host alone: no knob, no other input
-        mode = _CLOSED_LOOP if self._closed_loop else _OPEN_LOOP
+        mode, unit = (_CLOSED_LOOP, "um") if self._closed_loop else (_OPEN_LOOP, "V")
         apt.tell("pz_set_positioncontrolmode", _CHANNEL, mode)
         found = apt.ask("pz_req_positioncontrolmode", "pz_get_positioncontrolmode", _CHANNEL)["mode"]
         if found != mode:
@@ -255,10 +253,8 @@ class ThorlabsAligner:
         if rig.n_inputs != 2:
             raise DeviceError(f"the Thorlabs aligner has 2 outputs, x and y; the rig file has {rig.n_inputs} input(s)")
         self._scale, self._park = Scale(rig.mirror, unit, zero), rig.mirror.park
-        self._scale.check_reach(-_ALIGNER_VOLTS, _ALIGNER_VOLTS, "the Thorlabs aligner", " V")
-        check_resolution(
-            rig.mirror, np.abs(_ALIGNER_VOLTS / _FULL_SCALE / self._scale.unit), "the Thorlabs aligner"
-        )  # fmt: skip
+        most = _ALIGNER_VOLTS
+        self._scale.check(-most, most, "the Thorlabs aligner", " V", most / _FULL_SCALE)
         with SerialLine("the Thorlabs aligner", port, _BAUD_RATE).opening() as self._line:
             self._apt = AptUnit(self._line, _CUBE)
             self.description = f"Thorlabs {self._apt.greeted()}"
@@ -299,7 +295,6 @@ def _places(port: str | list[str], bays: list[int] | None, n_inputs: int) -> lis
             f"devices.mirror: the rig file has {n_inputs} input(s), and port = {port!r}, bays = {bays!r} name"
             f" {min(len(paths), len(numbers))} unit(s): give a list of ports, or of bays, with one for each"
         )
-    for each in numbers:
-        if not isinstance(each, int) or not 0 <= each <= 10:
-            raise RigError(f"devices.mirror.bays: expected whole numbers from 1 to 10, found {each!r}")
+    if strange := [each for each in numbers if not 0 <= each <= 10]:
+        raise RigError(f"devices.mirror.bays: expected whole numbers from 1 to 10, found {strange[0]!r}")
     return [(path, _FIRST_BAY + bay if bay else _CUBE) for path, bay in zip(paths, numbers, strict=True)]

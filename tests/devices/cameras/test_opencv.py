@@ -130,7 +130,7 @@ def test_what_cannot_be_read_is_refused_when_it_is_opened(
     (tmp_path / "text.avi").write_text("no film")
     rig = rig_of(table(source), tmp_path, **BITS_8, **changes)
     with pytest.raises(DeviceError, match=what):
-        OpenCVCamera(rig, source=source, corner=CORNER)
+        OpenCVCamera(rig, source=source, corner=[*CORNER])
     assert capfd.readouterr().err == ""
 
 
