@@ -67,8 +67,7 @@ class FolderCamera(ThreadCamera):
 
     def _pictures(self) -> Iterator[NDArray[Any]]:
         try:
-            yield from self._film.frames()
-            while self._repeat:
+            for _ in count() if self._repeat else range(1):
                 yield from self._film.frames()
         except ImportingError as error:
             raise DeviceError(str(error)) from error

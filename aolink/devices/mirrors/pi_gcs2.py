@@ -116,11 +116,7 @@ class PiMirror:
         """Wait for the answer to the latest command, where there is one. Raises DeviceError where that failed."""
         if command := self._unanswered:
             self._unanswered = ""
-            self._check(command, self._error_number(command, self._next_line()))
-
-    def _command(self, command: str) -> None:
-        self._send(command)
-        self._take_answer()
+            self._check(command, self._next_line())
 
     def _send(self, command: str) -> None:
         self._unanswered = command
@@ -160,7 +156,8 @@ class PiMirror:
 
     def _switch_on(self) -> None:
         if (servos := self._numbers("SVO?")) is None or not servos.all():
-            self._command(" ".join(["SVO", *(f"{axis} 1" for axis in self._axes)]))
+            self._send(" ".join(["SVO", *(f"{axis} 1" for axis in self._axes)]))
+            self._take_answer()
             if (servos := self._numbers("SVO?")) is not None and not servos.all():
                 raise DeviceError(
                     f"the servo of the PI axes {' '.join(self._axes)} does not switch on: are stage and high voltage"
@@ -185,19 +182,15 @@ class PiMirror:
         self._line.tell(f"{asked}\nERR?\n".encode())
         lines = self._lines()
         if "=" not in lines[0]:  # the answer to ERR? alone
-            if (number := self._error_number(asked, lines[0])) != _UNKNOWN_COMMAND:
-                self._check(asked, number)
+            if not self._check(asked, lines[0], _UNKNOWN_COMMAND):
                 raise self._strange(asked, lines[0])
             return None
-        self._check(asked, self._error_number(asked, self._next_line()))
+        self._check(asked, self._next_line())
         try:
             answers = {axis.strip(): float(number) for axis, _, number in (line.partition("=") for line in lines)}
-            numbers = np.array([answers[axis] for axis in self._axes])
+            return np.asarray_chkfinite([answers[axis] for axis in self._axes])
         except (ValueError, KeyError):
             raise self._strange(asked, " ".join(lines)) from None
-        if not np.isfinite(numbers).all():
-            raise self._strange(asked, " ".join(lines))
-        return numbers
 
     def _move_to(self, positions: NDArray[np.float64]) -> str:
         pairs = zip(self._axes, positions, strict=True)
@@ -217,18 +210,18 @@ class PiMirror:
     def _next_line(self) -> str:
         return self._line.read_until(b"\n").decode("latin-1")
 
-    def _error_number(self, command: str, answer: str) -> int:
+    def _check(self, command: str, answer: str, allowed: int = 0) -> int:
+        """The error number in an answer to ``ERR?``. Raises DeviceError unless it is 0 or ``allowed``."""
         try:
-            return int(answer)
+            number = int(answer)
         except ValueError:
             raise self._strange(f"{command} and ERR?", answer) from None
-
-    def _check(self, command: str, number: int) -> None:
-        if number:
+        if number not in (0, allowed):
             raise DeviceError(
                 f"the PI controller refuses {command} with its error {number}"
                 f" ({_ERRORS.get(number, 'see the manual of its commands')})"
             )
+        return number
 
     def _strange(self, command: str, answer: str) -> DeviceError:
         return DeviceError(

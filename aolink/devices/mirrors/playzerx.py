@@ -130,9 +130,9 @@ class PlayzerX(Played):
     def __init__(self, rig: Rig, *, port: str, laser: int = 0, ahead_s: float = 0.1) -> None:
         super().__init__()
         self._n_inputs, self._step_ns = rig.n_inputs, rig.timing.fast_step_ns
-        rate = _checked_rate(rig)
+        rate = round(1e9 / self._step_ns)
         self._ahead = round(ahead_s * rate)
-        _check(rig, laser, self._ahead)
+        _check(rig, rate, laser, self._ahead)
         self._park = codes_of(rig.mirror.park[None])
         self._laser: list[int] = []
         """Levels of its colours, once it is known how many it has."""
@@ -313,18 +313,14 @@ class PlayzerX(Played):
         self._line.tell(samples(codes, self._laser))
 
 
-def _checked_rate(rig: Rig) -> int:
-    rate = round(1e9 / rig.timing.fast_step_ns)
+def _check(rig: Rig, rate: int, laser: int, ahead: int) -> None:
+    """Refuse what the device cannot do. Raises DeviceError."""
+    mirror = rig.mirror
     if rate not in RATES or rate * rig.timing.fast_step_ns != 1_000_000_000:
         raise DeviceError(
             f"timing.fast_step_s = {rig.timing.fast_step_s:g} is {1 / rig.timing.fast_step_s:g} samples a second: the"
             f" PlayzerX plays a whole number from {RATES.start} to {RATES.stop - 1}; take one that divides 10^9"
         )
-    return rate
-
-
-def _check(rig: Rig, laser: int, ahead: int) -> None:
-    mirror = rig.mirror
     if rig.n_inputs > 2 or (mirror.input_min < -1).any() or (mirror.input_max > 1).any():
         raise DeviceError(
             f"the PlayzerX has two axes, each from -1 to 1: the rig file's mirror has {rig.n_inputs} input(s) from"

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from contextlib import ExitStack, suppress
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -111,23 +111,47 @@ class AptUnit:
             raise DeviceError(f"the Thorlabs unit at {self.line.url} sends {shown(head + data)}: {error}") from None
 
 
-class _Output(NamedTuple):
-    """A piezo's channel."""
+class _Output:
+    """A piezo's channel: its unit follows the host alone, in open or closed loop."""
 
-    unit: AptUnit
-    closed_loop: bool
-    most: float
-    """Full scale: volts, or micrometres in closed loop."""
+    def __init__(self, unit: AptUnit, closed_loop: bool, travel_um: float | None) -> None:
+        self.unit, self._closed_loop = unit, closed_loop
+        unit.tell("pz_set_inputvoltssrc", _CHANNEL, 0)  # the host alone: no knob, no other input
+        mode, of = (_CLOSED_LOOP, "closed") if closed_loop else (_OPEN_LOOP, "open")
+        unit.tell("pz_set_positioncontrolmode", _CHANNEL, mode)
+        if (found := self._asked("positioncontrolmode")["mode"]) != mode:
+            raise DeviceError(
+                f"the Thorlabs unit stays in control mode {found}, asked for {mode} ({of} loop): is its strain gauge"
+                " connected?"
+            )
+        if unit.is_cube:
+            most = travel_um or 0.0
+            if not closed_loop:
+                most = _CUBE_VOLTS.get(self._asked("tpz_iosettings")["voltage_limit"], 0.0)
+        else:  # it counts 100 nm, and tenths of a volt
+            most = (
+                self._asked("maxtravel")["travel"] if closed_loop else self._asked("outputmaxvolts")["voltage"]
+            ) / 10
+        if most <= 0:
+            raise DeviceError(
+                f"the Thorlabs unit says that its range is {most:g} {'um' if closed_loop else 'V'}: is an actuator"
+                " connected?"
+            )
+        self.most = most
+        """Full scale: volts, or micrometres in closed loop."""
+
+    def _asked(self, what: str) -> dict[str, Any]:
+        return self.unit.ask(f"pz_req_{what}", f"pz_get_{what}", _CHANNEL)
 
     def put(self, value: float) -> float:
         """Put out volts or micrometres; gives the value that the unit took."""
         code = int(np.clip(round(value / self.most * _FULL_SCALE), 0, _FULL_SCALE))
-        if self.closed_loop:
+        if self._closed_loop:
             self.unit.tell("pz_set_outputpos", _CHANNEL, code)
-            self.unit.ask("pz_req_outputpos", "pz_get_outputpos", _CHANNEL)
+            self._asked("outputpos")
         else:
             self.unit.tell("pz_set_outputvolts", _CHANNEL, code)
-            code = int(self.unit.ask("pz_req_outputvolts", "pz_get_outputvolts", _CHANNEL)["voltage"])
+            code = int(self._asked("outputvolts")["voltage"])
         return code * self.most / _FULL_SCALE
 
     def enable(self) -> None:
@@ -169,7 +193,6 @@ class ThorlabsPiezo:
                 f"devices.mirror.travel_um: in closed loop cubes need the travel of their actuators, found {travel_um}"
             )
         self._scale, self._park = Scale(rig.mirror, unit, zero), rig.mirror.park
-        self._closed_loop, self._travel_um = closed_loop, travel_um
         with ExitStack() as opened:
             self._lines: dict[str, SerialLine] = {}
             for path, _ in places:
@@ -177,7 +200,7 @@ class ThorlabsPiezo:
                     line = SerialLine("the Thorlabs unit", path, _BAUD_RATE)
                     self._lines[path] = opened.enter_context(line.opening())
             units = [AptUnit(self._lines[path], address) for path, address in places]
-            greeted = [(each.greeted(), _Output(each, closed_loop, self._prepare(each))) for each in units]
+            greeted = [(each.greeted(), _Output(each, closed_loop, travel_um)) for each in units]
             self.description = "Thorlabs " + "; ".join(dict.fromkeys(text for text, _ in greeted))
             self._outputs = [output for _, output in greeted]
             most = np.array([output.most for output in self._outputs])
@@ -208,30 +231,6 @@ class ThorlabsPiezo:
             self.park()
         for line in self._lines.values():
             line.close()
-
-    def _prepare(self, apt: AptUnit) -> float:
-        """Set the control mode and the input source; gives the volts or micrometres of full scale."""
-        apt.tell("pz_set_inputvoltssrc", _CHANNEL, 0)  # the host alone: no knob, no other input
-        mode, unit = (_CLOSED_LOOP, "um") if self._closed_loop else (_OPEN_LOOP, "V")
-        apt.tell("pz_set_positioncontrolmode", _CHANNEL, mode)
-        found = apt.ask("pz_req_positioncontrolmode", "pz_get_positioncontrolmode", _CHANNEL)["mode"]
-        if found != mode:
-            raise DeviceError(
-                f"the Thorlabs unit stays in control mode {found}, asked for {mode}"
-                f" ({'closed' if self._closed_loop else 'open'} loop): is its strain gauge connected?"
-            )
-        if self._closed_loop and apt.is_cube:
-            most = float(self._travel_um or 0.0)
-        elif self._closed_loop:
-            most = apt.ask("pz_req_maxtravel", "pz_get_maxtravel", _CHANNEL)["travel"] / 10  # it counts 100 nm
-        elif apt.is_cube:
-            limit = apt.ask("pz_req_tpz_iosettings", "pz_get_tpz_iosettings", _CHANNEL)["voltage_limit"]
-            most = _CUBE_VOLTS.get(limit, 0.0)
-        else:
-            most = apt.ask("pz_req_outputmaxvolts", "pz_get_outputmaxvolts", _CHANNEL)["voltage"] / 10
-        if most <= 0:
-            raise DeviceError(f"the Thorlabs unit says that its range is {most:g} {unit}: is an actuator connected?")
-        return float(most)
 
 
 class ThorlabsAligner:
