@@ -129,9 +129,8 @@ class _Output:
             if not closed_loop:
                 most = _CUBE_VOLTS.get(self._asked("tpz_iosettings")["voltage_limit"], 0.0)
         else:  # it counts 100 nm, and tenths of a volt
-            most = (
-                self._asked("maxtravel")["travel"] if closed_loop else self._asked("outputmaxvolts")["voltage"]
-            ) / 10
+            what, named = ("maxtravel", "travel") if closed_loop else ("outputmaxvolts", "voltage")
+            most = self._asked(what)[named] / 10
         if most <= 0:
             raise DeviceError(
                 f"the Thorlabs unit says that its range is {most:g} {'um' if closed_loop else 'V'}: is an actuator"
