@@ -81,7 +81,7 @@ def test_a_camera_with_a_trigger_takes_a_frame_for_each_edge_and_none_without(tm
 
 
 def test_a_camera_that_the_host_triggers_takes_a_frame_in_each_period_and_none_unasked(tmp_path: Path) -> None:
-    """At 20 commands a second; free, it would take 25."""
+    """At 20 commands a second; left to itself it would take 25."""
     frames, rig = packed(noise(16, 16), PIXEL_FORMATS["Mono16"]), fast_rig(period_steps=500)
     with gige_camera(tmp_path, frames, {}) as relay, opened(rig, trigger=Trigger("software")) as camera:
         assert camera.lacks == ()
