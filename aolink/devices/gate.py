@@ -234,7 +234,7 @@ class Gate:
         the number of frame periods between them."""
         timing, before, began = self._rig.timing, self._frame_id, self._frame_step
         since = chunk.first_step - began
-        follows = f", for frame {before} began at {began}"
+        follows = f", for frame {before} began at fast step {began}"
         if chunk.frame_id == before:
             within(device, chunk, "first_step", began, began, follows)
         elif chunk.frame_id > before:
