@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from aolink.assembly import Frame
 from aolink.devices.adapted import Adapted
 from aolink.devices.arrival import Arrivals
+from aolink.devices.cameras.pictures import check_timing
 from aolink.devices.clock import ClockExchange
 from aolink.devices.drivers import calling
 from aolink.devices.interfaces import ClockSampled, Event, Mirror
@@ -56,7 +57,7 @@ class AdaptedCamera(Adapted):
             raise DeviceError("the rig file has a [scene], and the camera's driver no second picture: take it out")
         self._rig, self._driver, self._mirror, self._monotonic_ns = rig, driver, mirror, monotonic_ns
         self._step_ns = rig.timing.fast_step_ns
-        self._period_ns = rig.timing.frame_period_steps * self._step_ns
+        self._period_ns = rig.timing.frame_period_ns
         self._arrivals = Arrivals(self._period_ns)
         self._running = self._tells_time = False
         self._first_step = 0
@@ -206,12 +207,7 @@ class AdaptedCamera(Adapted):
                 f"the camera gives {pixels.shape} pixels from {pixels.min()} to {pixels.max()}, the rig file says"
                 f" {sensor.shape} (rows, columns) of {sensor.bit_depth} bits: correct [sensor] or the camera's settings"
             )
-        expected_ns = self._rig.timing.exposure_steps * self._step_ns
-        if abs(raw.exposure_ns - expected_ns) > self._step_ns / 2:
-            raise DeviceError(
-                f"the camera exposes for {raw.exposure_ns / 1e9:g} s, the rig file says {expected_ns / 1e9:g} s:"
-                " correct timing.exposure_steps or the camera's settings"
-            )
+        check_timing(self._rig.timing, "the camera", raw.exposure_ns)
 
     def _frame_id(self, raw: SimpleFrame) -> int:
         """The count of a frame from the first of the session on. Raises DeviceError where the camera repeats one."""

@@ -142,16 +142,14 @@ class AdaptedMirror(Adapted):
         events = self.take_waiting()
         with self._call("when it was asked what it applied"):
             self._polled_ns = time.monotonic_ns()
-            for first_step, u, *rest in self._driver.applied():
-                u = np.asarray(u, dtype=np.float64)
-                late = rest[0] if rest and rest[0] is not None else np.zeros(len(u), dtype=np.bool_)
-                events += self._take(Held(first_step, u, late))
+            for held in self._driver.applied():
+                events += self._take(Held(*held))
         return events
 
     def _take(self, held: Held) -> list[Event]:
         """Report each step from the first command to the parking once, in order."""
-        first_step, u, late = held
-        assert late is not None
+        first_step, u = held.first_step, np.asarray(held.u, dtype=np.float64)
+        late = np.zeros(len(u), dtype=np.bool_) if held.late is None else held.late
         if u.ndim != 2 or u.shape[1] != self._rig.n_inputs or not np.isfinite(u).all():
             raise DeviceError(
                 f"the mirror gives an array of {u.shape} as what it applied, expected (steps, {self._rig.n_inputs}) of"

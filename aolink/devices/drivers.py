@@ -6,8 +6,10 @@ import inspect
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from importlib.metadata import EntryPoint
-from typing import Any, Literal, get_args
+from types import NoneType, UnionType
+from typing import Any, Literal, get_args, get_origin
 
+from aolink.devices.simple import FREE_RUNNING, Trigger
 from aolink.errors import AolinkError, DeviceError, RigError
 from aolink.extensions import installed, loaded
 from aolink.rig import Rig
@@ -39,20 +41,58 @@ def open_driver(kind: DeviceKind, table: DeviceTable, rig: Rig) -> Any:
     RigError
         The driver does not take the keys that the table has.
     """
-    make = check_driver(kind, table, rig)
+    make, options = check_driver(kind, table, rig)
     with calling(kind, "when it was opened"):
-        return make(rig, **table.options)
+        return make(rig, **options)
 
 
-def check_driver(kind: DeviceKind, table: DeviceTable, rig: Rig) -> Callable[..., Any]:
-    """The class of the driver that a rig file names, whose keys fit; nothing is opened. Raises as `open_driver`."""
-    make = load_driver(kind, table.driver)
+def check_driver(kind: DeviceKind, table: DeviceTable, rig: Rig) -> tuple[Callable[..., Any], dict[str, Any]]:
+    """The class of the driver that a rig file names, and its arguments; nothing is opened. Raises as `open_driver`.
+
+    The keys are those that the class takes, of the kinds that its annotations say. Where it has ``triggers``, the key
+    ``trigger`` is one of these.
+    """
+    make, options = load_driver(kind, table.driver), dict(table.options)
+    if forms := getattr(make, "triggers", ()):
+        trigger = Trigger.of(options.pop("trigger", FREE_RUNNING.kind), forms)
+        options |= {"trigger": trigger} if len(forms) > 1 else {}
     try:
         with suppress(ValueError):  # one that is not written in Python may have no signature
-            inspect.signature(make).bind(rig, **table.options)
+            inspect.signature(make).bind(rig, **options)
     except TypeError as error:
         raise RigError(f"devices.{kind}: the driver {table.driver} cannot take these keys: {error}") from None
-    return make
+    hints: dict[str, Any] = {}
+    with suppress(Exception):  # another package's annotations may be anything
+        hints = {each.name: each.annotation for each in inspect.signature(make, eval_str=True).parameters.values()}
+    for name, value in options.items():
+        if not _is_of(hint := hints.get(name, Any), value):
+            raise RigError(f"devices.{kind}.{name}: expected {_called(hint)}, found {shown(value)}")
+    return make, options
+
+
+_CALLED = {str: "text", bool: "", int: "whole number", float: "number", dict: "table"}
+
+
+def _is_of(hint: Any, value: Any) -> bool:
+    """Whether a value of TOML is of the kind that an annotation says; other classes than those of TOML are not
+    checked."""
+    kind, within = get_origin(hint) or hint, get_args(hint)
+    if isinstance(hint, UnionType):
+        return any(_is_of(each, value) for each in within)
+    if kind is list and isinstance(value, list):
+        return all(_is_of(within[0], each) for each in value)
+    if kind in (int, float):
+        return isinstance(value, int | kind) and not isinstance(value, bool)
+    return kind not in (*_CALLED, list, NoneType) or isinstance(value, kind)
+
+
+def _called(hint: Any, article: str = "a ", plural: str = "") -> str:
+    within = [each for each in get_args(hint) if each is not NoneType]
+    if isinstance(hint, UnionType):
+        return " or ".join(_called(each, article, plural) for each in within)
+    if get_origin(hint) is list:
+        return f"a list of {_called(within[0], '', 's')}"
+    return "true or false" if hint is bool else f"{article}{_CALLED[get_origin(hint) or hint]}{plural}"
 
 
 def native_port(kind: DeviceKind, table: DeviceTable) -> str:
@@ -78,18 +118,6 @@ def calling(kind: str, when: str) -> Iterator[None]:
         raise
     except Exception as error:
         raise DeviceError(f"the driver of the {kind} failed {when}: {error!r}") from error
-
-
-class Failure:
-    """The error that has ended a driver's thread: the session gets it when it calls the driver next."""
-
-    def __init__(self) -> None:
-        self.error: Exception | None = None
-
-    def check(self) -> None:
-        """Raise the error, if there is one."""
-        if self.error is not None:
-            raise self.error
 
 
 def load_driver(kind: DeviceKind, name: str) -> Callable[..., Any]:

@@ -39,6 +39,7 @@ _LONGEST_TEXT = 1000
 _REMEMBERED_BLOCKS = 4096
 """Number of blocks that are remembered. A closed loop sends some six for each exposure; for older ones only the id is
 checked."""
+_BY_NOW = ", where the device is at most"
 _KINDS: dict[str, tuple[type[Message], ...]] = {
     "camera": (pb.FrameChunk, pb.TruthChunk, pb.ClockReply, pb.Event, pb.Ack, pb.Identity),
     "mirror": (pb.Applied, pb.CommandAck, pb.ClockReply, pb.Event, pb.Ack, pb.Identity),
@@ -58,6 +59,13 @@ def require(ok: bool, device: str, field: str, found: object, expected: object) 
     """Raise the error of `lie` for a field unless its value is ``ok``."""
     if not ok:
         raise lie(device, field, found, str(expected))
+
+
+def within(device: str, message: Message, field: str, low: int, high: int, why: str = "") -> None:
+    """Raise the error of `lie` unless a field of a message is a number from ``low`` to ``high``."""
+    found = getattr(message, field)
+    expected = f"{low}{f' to {high}' if high != low else ''}{why}"
+    require(low <= found <= high, device, f"{type(message).__name__}.{field}", found, expected)
 
 
 def printable(text: str) -> str:
@@ -137,15 +145,12 @@ class Gate:
         elif isinstance(message, pb.CommandAck):
             self._check_command_ack(device, message, receive_ns)
         elif isinstance(message, pb.TruthChunk):
-            fine, what = 0 < message.total <= self._most_truth, f"1 to {self._most_truth} bytes"
-            require(fine, device, "TruthChunk.total", message.total, what)
+            within(device, message, "total", 1, self._most_truth, " bytes")
             _check_data(device, message)
         elif isinstance(message, pb.ClockReply):
             check_times(device, message, ("device_receive_ns", "device_send_ns"))
         elif isinstance(message, pb.Ack):
-            latest = max(self._sent_end, self._end(receive_ns))
-            what = f"at most {latest}, where the device is at most"
-            require(message.step <= latest, device, "Ack.step", message.step, what)
+            within(device, message, "step", 0, max(self._sent_end, self._end(receive_ns)), _BY_NOW)
         return True
 
     def check_step(self, device: str, step: int, now_ns: int) -> None:
@@ -187,15 +192,11 @@ class Gate:
         hub, before = self._hub, link.handed
         for each in hub.links:
             name = f"{each.name}_bytes"
-            taken, least = getattr(handed, name), getattr(before, name) if before else 0
-            what = f"{least} to {each.sent_bytes}"
-            require(least <= taken <= each.sent_bytes, link.name, f"VirtualTime.{name}", taken, what)
+            within(link.name, handed, name, getattr(before, name) if before else 0, each.sent_bytes)
         delay_s = _SLACK_S + (_DELAY_S + 4 * self._rig.simulation.latency_s) * sum(e.sent_packets for e in hub.links)
         driven_s = (self._sent_end - self._first_step) * self._step_ns / 1e9 * (1 + MOST_RATE_ERROR)
-        first_ns = before.host_ns if before else 0
         last_ns = hub.virtual_since_ns + hub.elapsed_ns + round((driven_s + delay_s) * 1e9)
-        fine, what = first_ns <= handed.host_ns <= last_ns, f"{first_ns} to {last_ns}"
-        require(fine, link.name, "VirtualTime.host_ns", handed.host_ns, what)
+        within(link.name, handed, "host_ns", before.host_ns if before else 0, last_ns)
 
     def _end(self, now_ns: int) -> int:
         """The first fast step that cannot have ended yet."""
@@ -212,47 +213,34 @@ class Gate:
         _check_data(device, chunk)
         if head == self._frame_head:
             return
-        timing, end = self._rig.timing, self._end(receive_ns)
-        known = len(self._planes)
-        require(chunk.plane < known, device, "FrameChunk.plane", chunk.plane, f"below {known}")
+        timing, first = self._rig.timing, chunk.first_step
+        within(device, chunk, "plane", 0, len(self._planes) - 1)
         rows, columns = self._planes[chunk.plane][0]
-        first = chunk.first_step
-        pairs = [
-            ("height", chunk.height, rows),
-            ("width", chunk.width, columns),
-            ("total", chunk.total, 2 * rows * columns),
-            ("last_step", chunk.last_step, first + timing.exposure_steps - 1),
-        ]
-        for name, found, expected in pairs:
-            require(found == expected, device, f"FrameChunk.{name}", found, expected)
-        what = f"below {end}, where the device is at most"
-        require(chunk.last_step < end, device, "FrameChunk.last_step", chunk.last_step, what)
-        offset_ns, what = chunk.exposure_offset_ns, f"below {self._step_ns}"
-        require(offset_ns < self._step_ns, device, "FrameChunk.exposure_offset_ns", offset_ns, what)
+        exact = {"height": rows, "width": columns, "total": 2 * rows * columns}
+        for name, expected in {**exact, "last_step": first + timing.exposure_steps - 1}.items():
+            within(device, chunk, name, expected, expected)
+        within(device, chunk, "last_step", 0, self._end(receive_ns) - 1, _BY_NOW)
+        within(device, chunk, "exposure_offset_ns", 0, self._step_ns - 1)
         check_times(device, chunk, ("exposure_start_ns", "exposure_end_ns"))
         if self._frame_id >= 0:
-            self._check_order(device, chunk.frame_id, first)
+            self._check_order(device, chunk)
         else:
-            require(chunk.frame_id <= MOST_STEP, device, "FrameChunk.frame_id", chunk.frame_id, "at most 2^53")
+            within(device, chunk, "frame_id", 0, MOST_STEP)
         if chunk.frame_id >= self._frame_id:
             self._frame_id, self._frame_step, self._frame_head = chunk.frame_id, first, head
 
-    def _check_order(self, device: str, frame_id: int, first_step: int) -> None:
+    def _check_order(self, device: str, chunk: pb.FrameChunk) -> None:
         """Whether a frame can follow the one before: a newer frame begins later, and its id is higher by no more than
         the number of frame periods between them."""
-        timing, before, since = self._rig.timing, self._frame_id, first_step - self._frame_step
-        what = f"{self._frame_step}, as the rest of frame {frame_id} has"
-        require(frame_id != before or not since, device, "FrameChunk.first_step", first_step, what)
-        if frame_id <= before:
-            what = f"above {before}, the id of the frame before it"
-            require(since <= 0, device, "FrameChunk.frame_id", frame_id, what)
-            return
-        least = self._frame_step + timing.exposure_steps
-        what = f"at least {least}, for frame {before} began at {self._frame_step}"
-        require(first_step >= least, device, "FrameChunk.first_step", first_step, what)
-        most = before + since // timing.frame_period_steps + 1
-        what = f"at most {most}, {since} fast steps after frame {before}"
-        require(frame_id <= most, device, "FrameChunk.frame_id", frame_id, what)
+        timing, before, began = self._rig.timing, self._frame_id, self._frame_step
+        since = chunk.first_step - began
+        follows = f", for frame {before} began at fast step {began}"
+        if chunk.frame_id == before:
+            within(device, chunk, "first_step", began, began, follows)
+        elif chunk.frame_id > before:
+            within(device, chunk, "first_step", began + timing.exposure_steps, MOST_STEP, follows)
+        most = before + since // timing.frame_period_steps + 1 if since > 0 else before
+        within(device, chunk, "frame_id", before + 1 if since > 0 else 0, most, follows)
 
     def _check_applied(self, device: str, applied: pb.Applied, receive_ns: int) -> bool:
         n_inputs, numbers = self._rig.n_inputs, len(applied.u)
@@ -265,18 +253,12 @@ class Gate:
         require(whole, device, "Applied.n_steps", applied.n_steps, what)
         if end <= self._first_step:  # from an earlier session
             return False
-        latest = self._end(receive_ns)
-        what = f"to end by {latest}, where the device is at most"
-        require(end <= latest, device, "Applied.first_step + n_steps", end, what)
-        block_id, commands = applied.block_id, (pb.Applied.COMMAND, pb.Applied.CLIPPED)
-        what = f"a command's, where the source is {sources.Name(applied.source)}"
-        require(bool(block_id) or applied.source not in commands, device, "Applied.block_id", 0, what)
-        what = f"at most {self._last_block}, the newest that was sent"
-        require(block_id <= self._last_block, device, "Applied.block_id", block_id, what)
-        first_sent, end_sent = self._sent.get(block_id, (0, MOST_STEP))
-        what = f"steps {first_sent} to {end_sent - 1} of block {block_id}"
-        within = first_sent <= applied.first_step and end <= end_sent
-        require(within, device, "Applied.first_step", f"{applied.first_step} (to {end - 1})", what)
+        commanded = applied.source in (pb.Applied.COMMAND, pb.Applied.CLIPPED)
+        within(device, applied, "block_id", int(commanded), self._last_block, ", the newest that was sent")
+        first_sent, end_sent = self._sent.get(applied.block_id, (0, MOST_STEP))
+        last = min(end_sent, self._end(receive_ns)) - applied.n_steps
+        why = f" for {applied.n_steps} steps of block {applied.block_id} by now"
+        within(device, applied, "first_step", first_sent, last, why)
         u = np.array(applied.u, dtype=np.float64).reshape(-1, n_inputs)
         inside = (u >= self._input_min) & (u <= self._input_max)
         if not inside.all():  # NaN fails as well
@@ -289,18 +271,13 @@ class Gate:
         return True
 
     def _check_command_ack(self, device: str, ack: pb.CommandAck, receive_ns: int) -> None:
-        what = f"1 to {self._last_block}, those that were sent"
-        require(0 < ack.block_id <= self._last_block, device, "CommandAck.block_id", ack.block_id, what)
+        within(device, ack, "block_id", 1, self._last_block, ", those that were sent")
         require(ack.code in pb.Code.values(), device, "CommandAck.code", ack.code, f"one of {pb.Code.values()}")
         if ack.block_id in self._sent:
             first, end = self._sent[ack.block_id]
-            what = f"at most {end - first}, the steps of block {ack.block_id}"
             for name in ("late_steps", "superseded_steps"):
-                found = getattr(ack, name)
-                require(found <= end - first, device, f"CommandAck.{name}", found, what)
-        latest = max(self._sent_end, self._end(receive_ns))
-        end = ack.queue_end_step
-        require(end <= latest, device, "CommandAck.queue_end_step", end, f"at most {latest}")
+                within(device, ack, name, 0, end - first, f", the steps of block {ack.block_id}")
+        within(device, ack, "queue_end_step", 0, max(self._sent_end, self._end(receive_ns)))
 
 
 def _check_data(device: str, chunk: pb.FrameChunk | pb.TruthChunk) -> None:
@@ -312,5 +289,4 @@ def _check_data(device: str, chunk: pb.FrameChunk | pb.TruthChunk) -> None:
 
 def check_times(device: str, message: Message, names: Iterable[str]) -> None:
     for name in names:
-        field, time_ns = f"{type(message).__name__}.{name}", getattr(message, name)
-        require(abs(time_ns) <= MOST_TIME_NS, device, field, time_ns, f"within {MOST_TIME_NS} ns of the device's zero")
+        within(device, message, name, -MOST_TIME_NS, MOST_TIME_NS, " ns from the device's zero")

@@ -8,7 +8,6 @@ from aolink.devices.adapted_camera import AdaptedCamera
 from aolink.devices.adapted_mirror import AdaptedMirror
 from aolink.devices.interfaces import Happened
 from aolink.devices.native import NativeCamera, NativeMirror
-from aolink.devices.no_mirror import NoMirror
 from aolink.wire.hub import Hub
 
 _POLL_S = 0.005
@@ -22,7 +21,7 @@ class Host(Hub):
         super().__init__(stop)
         self.native: list[NativeCamera | NativeMirror] = []
         """The devices behind the links."""
-        self.polled: list[AdaptedCamera | AdaptedMirror | NoMirror] = []
+        self.polled: list[AdaptedCamera | AdaptedMirror] = []
         """The devices of simple drivers."""
 
     def close(self) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import secrets
 
-from aolink.devices.gate import MOST_STEP, check_times, require
+from aolink.devices.gate import MOST_STEP, check_times, require, within
 from aolink.errors import DeviceError, PortError
 from aolink.rig import Rig
 from aolink.wire import messages_pb2 as pb
@@ -37,17 +37,14 @@ def identify(hub: Hub, link: Link, nonce: int) -> pb.Identity:
     except PortError:
         if link.foreign_version is None:  # the device closes the connection to a host that it refuses
             raise
-    if identity is None and link.foreign_version is not None:
-        found = link.foreign_version
-    elif identity is None:
+    found = link.foreign_version if identity is None else identity.protocol_version
+    if found is None:
         heard = link.counts.bytes_received
         what = f"{heard} bytes came that are not aolink packets" if heard else "nothing came"
         raise DeviceError(
             f"no device answers on the {link.name} port ({what}): is it the right port, is the device switched on,"
             " does another host have it?"
         )
-    else:
-        found = identity.protocol_version
     if identity is None or found != PROTOCOL_VERSION:
         update = f"update the {'device' if found < PROTOCOL_VERSION else 'host'}"
         raise DeviceError(
@@ -66,8 +63,7 @@ def identify(hub: Hub, link: Link, nonce: int) -> pb.Identity:
 def check_kind(link: Link, identity: pb.Identity, kind: pb.Identity.Kind) -> None:
     """Refuse a device of another kind. Raises DeviceError."""
     if identity.kind != kind:
-        found = pb.Identity.Kind.Name(identity.kind).lower()
-        wanted = pb.Identity.Kind.Name(kind).lower()
+        found, wanted = (pb.Identity.Kind.Name(each).lower() for each in (identity.kind, kind))
         raise DeviceError(
             f"the device on the {link.name} port is a {found} ({identity.model}), expected a {wanted}:"
             " are the two ports swapped?"
@@ -82,10 +78,9 @@ def check_identity(link: Link, identity: pb.Identity) -> None:
         text = getattr(identity, field)
         fine, what = len(text) <= _LONGEST_NAME and text.isprintable(), "characters that can be printed"
         require(fine, name, f"Identity.{field}", repr(text[:40]), f"at most {_LONGEST_NAME} {what}")
-    step_ns, step = identity.fast_step_ns, identity.next_step
-    require(0 < step_ns <= 10**10, name, "Identity.fast_step_ns", step_ns, "1 to 10^10")
-    require(step <= MOST_STEP, name, "Identity.next_step", step, "at most 2^53")
-    check_times(link.name, identity, ("step_zero_ns",))
+    within(name, identity, "fast_step_ns", 1, 10**10)
+    within(name, identity, "next_step", 0, MOST_STEP)
+    check_times(name, identity, ("step_zero_ns",))
 
 
 def check_against_rig(rig: Rig, identities: dict[str, pb.Identity]) -> list[str]:
@@ -117,15 +112,11 @@ def check_against_rig(rig: Rig, identities: dict[str, pb.Identity]) -> list[str]
         ]
     if "mirror" in identities:
         limits = identities["mirror"].mirror
-        pairs += [
-            ("number of inputs", limits.n_inputs, rig.n_inputs),
-            ("mirror.input_min", list(limits.input_min), rig.mirror.input_min.tolist()),
-            ("mirror.input_max", list(limits.input_max), rig.mirror.input_max.tolist()),
-            ("mirror.park", list(limits.park), rig.mirror.park.tolist()),
-            ("mirror.dac_bits", limits.dac_bits, rig.mirror.dac_bits),
-            ("mirror.queue_steps", limits.queue_steps, rig.mirror.queue_steps),
-            ("mirror.watchdog_s", limits.watchdog_s, rig.mirror.watchdog_s),
-        ]
+        pairs.append(("number of inputs", limits.n_inputs, rig.n_inputs))
+        for name in ("input_min", "input_max", "park"):
+            pairs.append((f"mirror.{name}", [*getattr(limits, name)], getattr(rig.mirror, name).tolist()))
+        for name in ("dac_bits", "queue_steps", "watchdog_s"):
+            pairs.append((f"mirror.{name}", getattr(limits, name), getattr(rig.mirror, name)))
     for name, found, expected in pairs:
         if found != expected:
             raise DeviceError(

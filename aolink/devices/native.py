@@ -221,6 +221,8 @@ class _Flight:
     """Time of the last try."""
     put_off_ns: int = 0
     """The time at which a try was due and was not sent, because the one before it could still be answered."""
+    withdrawn: bool = False
+    """Whether it is not sent again, though it may still be answered."""
     timeouts: int = 0
     times_full: int = 0
     tries: dict[int, int] = field(default_factory=dict)
@@ -261,8 +263,6 @@ class NativeMirror(_NativeDevice):
         """A queue that stays full for longer will stay full forever."""
         self._block_ids = count(1)
         self._flights: dict[int, _Flight] = {}
-        self._withdrawn: dict[int, _Flight] = {}
-        """Blocks that are not sent again, but may still be answered."""
         self._given_up: list[CommandAnswered] = []
         """Blocks whose answers are not waited for any more, until that is an event."""
         self._answered_ns: int | None = None
@@ -297,7 +297,11 @@ class NativeMirror(_NativeDevice):
 
     @property
     def in_flight(self) -> int:
-        return len(self._flights)
+        return len(self._sent_again())
+
+    def _sent_again(self) -> list[_Flight]:
+        """The blocks that are sent again until they are answered."""
+        return [flight for flight in self._flights.values() if not flight.withdrawn]
 
     def send_block(self, first_step: int, u: NDArray[np.float64], cause_frame_id: int, now_ns: int) -> pb.CommandBlock:
         u = self._gate.limits.take(first_step, u)
@@ -314,13 +318,11 @@ class NativeMirror(_NativeDevice):
         return block
 
     def withdraw(self, step: int) -> int:
-        replaced = [
-            flight for flight in self._flights.values() if flight.block.first_step + flight.block.n_steps > step
-        ]
+        replaced = [each for each in self._sent_again() if each.block.first_step + each.block.n_steps > step]
         for flight in replaced:
-            self._withdrawn[flight.block.block_id] = self._flights.pop(flight.block.block_id)
-        while len(self._withdrawn) > _MOST_WITHDRAWN:  # their answers were lost
-            self._given_up.append(self._withdrawn.pop(next(iter(self._withdrawn))).answered())
+            flight.withdrawn = True
+        for flight in [each for each in self._flights.values() if each.withdrawn][:-_MOST_WITHDRAWN]:
+            self._given_up.append(self._flights.pop(flight.block.block_id).answered())  # their answers were lost
         return min([step, *(flight.block.first_step for flight in replaced)])
 
     def go_on_from(self, first_step: int, step: int) -> NDArray[np.float64]:
@@ -338,14 +340,14 @@ class NativeMirror(_NativeDevice):
 
     def next_due_ns(self) -> int | None:
         timeout_ns = self._timeout_ns()
-        due_ns = [flight.due_ns(timeout_ns) for flight in self._flights.values()]
+        due_ns = [flight.due_ns(timeout_ns) for flight in self._sent_again()]
         if (report_ns := self._reports.next_due_ns(timeout_ns)) is not None:
             due_ns.append(report_ns)
         return min(due_ns, default=None)
 
     def serve(self, now_ns: int) -> list[Event]:
         timeout_ns = self._timeout_ns()
-        for flight in self._flights.values():
+        for flight in self._sent_again():
             if flight.due_ns(timeout_ns) > now_ns:
                 continue
             silent_s = (now_ns - flight.heard_ns) / 1e9
@@ -383,8 +385,8 @@ class NativeMirror(_NativeDevice):
 
     def last_answers(self) -> list[CommandAnswered]:
         self.withdraw(0)
-        given_up = [*self._given_up, *(flight.answered() for flight in self._withdrawn.values())]
-        self._given_up, self._withdrawn = [], {}
+        given_up = [*self._given_up, *(flight.answered() for flight in self._flights.values())]
+        self._given_up, self._flights = [], {}
         return given_up
 
     def rearm(self) -> int:
@@ -406,23 +408,20 @@ class NativeMirror(_NativeDevice):
         self.latched, self.outage_s, self._answered_ns = self.identity.mirror.latched, 0.0, None
 
     def _take(self, message: Message, receive_ns: int) -> list[Event]:
-        given_up, self._given_up = self._given_up, []
-        return [*given_up, *self._answers_to(message, receive_ns)]
-
-    def _answers_to(self, message: Message, receive_ns: int) -> Sequence[Event]:
+        events: list[Event] = [*self._given_up]
+        self._given_up = []
         if isinstance(message, pb.CommandAck):
-            return self._take_ack(message, receive_ns)
-        if isinstance(message, pb.Applied):
-            return self._reports.take(message, receive_ns)
-        if isinstance(message, pb.ClockReply):
+            events += self._take_ack(message, receive_ns)
+        elif isinstance(message, pb.Applied):
+            events += self._reports.take(message, receive_ns)
+        elif isinstance(message, pb.ClockReply):
             # While a block is sent again the line is busy in one direction, so such a sample is useless.
-            clean = all(len(flight.tries) == 1 for flight in self._flights.values())
-            return self._sample_clock(message, receive_ns, usable=clean)
-        return []
+            clean = all(len(flight.tries) == 1 for flight in self._sent_again())
+            events += self._sample_clock(message, receive_ns, usable=clean)
+        return events
 
     def _take_ack(self, ack: pb.CommandAck, receive_ns: int) -> list[Event]:
-        flight = self._flights.get(ack.block_id) or self._withdrawn.get(ack.block_id)
-        if flight is None:
+        if (flight := self._flights.get(ack.block_id)) is None:
             return []
         sent_ns = flight.tries.get(ack.sequence)
         if sent_ns is not None:
@@ -434,14 +433,13 @@ class NativeMirror(_NativeDevice):
                 expected = f"room in a queue of {self.identity.mirror.queue_steps} steps by then"
                 raise lie(self.name, "CommandAck.code", f"QUEUE_FULL for {full_s:.1f} s", expected)
             return []
-        withdrawn = self._flights.pop(ack.block_id, None) is None
-        self._withdrawn.pop(ack.block_id, None)
+        del self._flights[ack.block_id]
         self.queue_end_step = ack.queue_end_step
-        if ack.code == pb.LATCHED and withdrawn:
-            pass  # it was sent before the mirror was re-armed or parked, or another block says the same
-        elif ack.code == pb.LATCHED:
-            self.latched = True
-            self.outage_s = 0.0 if self._answered_ns is None else (receive_ns - self._answered_ns) / 1e9
+        if ack.code == pb.LATCHED:
+            # A block that was withdrawn was sent before the mirror was re-armed or parked, or another says the same.
+            if not flight.withdrawn:
+                self.latched = True
+                self.outage_s = 0.0 if self._answered_ns is None else (receive_ns - self._answered_ns) / 1e9
         else:
             self._answered_ns = max(self._answered_ns or 0, flight.last_ns if sent_ns is None else sent_ns)
         ack.text = printable(ack.text)

@@ -78,13 +78,13 @@ def open_devices(
         if reconnect_s:
             _allow_return(host, stop, reconnect_s)
         mirror: Mirror
-        if native_mirror is None and "mirror" not in tables:
+        if "mirror" in tables:
+            mirror = native_mirror or _open_mirror(rig, tables["mirror"], host, stack)
+        else:
             mirror = no_mirror = NoMirror(rig, host.now_ns, native_camera.since_zero_ns if native_camera else None)
             host.polled.append(no_mirror)
             if rig.drive.kind != "none":
                 warnings.append("no mirror is named (--mirror, [devices.mirror]): the rig file's drive is not played")
-        else:
-            mirror = native_mirror or _open_mirror(rig, tables["mirror"], host, stack)
         camera = native_camera or _open_camera(rig, tables["camera"], mirror, host, stack)
         yield Opened(host, camera, mirror, warnings)
 
@@ -101,24 +101,20 @@ def _tables(rig: Rig, camera_port: str | None, mirror_port: str | None) -> dict[
 
 
 def _open_mirror(rig: Rig, table: DeviceTable, host: Host, stack: ExitStack) -> AdaptedMirror:
-    driver = open_driver("mirror", table, rig)
-    with _closing_what_fails("mirror", lambda: driver.close()):
-        if hasattr(driver, "put"):
-            _check_whole("mirror", table, driver, DirectMirror)
-            driver = PacedMirror(rig, driver)
-        else:
-            _check_whole("mirror", table, driver, SimpleMirror)
-        mirror = AdaptedMirror(rig, driver, table.delay or Delay(), host.now_ns)
+    with _opened("mirror", table, rig) as driver:
+        paced = hasattr(driver, "put")
+        _check_whole("mirror", table, driver, DirectMirror if paced else SimpleMirror)
+        simple = PacedMirror(rig, driver) if paced else driver
+        mirror = AdaptedMirror(rig, simple, table.delay or Delay(), host.now_ns)
         _close_with(stack, mirror.close)
     host.polled.append(mirror)
     return mirror
 
 
 def _open_camera(rig: Rig, table: DeviceTable, mirror: Mirror, host: Host, stack: ExitStack) -> AdaptedCamera:
-    driver = open_driver("camera", table, rig)
-    with _closing_what_fails("camera", lambda: driver.close()):
+    with _opened("camera", table, rig) as driver:
         _check_whole("camera", table, driver, SimpleCamera)
-        tells_time, period_s = driver.time_ns() is not None, rig.timing.frame_period_steps * rig.timing.fast_step_s
+        tells_time, period_s = driver.time_ns() is not None, rig.timing.frame_period_ns / 1e9
         # Where the delay of frames is not known, a frame may arrive at any time within the frame period after its
         # exposure.
         delay = table.delay or (Delay() if tells_time else Delay(mean_s=period_s / 2, sd_s=period_s / math.sqrt(12)))
@@ -139,14 +135,15 @@ def _close_with(stack: ExitStack, close: Callable[[], None]) -> None:
 
 
 @contextmanager
-def _closing_what_fails(kind: DeviceKind, close: Callable[[], None]) -> Iterator[None]:
-    """Close a driver that turns out to be unusable. Raises DeviceError for any exception of the driver."""
+def _opened(kind: DeviceKind, table: DeviceTable, rig: Rig) -> Iterator[Any]:
+    """A driver, closed where it turns out to be unusable. Raises DeviceError for any exception of the driver."""
+    driver = open_driver(kind, table, rig)
     try:
         with calling(kind, "when it was opened"):
-            yield
+            yield driver
     except BaseException:
         with suppress(Exception):  # it may lack ``close`` as well
-            close()
+            driver.close()
         raise
 
 
@@ -163,24 +160,21 @@ def _open_native(
         identities[kind] = identify(host, link, new_nonce())
         check_kind(link, identities[kind], pb.Identity.CAMERA if kind == "camera" else pb.Identity.MIRROR)
     warnings = check_against_rig(rig, identities)
-    if "camera" in identities and "mirror" not in identities and identities["camera"].virtual_time:
-        raise DeviceError("the camera runs on virtual time, which the mirror's line hands on: give --mirror PORT too")
+    virtual = any(identity.virtual_time for identity in identities.values())
+    if virtual and len(identities) < 2:
+        raise DeviceError(
+            "the camera runs on virtual time, which the mirror's line hands on: give --mirror PORT too"
+            if "camera" in identities
+            else "the mirror runs on virtual time, which only the camera of the same simulated rig follows: run the rig"
+            " with --real-time"
+        )
     gate = Gate(rig, host, identities.values(), asked_ns)
     host.budget_bytes += gate.exposure_bytes * (2 + rig.mirror.queue_steps // rig.timing.frame_period_steps)
-    if "mirror" in identities and identities["mirror"].virtual_time:
-        if "camera" not in identities:
-            raise DeviceError(
-                "the mirror runs on virtual time, which only the camera of the same simulated rig follows: run the rig"
-                " with --real-time"
-            )
+    if virtual:
         host.go_virtual(gate.check_virtual_time)
-    mirror = camera = None
-    if "mirror" in links:
-        mirror = NativeMirror(host, links["mirror"], identities["mirror"], gate)
-        host.native.append(mirror)
-    if "camera" in links:
-        camera = NativeCamera(host, links["camera"], identities["camera"], gate)
-        host.native.append(camera)
+    mirror = NativeMirror(host, links["mirror"], identities["mirror"], gate) if "mirror" in links else None
+    camera = NativeCamera(host, links["camera"], identities["camera"], gate) if "camera" in links else None
+    host.native += [each for each in (mirror, camera) if each is not None]
     for link in host.links:
         link.reset_counts()
     return camera, mirror, warnings

@@ -1,18 +1,16 @@
-"""A mirror without a queue, driven at the fast rate by a thread of the host."""
+"""Mirrors whose inputs wait on the host: a thread of the host plays each in its fast step."""
 
 from __future__ import annotations
 
 import threading
 import time
 from collections import deque
-from collections.abc import Iterable
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from aolink.devices.drivers import Failure
 from aolink.devices.interfaces import lacks_of
-from aolink.devices.outages import Outages
 from aolink.devices.simple import DirectMirror, Held
 from aolink.rig import Rig
 
@@ -23,7 +21,101 @@ _LEAST_PERIOD_NS = 1_000_000
 """Least period of checking whether the host is held up, ns: more frequent checks would cost more than they show."""
 
 
-class PacedMirror:
+class Played:
+    """The common part of mirrors whose inputs a thread of the host plays: `send`, `applied`, and the thread's error.
+
+    An input may be kept as the device takes it, (n,); `_inputs` gives the inputs of a run of steps.
+    """
+
+    def __init__(self) -> None:
+        self._queue: dict[int, NDArray[Any]] = {}
+        """Inputs by fast step."""
+        self._next = 0
+        """The first step that has not been played."""
+        self._held: list[tuple[NDArray[Any], bool]] = []
+        """Inputs of the steps that were not reported yet, and whether they were late."""
+        self._reported = 0
+        """The first step of ``_held``."""
+        self._changed = threading.Condition()
+        """Guards all of the above."""
+        self._failure: Exception | None = None
+        self._thread = threading.Thread(target=self._run, name=f"aolink-{type(self).__name__}", daemon=True)
+
+    def send(self, first_step: int, u: NDArray[Any]) -> int:
+        with self._changed:
+            self._check()
+            late = min(max(self._next - first_step, 0), len(u))
+            self._queue.update(enumerate(u[late:], first_step + late))
+        return late
+
+    def applied(self) -> list[Held]:
+        with self._changed:
+            self._check()
+            n_steps = self._n_over()
+            held, self._held = self._held[:n_steps], self._held[n_steps:]
+            first, self._reported = self._reported, self._reported + n_steps
+        if not held:
+            return []
+        return [Held(first, self._inputs(np.array([u for u, _ in held])), np.array([late for _, late in held]))]
+
+    def _n_over(self) -> int:
+        """How many of the steps in ``_held`` are over."""
+        return len(self._held)
+
+    def _inputs(self, held: NDArray[Any]) -> NDArray[np.float64]:
+        return held
+
+    def _check(self) -> None:
+        """Raise the error that has ended the thread, if there is one."""
+        if self._failure is not None:
+            raise self._failure
+
+    def _play(self) -> None:
+        """Play inputs until the mirror is closed."""
+        raise NotImplementedError
+
+    def _run(self) -> None:
+        try:
+            self._play()
+        except Exception as error:  # the session gets it when it asks next
+            with self._changed:
+                self._failure = error
+
+
+class Outages:
+    """A thread that should run every ``period_ns`` measures by its own lateness how long this process did not run.
+
+    It is slightly late without an outage, too: a lateness below one period is not counted.
+    """
+
+    def __init__(self, period_ns: int) -> None:
+        self._period_ns = period_ns
+        self._ended_ns, self._seen_ns = 0, time.monotonic_ns()
+        self._changed = threading.Lock()
+        self._closed = threading.Event()
+        self._thread = threading.Thread(target=self._watch, name="aolink-outages", daemon=True)
+        self._thread.start()
+
+    def total_ns(self) -> int:
+        """Time of all outages so far, including one that has just ended and that the thread has not noticed yet."""
+        with self._changed:
+            return self._ended_ns + self._overdue_ns()
+
+    def close(self) -> None:
+        self._closed.set()
+        self._thread.join()
+
+    def _overdue_ns(self) -> int:
+        return max(0, time.monotonic_ns() - self._seen_ns - 2 * self._period_ns)
+
+    def _watch(self) -> None:
+        while not self._closed.wait(self._period_ns / 1e9):
+            with self._changed:
+                self._ended_ns += self._overdue_ns()
+                self._seen_ns = time.monotonic_ns()
+
+
+class PacedMirror(Played):
     """A `SimpleMirror` made of a `DirectMirror`: the host queues the inputs, and sends each when its step begins.
 
     The scheduler and the serial line limit how exact this is. A step for which the device took its input later than
@@ -33,30 +125,19 @@ class PacedMirror:
     """
 
     def __init__(self, rig: Rig, driver: DirectMirror) -> None:
+        super().__init__()
         self.description = driver.description
         self.lacks = lacks_of(driver)
         self._driver, self._park, self._step_ns = driver, rig.mirror.park, rig.timing.fast_step_ns
         self._zero_ns = time.monotonic_ns()
-        self._queue: dict[int, NDArray[np.float64]] = {}
-        self._next = 0
-        """The next step to play."""
         self._now = self._park
         """The input that the device holds."""
-        self._held: list[tuple[NDArray[np.float64], bool]] = []
-        """Inputs of the steps that were not reported yet, and whether they were late."""
-        self._reported = 0
-        """The first step of ``_held``. While the device takes an input, its step has been played, but is not in
-        ``_held`` yet."""
-        self._changed = threading.Condition()
-        """Guards all of the above."""
         self._device = threading.Lock()
         """Held while the driver is called; a thread that holds ``_changed`` never acquires it."""
         self._lateness_ns: deque[int] = deque(maxlen=_REMEMBERED)
         """Times from the beginning of a step until the device's answer to its input was read, for the newest inputs."""
         self._outages = Outages(max(rig.timing.fast_step_ns // 8, _LEAST_PERIOD_NS))
         self._parked = self._closed = False
-        self._failure = Failure()
-        self._thread = threading.Thread(target=self._play, name="aolink-paced-mirror", daemon=True)
         self._thread.start()
 
     def time_ns(self) -> int:
@@ -71,20 +152,8 @@ class PacedMirror:
 
     def send(self, first_step: int, u: NDArray[np.float64]) -> int:
         with self._changed:
-            self._failure.check()
             self._parked = False
-            late = min(max(self._next - first_step, 0), len(u))
-            self._queue.update(enumerate(u[late:], first_step + late))
-        return late
-
-    def applied(self) -> Iterable[Held]:
-        with self._changed:
-            self._failure.check()
-            held, self._held = self._held, []
-            first, self._reported = self._reported, self._reported + len(held)
-        if not held:
-            return []
-        return [Held(first, np.array([u for u, _ in held]), np.array([late for _, late in held]))]
+            return super().send(first_step, u)
 
     def park(self) -> int:
         with self._changed:
@@ -118,12 +187,7 @@ class PacedMirror:
                 if np.array_equal(u, self._now):
                     self._held.append((self._now, False))
                     continue
-            try:
-                self._put(step, u)
-            except Exception as error:  # the session gets the error when it asks next
-                with self._changed:
-                    self._failure.error = error
-                return
+            self._put(step, u)
 
     def _wait_for_step(self) -> int | None:
         """Wait for the step that follows the last one played, and give the present step; None when the mirror is

@@ -1,21 +1,29 @@
 """Protocols for drivers of cameras and mirrors that do not speak aolink's packets.
 
 A simple driver knows its device and nothing of a session. It never waits: the session's thread polls it every few
-milliseconds. `aolink.devices.adapted_camera` and `adapted_mirror` make a session's devices of such drivers, and
-`aolink.devices.paced` makes a mirror with a queue of one without.
+milliseconds. `aolink.devices.adapted_camera` and `adapted_mirror` make a session's devices of such drivers,
+`ThreadCamera` makes a camera of a loop that may wait, and `aolink.devices.paced` a mirror with a queue of one without.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import threading
+from collections import deque
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from aolink.devices.interfaces import Lacks as Lacks
+from aolink.errors import RigError
 from aolink.exposure import Truth
+
+_MOST_WAITING = 64
+"""The most frames that wait to be taken: where there are more, the oldest are dropped, and count as lost."""
+_JOIN_S = 2.0
+"""How long closing a camera waits for its thread, which may be waiting for a frame."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -39,6 +47,31 @@ class SimpleFrame:
     """Packets of the frame that never arrived."""
     truth: Truth | None = None
     """The true states and path, where the driver simulates a camera."""
+
+
+class Trigger(NamedTuple):
+    """What starts each exposure of a camera: the key ``trigger`` of ``[devices.camera]``."""
+
+    kind: str
+    """``free-running``: the camera itself; ``software``: a command of the host; ``hardware``: an edge at an input."""
+    input: str = ""
+    """Name of the camera's input, where a driver sets it."""
+
+    @classmethod
+    def of(cls, value: Any, forms: tuple[str, ...]) -> Trigger:
+        """The trigger of a rig file, which has one of ``forms``, such as ``hardware:INPUT``. Raises RigError."""
+        kind, colon, name = value.partition(":") if isinstance(value, str) else ("", "", "")
+        if (f"{kind}:INPUT" if colon and name else value) not in forms:
+            expected = " or ".join(repr(each) for each in forms)
+            raise RigError(f"devices.camera.trigger: expected {expected} with this driver, found {value!r}")
+        return cls(kind, name)
+
+    def lacks(self, others: tuple[Lacks, ...]) -> tuple[Lacks, ...]:
+        """What a camera lacks with this trigger, of what it lacks when it runs freely."""
+        return tuple(each for each in others if each != Lacks.TRIGGER or self == FREE_RUNNING)
+
+
+FREE_RUNNING = Trigger("free-running")
 
 
 class ClockAnswer(NamedTuple):
@@ -81,6 +114,65 @@ class SimpleCamera(Protocol):
 
     def close(self) -> None:
         """Release the device."""
+
+
+class ThreadCamera:
+    """Base class of a `SimpleCamera` whose frames come from a thread: a driver gives `expose`, and ``description``.
+
+    By default it reports no time and does not count its frames.
+    """
+
+    description: str
+    lacks: tuple[Lacks, ...] = (Lacks.TIME, Lacks.COUNT, Lacks.TRIGGER)
+    triggers: tuple[str, ...] = ("free-running",)
+    _thread: threading.Thread | None = None
+
+    def expose(self, start_ns: int, exposures: int, stopped: threading.Event) -> Iterator[SimpleFrame]:
+        """Give ``exposures`` frames (0: without an end), or more, until ``stopped`` is set; it may wait for each.
+
+        Frames from before ``start_ns`` do not count. It runs on a thread of its own; what it raises ends the session
+        once the frames before are taken.
+        """
+        raise NotImplementedError
+
+    def time_ns(self) -> int | None:
+        return None
+
+    def start(self, start_ns: int, exposures: int) -> None:
+        self._arrived: deque[SimpleFrame] = deque(maxlen=_MOST_WAITING)
+        self._failure: Exception | None = None
+        self._stopped = threading.Event()
+        frames = self.expose(start_ns, exposures, self._stopped)
+        run = (frames, self._stopped, self._arrived)
+        self._thread = threading.Thread(target=self._run, args=run, name="aolink-camera", daemon=True)
+        self._thread.start()
+
+    def frames(self) -> list[SimpleFrame]:
+        """The frames since the last call. Raises the error that has ended the thread, after the frames before it."""
+        if self._thread is None:
+            return []
+        frames = [self._arrived.popleft() for _ in range(len(self._arrived))]
+        if not frames and self._failure is not None:
+            raise self._failure
+        return frames
+
+    def stop(self) -> None:
+        """Ask the thread to end; it need not have ended yet."""
+        if self._thread is not None:
+            self._stopped.set()
+
+    def close(self) -> None:
+        """End the thread, once the frame that is under way has come, or after two seconds."""
+        self.stop()
+        if self._thread is not None:
+            self._thread.join(_JOIN_S)
+
+    def _run(self, frames: Iterator[SimpleFrame], stopped: threading.Event, arrived: deque[SimpleFrame]) -> None:
+        try:
+            arrived.extend(frames)
+        except Exception as failure:
+            if not stopped.is_set():
+                self._failure = failure
 
 
 class Held(NamedTuple):

@@ -97,7 +97,7 @@ def check_devices(rig: Rig) -> Iterator[Finding]:
             if table.driver == NATIVE:
                 native_port(kind, table)
                 continue
-            lacks = "; ".join(lacks_of(check_driver(kind, table, rig))) or "nothing"
+            lacks = "; ".join(lacks_of(check_driver(kind, table, rig)[0])) or "nothing"
         except AolinkError as error:
             yield _error(key, str(error))
             continue

@@ -120,6 +120,14 @@ class Timing:
         return round(self.fast_step_s * 1e9)
 
     @property
+    def exposure_ns(self) -> int:
+        return self.exposure_steps * self.fast_step_ns
+
+    @property
+    def frame_period_ns(self) -> int:
+        return self.frame_period_steps * self.fast_step_ns
+
+    @property
     def exposure_offset_ns(self) -> int:
         return round(self.exposure_offset * self.fast_step_ns)
 

@@ -282,9 +282,3 @@ def test_native_devices_may_stand_in_the_rig_file(aolink: Run, tmp_path: Path) -
         done = aolink("record", "--rig", rig, "--exposures", "2", "-o", "a.mcap")
     assert done.returncode == 0, done.stderr
     assert len(list(Recording(tmp_path / "a.mcap"))) == 2
-
-
-def test_the_page_shows_the_examples_mirror_as_it_is() -> None:
-    text = (EXAMPLE / "aolink_example" / "devices.py").read_text()
-    _, mirror, _ = text.split("\nclass ")
-    assert f"class {mirror.rstrip()}\n```" in (ROOT / "aolink" / "devices" / "README.md").read_text()

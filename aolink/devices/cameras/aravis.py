@@ -7,18 +7,19 @@ picture whose counts take two bytes is passed to the session in that memory, wit
 from __future__ import annotations
 
 import ctypes
+import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from contextlib import ExitStack, suppress
+from queue import SimpleQueue
 from typing import Any
 
 from aolink.devices.cameras.aravis_library import Aravis, Refused
 from aolink.devices.cameras.aravis_stream import PictureStream, StreamPicture
-from aolink.devices.cameras.pictures import checked_corner
+from aolink.devices.cameras.pictures import check_timing, checked_corner
 from aolink.devices.cameras.pixel_formats import PIXEL_FORMATS, PixelFormat
-from aolink.devices.cameras.requests import Requests
-from aolink.devices.simple import ClockAnswer, Lacks, SimpleFrame
+from aolink.devices.simple import FREE_RUNNING, ClockAnswer, Lacks, SimpleFrame, Trigger
 from aolink.errors import DeviceError, RigError
 from aolink.rig import Rig
 
@@ -27,7 +28,6 @@ _PACKET_OVERHEAD, _PACKET_OVERHEAD_EXTENDED = 36, 48
 GVSP."""
 _ID_PERIOD = 65535
 """A 16-bit frame id goes from 65535 to 1: 0 is not valid."""
-_RATE_TOLERANCE = 0.01
 _TIMESTAMP_CONTROL, _TIMESTAMP_LATCH, _TIMESTAMP_VALUE = 0x0944, 2, 0x0948
 """Registers that GigE Vision specifies: the value that is written to latch the clock, and the address of the latched
 value."""
@@ -55,6 +55,32 @@ def discover() -> list[tuple[str, str]]:
     return found
 
 
+class _Requests:
+    """Calls functions in their order, one at a time, on a thread that does not hold up the end of the program."""
+
+    def __init__(self, name: str) -> None:
+        self._waiting: SimpleQueue[tuple[Future[Any], Callable[[], Any]] | None] = SimpleQueue()
+        threading.Thread(target=self._run, name=name, daemon=True).start()
+
+    def send(self, request: Callable[[], Any]) -> Future[Any]:
+        """Queue ``request``; the future has its result, or the exception that it raised."""
+        future: Future[Any] = Future()
+        self._waiting.put((future, request))
+        return future
+
+    def end(self) -> None:
+        """Accept no more requests: those queued before are still called."""
+        self._waiting.put(None)
+
+    def _run(self) -> None:
+        while (each := self._waiting.get()) is not None:
+            future, request = each
+            try:
+                future.set_result(request())
+            except BaseException as error:  # the future hands it to whoever asks for the result
+                future.set_exception(error)
+
+
 class AravisCamera:
     """A camera that speaks GigE Vision (or USB3 Vision, which has not been tried).
 
@@ -66,8 +92,8 @@ class AravisCamera:
         GenICam's name of the format; empty for one of as many bits as the rig file's sensor has, packed if the camera
         can.
     trigger:
-        The camera's input whose rising edge starts each exposure, such as ``Line1``; if empty, the camera runs freely,
-        at the rig file's rate.
+        What starts each exposure: a rising edge at an input of the camera, such as ``hardware:Line1``, a command that
+        this program sends at the rig file's rate (``software``), or the camera itself.
     stamp_at:
         What the camera's time stamp marks of an exposure, its ``start`` or its ``end``: its manual says which.
     corner:
@@ -90,32 +116,28 @@ class AravisCamera:
     """
 
     lacks: tuple[Lacks, ...] = (Lacks.TRIGGER,)
+    triggers = ("free-running", "software", "hardware:INPUT")
 
     def __init__(
-        self, rig: Rig, *, address: str = "", pixel_format: str = "", trigger: str = "", stamp_at: str = "start",
-        corner: list[int] | None = None, resend: bool = True, packet_size: int = 0,
+        self, rig: Rig, *, address: str = "", pixel_format: str = "", trigger: Trigger = FREE_RUNNING,
+        stamp_at: str = "start", corner: list[int] | None = None, resend: bool = True, packet_size: int = 0,
         features: dict[str, Any] | None = None,
     ) -> None:  # fmt: skip
-        for key, value, kind, called in (
-            ("address", address, str, "a text"), ("pixel_format", pixel_format, str, "a text"),
-            ("trigger", trigger, str, "a text"), ("resend", resend, bool, "true or false"),
-            ("packet_size", packet_size, int, "a number of bytes"), ("features", features or {}, dict, "a table"),
-        ):  # fmt: skip
-            if not isinstance(value, kind):
-                raise RigError(f"devices.camera.{key} is {value!r}, expected {called}")
         if stamp_at not in ("start", "end"):
             raise RigError(f"devices.camera.stamp_at is {stamp_at!r}, expected 'start' or 'end'")
         place = checked_corner(corner)
         self._rig, self._shape, self._stamp_at = rig, rig.sensor.shape, stamp_at
-        timing = rig.timing
-        self._period_ns = timing.frame_period_steps * timing.fast_step_ns
+        self._period_ns = rig.timing.frame_period_ns
         self._aravis = Aravis()
         self._address = address or self._only_camera()
         self._camera = None
-        self._requests = Requests("aolink-aravis")
+        self._requests = _Requests("aolink-aravis")
         self._asked: Future[ClockAnswer] | None = None
         """The answer of the clock that is being awaited."""
         self._running = False
+        self._trigger, self._stopped = trigger, threading.Event()
+        self._failure: Exception | None = None
+        """The error of the thread that triggers the camera."""
         self._start_ns = 0
         self._before: tuple[int, int, int] | None = None
         """The frame before: its id as the camera has it, its number without wrapping, and its time, ns."""
@@ -130,14 +152,14 @@ class AravisCamera:
                 self._set_feature(feature, value)
             self._format = self._set_format(pixel_format)
             self._set_region(place)
-            self._exposure_ns = self._set_timing(trigger)
+            self._exposure_ns = self._set_timing()
             self.description = self._describe()
             self._stream = self._open_stream(resend, packet_size)
             self._latch = self._find_latch()
         except BaseException:
             self.close()
             raise
-        self.lacks = (*([] if self._latch else [Lacks.TIME]), *([] if trigger else [Lacks.TRIGGER]))
+        self.lacks = trigger.lacks((*([] if self._latch else [Lacks.TIME]), Lacks.TRIGGER))
 
     def time_ns(self) -> int | None:
         """The camera's clock, latched now; None where it has no latch, so that nothing compares it with the host's."""
@@ -159,22 +181,29 @@ class AravisCamera:
             pass  # frames that are left from before
         self._start_ns, self._before = start_ns, None
         # After an answer that is under way: Aravis does not say that features may be used by two threads at once.
-        self._requests.send(lambda: self._do("arv_camera_start_acquisition", self._camera, to="be started")).result()
+        self._requests.send(lambda: self._set("start_acquisition", to="be started")).result()
         self._running = True
+        if self._trigger.kind == "software":
+            if (now_ns := self._requests.send(self.time_ns).result()) is not None:
+                start_ns += time.monotonic_ns() - now_ns
+            self._stopped = threading.Event()
+            threading.Thread(
+                target=self._pulse, args=(start_ns, self._stopped), name="aolink-trigger", daemon=True
+            ).start()
 
     def frames(self) -> Iterator[SimpleFrame]:
         for picture in self._stream.pictures():
-            frame = self._frame(picture)
-            if frame is not None:
+            if (frame := self._frame(picture)) is not None:
                 yield frame
+        if self._failure is not None:
+            raise self._failure
         self._check_control("no longer answers, or another program has taken it: is it connected, is its power on?")
 
     def stop(self) -> None:
         if self._running:
             self._running = False
-            stopping = self._requests.send(
-                lambda: self._do("arv_camera_stop_acquisition", self._camera, to="be stopped")
-            )
+            self._stopped.set()
+            stopping = self._requests.send(lambda: self._set("stop_acquisition", to="be stopped"))
             try:
                 stopping.result(_RELEASE_S)
             except TimeoutError:
@@ -190,6 +219,7 @@ class AravisCamera:
     def close(self) -> None:
         camera, running = self._camera, self._running
         self._camera, self._running = None, False
+        self._stopped.set()
 
         def release() -> None:
             if running:
@@ -203,6 +233,17 @@ class AravisCamera:
             with suppress(TimeoutError):
                 self._requests.send(release).result(_RELEASE_S)
         self._requests.end()
+
+    def _pulse(self, from_ns: int, stopped: threading.Event) -> None:
+        """Trigger the camera by software, once in each frame period from ``from_ns`` of `time.monotonic_ns` on."""
+        due_ns = from_ns
+        try:
+            while not stopped.wait(max(due_ns - time.monotonic_ns(), 0) / 1e9):
+                self._requests.send(lambda: self._set("software_trigger", to="be triggered")).result()
+                due_ns += self._period_ns
+        except Exception as error:
+            if not stopped.is_set():
+                self._failure = error
 
     # Opening
 
@@ -249,15 +290,8 @@ class AravisCamera:
         offered = [names[k].decode() for k in range(count.value)]
         self._aravis("g_free", names)
         bits = self._rig.sensor.bit_depth
-        chosen = next(
-            (
-                each
-                for each in PIXEL_FORMATS.values()
-                if each.name in offered and (each.name == wanted if wanted else each.bits == bits)
-            ),
-            None,
-        )
-        if chosen is None:
+        fit = [each for each in PIXEL_FORMATS.values() if (each.name == wanted if wanted else each.bits == bits)]
+        if (chosen := next((each for each in fit if each.name in offered), None)) is None:
             raise DeviceError(
                 f"the camera {self._address} has the pixel formats {', '.join(offered)}, aolink reads"
                 f" {', '.join(PIXEL_FORMATS)}; {wanted or f'one of {bits} bits'} is asked for: correct"
@@ -286,50 +320,40 @@ class AravisCamera:
                 f" asks for {columns} x {rows} at ({x}, {y}): correct [sensor] or devices.camera.corner"
             )
 
-    def _set_timing(self, trigger: str) -> int:
+    def _set_timing(self) -> int:
         """Exposure time, frame rate or trigger; gives the exposure time that the camera has, ns."""
-        timing = self._rig.timing
-        wanted_ns, rate = timing.exposure_steps * timing.fast_step_ns, 1e9 / self._period_ns
-        for what in ("exposure", "gain"):
+        timing, free = self._rig.timing, self._trigger == FREE_RUNNING
+        rate = 1e9 / timing.frame_period_ns
+        for what, setter in (("exposure", "set_exposure_time_auto"), ("gain", "set_gain_auto")):
             if self._get(f"is_{what}_auto_available"):
-                self._set("set_exposure_time_auto" if what == "exposure" else "set_gain_auto", 0, to=f"fix its {what}")
+                self._set(setter, 0, to=f"fix its {what}")
         if self._get("are_chunks_available"):
             self._set("set_chunk_mode", 0, to="leave out chunks")
         self._set("set_acquisition_mode", 0, to="go on taking frames")
         self._set("clear_triggers", to="run freely")
-        if not trigger:
+        if free:
             self._set("set_frame_rate", rate, to=f"take {rate:g} frames a second")
-        self._set("set_exposure_time", wanted_ns / 1e3, to=f"expose for {wanted_ns / 1e9:g} s")
+        self._set("set_exposure_time", timing.exposure_ns / 1e3, to=f"expose for {timing.exposure_ns / 1e9:g} s")
         exposure_ns = round(float(self._get("get_exposure_time")) * 1e3)
-        if abs(exposure_ns - wanted_ns) > timing.fast_step_ns / 2:
-            raise DeviceError(
-                f"the camera {self._address} can expose for {exposure_ns / 1e9:g} s, the rig file asks for"
-                f" {wanted_ns / 1e9:g} s: correct timing.exposure_steps"
-            )
-        if trigger:
-            self._set("set_trigger", trigger.encode(), to=f"be triggered by {trigger}")
-        elif abs((has := self._get("get_frame_rate")) / rate - 1) > _RATE_TOLERANCE:
-            raise DeviceError(
-                f"the camera {self._address} can take {has:g} frames a second, the rig file asks for {rate:g}: correct"
-                " timing.frame_period_steps"
-            )
+        check_timing(timing, f"the camera {self._address}", exposure_ns, self._get("get_frame_rate") if free else 0.0)
+        if not free:
+            source = self._trigger.input or "Software"
+            self._set("set_trigger", source.encode(), to=f"be triggered by {source}")
         return exposure_ns
 
     def _describe(self) -> str:
         def said(name: str, *arguments: Any) -> str:
-            try:
-                return (self._aravis(name, self._camera, *arguments) or b"?").decode(errors="replace")
-            except Refused:
-                return "?"
+            with suppress(DeviceError):
+                return (self._get(name, *arguments) or b"?").decode(errors="replace")
+            return "?"
 
-        firmware = next(
-            (each for each in (b"DeviceFirmwareVersion", b"DeviceVersion")
-             if self._get("is_feature_available", each)), None,
-        )  # fmt: skip
-        version = f", firmware {said('arv_camera_get_string', firmware)}" if firmware else ""
-        vendor, model = said("arv_camera_get_vendor_name"), said("arv_camera_get_model_name")
-        serial = said("arv_camera_get_device_serial_number")
-        return f"{vendor} {model}, serial number {serial}{version}, {self._format.name} from {self._address} by Aravis"
+        versions = (b"DeviceFirmwareVersion", b"DeviceVersion")
+        found = next((said("get_string", each) for each in versions if self._get("is_feature_available", each)), "?")
+        vendor, model, serial = map(said, ("get_vendor_name", "get_model_name", "get_device_serial_number"))
+        return (
+            f"{vendor} {model}, serial number {serial}, firmware {found}, {self._format.name} from {self._address} by"
+            " Aravis"
+        )
 
     # Frames
 

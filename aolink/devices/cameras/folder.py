@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from itertools import count
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 from numpy.typing import NDArray
 
-from aolink.devices.cameras.pictures import FrameThread, ThreadCamera, as_counts, checked_corner, sensor_part
-from aolink.devices.simple import Lacks, SimpleFrame
+from aolink.devices.cameras.pictures import as_counts, checked_corner, sensor_part
+from aolink.devices.simple import SimpleFrame, ThreadCamera
 from aolink.errors import DeviceError, ImportingError
 from aolink.films.formats import open_film
 from aolink.rig import Rig
@@ -36,9 +36,9 @@ class FolderCamera(ThreadCamera):
         The pictures cannot be read, or the sensor is not within them.
     """
 
-    lacks: ClassVar[tuple[Lacks, ...]] = ()
+    lacks = ()
 
-    def __init__(self, rig: Rig, *, path: str, repeat: bool = True, corner: Sequence[int] | None = None) -> None:
+    def __init__(self, rig: Rig, *, path: str, repeat: bool = True, corner: list[int] | None = None) -> None:
         self._rig, self._repeat, self._corner = rig, repeat, checked_corner(corner)
         try:
             self._film = open_film(rig.path_of(Path(path).expanduser(), "devices.camera.path"))
@@ -52,13 +52,9 @@ class FolderCamera(ThreadCamera):
         """This computer's clock, ns."""
         return time.monotonic_ns()
 
-    def start(self, start_ns: int, exposures: int) -> None:
-        """Play ``exposures`` pictures (0: until stopped), the first one as if exposed from ``start_ns`` on."""
-        self.thread = FrameThread(lambda stopped: self._play(start_ns, exposures, stopped))
-
-    def _play(self, start_ns: int, exposures: int, stopped: threading.Event) -> Iterator[SimpleFrame]:
-        timing = self._rig.timing
-        exposure_ns, period_ns = (n * timing.fast_step_ns for n in (timing.exposure_steps, timing.frame_period_steps))
+    def expose(self, start_ns: int, exposures: int, stopped: threading.Event) -> Iterator[SimpleFrame]:
+        """Play the pictures, the first one as if exposed from ``start_ns`` on."""
+        exposure_ns, period_ns = self._rig.timing.exposure_ns, self._rig.timing.frame_period_ns
         pictures = self._pictures()
         for number in range(exposures) if exposures else count():
             begin_ns = start_ns + number * period_ns
@@ -71,8 +67,7 @@ class FolderCamera(ThreadCamera):
 
     def _pictures(self) -> Iterator[NDArray[Any]]:
         try:
-            yield from self._film.frames()
-            while self._repeat:
+            for _ in count() if self._repeat else range(1):
                 yield from self._film.frames()
         except ImportingError as error:
             raise DeviceError(str(error)) from error

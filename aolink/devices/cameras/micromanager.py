@@ -5,11 +5,11 @@ from __future__ import annotations
 import os
 import threading
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, ClassVar
+from collections.abc import Iterator
+from typing import Any
 
-from aolink.devices.cameras.pictures import FrameThread, ThreadCamera, as_counts, check_within, checked_corner
-from aolink.devices.simple import Lacks, SimpleFrame
+from aolink.devices.cameras.pictures import as_counts, check_timing, check_within, checked_corner
+from aolink.devices.simple import FREE_RUNNING, Lacks, SimpleFrame, ThreadCamera, Trigger
 from aolink.errors import DeviceError
 from aolink.extensions import needs_extra
 from aolink.rig import Rig
@@ -22,7 +22,7 @@ _PATH = "MICROMANAGER_PATH"
 
 
 class MicroManagerCamera(ThreadCamera):
-    """A camera that takes frames by itself, one every frame period, with the exposure time of the rig file.
+    """A camera that takes frames with the exposure time of the rig file, by itself one every frame period.
 
     Micro-Manager tells when a frame came to this machine, not when the camera took it.
 
@@ -37,6 +37,8 @@ class MicroManagerCamera(ThreadCamera):
         ``MICROMANAGER_PATH``.
     properties:
         Properties of the camera by their names, set in this order: ``PixelType``, ``Gain``, a trigger, ...
+    trigger:
+        A hardware trigger is set by ``properties``, whose names each adapter has its own; it is declared here.
     corner:
         Row and column of the chip at which the sensor begins.
 
@@ -46,16 +48,18 @@ class MicroManagerCamera(ThreadCamera):
         pymmcore is not installed, the adapter or its camera cannot be opened, or it cannot do what the rig file says.
     """
 
-    lacks: ClassVar[tuple[Lacks, ...]] = (Lacks.TIME, Lacks.TRIGGER)
+    lacks: tuple[Lacks, ...] = (Lacks.TIME, Lacks.TRIGGER)
+    triggers = ("free-running", "hardware")
 
     def __init__(
         self, rig: Rig, *, config: str = "", adapter: str = "", device: str = "", folder: str = "",
-        properties: Mapping[str, bool | int | float | str] | None = None, corner: Sequence[int] = (0, 0),
+        properties: dict[str, Any] | None = None, corner: list[int] | None = None, trigger: Trigger = FREE_RUNNING,
     ) -> None:  # fmt: skip
         with needs_extra("micromanager", DeviceError):
             import pymmcore
         if bool(config) == bool(adapter and device):
             raise DeviceError("devices.camera needs config (a .cfg file of Micro-Manager), or adapter and device")
+        self.lacks = trigger.lacks(self.lacks)
         self._rig, self._metadata = rig, pymmcore.Metadata
         row, column = checked_corner(corner) or (0, 0)
         self._core: Any = pymmcore.CMMCore()
@@ -73,22 +77,14 @@ class MicroManagerCamera(ThreadCamera):
             for name, value in (properties or {}).items():
                 self._core.setProperty(self._label, name, int(value) if isinstance(value, bool) else value)
             self._set_up(row, column)
-        except (RuntimeError, OSError) as error:
+        except BaseException as error:
             self._core.reset()
+            if not isinstance(error, RuntimeError | OSError):
+                raise
             reason = " ".join(str(error).split())
             raise DeviceError(f"{self._name} cannot be opened: {reason}; is {_PATH} its folder?") from None
-        except BaseException:
-            self._core.reset()
-            raise
         version = self._core.getVersionInfo()
         self.description = f"{self._name}, {version}, exposure {self._exposure_ns / 1e9:g} s"
-
-    def time_ns(self) -> None:
-        """Micro-Manager gives no time of the camera's."""
-
-    def start(self, start_ns: int, exposures: int) -> None:
-        """Take frames until stopped; those that begin before ``start_ns`` do not belong to the session."""
-        self.thread = FrameThread(self._read)
 
     def close(self) -> None:
         """Release the camera."""
@@ -101,23 +97,19 @@ class MicroManagerCamera(ThreadCamera):
         core.clearROI()
         check_within((core.getImageHeight(), core.getImageWidth()), (height, width), (row, column), self._name)
         core.setROI(column, row, width, height)
-        found = core.getImageHeight(), core.getImageWidth()
-        if found != (height, width):
-            raise DeviceError(f"{self._name} gives {found} pixels, the rig file's sensor has {(height, width)}")
+        check_within((core.getImageHeight(), core.getImageWidth()), (height, width), None, self._name)
         if core.getNumberOfComponents() != 1 or core.getImageBitDepth() > sensor.bit_depth:
             raise DeviceError(
                 f"{self._name} gives {core.getNumberOfComponents()} colour(s) of {core.getImageBitDepth()} bits, the"
                 f" rig file's sensor has one of {sensor.bit_depth}: set devices.camera.properties, such as PixelType"
             )
-        wanted_ms = timing.exposure_steps * timing.fast_step_s * 1e3
-        core.setExposure(wanted_ms)
+        core.setExposure(timing.exposure_ns / 1e6)
         self._exposure_ns = round(core.getExposure() * 1e6)
-        if abs(core.getExposure() - wanted_ms) > timing.fast_step_s * 1e3:
-            raise DeviceError(f"{self._name} exposes for {core.getExposure():g} ms, the rig file says {wanted_ms:g} ms")
+        check_timing(timing, self._name, self._exposure_ns)
 
-    def _read(self, stopped: threading.Event) -> Iterator[SimpleFrame]:
-        core, timing = self._core, self._rig.timing
-        core.startContinuousSequenceAcquisition(timing.frame_period_steps * timing.fast_step_s * 1e3)
+    def expose(self, start_ns: int, exposures: int, stopped: threading.Event) -> Iterator[SimpleFrame]:
+        core = self._core
+        core.startContinuousSequenceAcquisition(self._rig.timing.frame_period_ns / 1e6)
         try:
             while not stopped.is_set():
                 if core.isBufferOverflowed():

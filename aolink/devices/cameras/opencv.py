@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 from aolink.devices.cameras import pictures
-from aolink.devices.cameras.pictures import FrameThread, ThreadCamera, check_within, checked_corner
-from aolink.devices.simple import Lacks, SimpleFrame
+from aolink.devices.cameras.pictures import check_timing, check_within, checked_corner
+from aolink.devices.simple import SimpleFrame, ThreadCamera
 from aolink.errors import DeviceError
 from aolink.extensions import needs_extra
 from aolink.films.film import grey
@@ -43,9 +43,7 @@ class OpenCVCamera(ThreadCamera):
         OpenCV is not installed or cannot open the source, or size or rate of its pictures are not the rig file's.
     """
 
-    lacks: ClassVar[tuple[Lacks, ...]] = (Lacks.TIME, Lacks.COUNT, Lacks.TRIGGER)
-
-    def __init__(self, rig: Rig, *, source: int | str = 0, corner: Sequence[int] | None = None) -> None:
+    def __init__(self, rig: Rig, *, source: int | str = 0, corner: list[int] | None = None) -> None:
         with needs_extra("opencv", DeviceError):
             import cv2
         self._rig, self._corner, timing = rig, checked_corner(corner), rig.timing
@@ -57,8 +55,7 @@ class OpenCVCamera(ThreadCamera):
         cv2.utils.logging.setLogLevel(said)
         if not self._capture.isOpened():
             raise DeviceError(f"OpenCV cannot open {self._name}: is it connected, not in use, and may you read it?")
-        self._rate = 1 / (timing.frame_period_steps * timing.fast_step_s)
-        self._exposure_ns = timing.exposure_steps * timing.fast_step_ns
+        self._rate, self._exposure_ns = 1e9 / timing.frame_period_ns, timing.exposure_ns
         with ExitStack() as stack:
             stack.callback(self._capture.release)
             self._is_file = int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT)) > 0
@@ -73,16 +70,9 @@ class OpenCVCamera(ThreadCamera):
             self.description = f"OpenCV {cv2.__version__} {self._capture.getBackendName()} {self._name}, {exposure}"
             stack.pop_all()
 
-    def time_ns(self) -> None:
-        """OpenCV gives no time of the camera's."""
-
-    def start(self, start_ns: int, exposures: int) -> None:
-        """Read frames until stopped: those of a file from ``start_ns`` on, others as they come, also before it."""
-        self.thread = FrameThread(lambda stopped: self._read(start_ns, stopped))
-
     def close(self) -> None:
         """Release the camera, once the frame that is under way has come: the thread does it, where there is one."""
-        if self.thread is None:
+        if self._thread is None:
             self._capture.release()
         super().close()
 
@@ -106,21 +96,17 @@ class OpenCVCamera(ThreadCamera):
         if not (self._is_file or self._capture.getBackendName() == "V4L2"):
             return  # OpenCV only guesses the rate of a stream
         rate = self._capture.get(cv2.CAP_PROP_FPS)
-        if rate > 0 and abs(rate / self._rate - 1) > _RATE_MARGIN:
-            raise DeviceError(
-                f"{self._name} gives {rate:.4g} frames a second, the rig file says {self._rate:.4g}: correct"
-                " timing.frame_period_steps or timing.fast_step_s"
-            )
+        check_timing(self._rig.timing, self._name, self._exposure_ns, rate, _RATE_MARGIN)
         self._rate = rate if rate > 0 else self._rate
 
-    def _read(self, begin_ns: int, stopped: threading.Event) -> Iterator[SimpleFrame]:
+    def expose(self, start_ns: int, exposures: int, stopped: threading.Event) -> Iterator[SimpleFrame]:
         """Give frames as they come, those of a file when they are due. The capture belongs to the thread that reads
         it."""
         number = 0
         try:
             while not stopped.is_set():
                 number += 1
-                due_ns = begin_ns + round(number / self._rate * 1e9) if self._is_file else 0
+                due_ns = start_ns + round(number / self._rate * 1e9) if self._is_file else 0
                 if stopped.wait(max(due_ns - time.monotonic_ns(), 0) / 1e9):
                     return
                 grabbed = self._capture.grab()

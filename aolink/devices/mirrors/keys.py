@@ -1,9 +1,8 @@
-"""Checks of the rig file: the drivers' own keys in ``[devices.mirror]``, and that its converter is as coarse as the
-device's own."""
+"""The numbers that a device takes for the rig's inputs, and checks that its range and resolution suffice for these."""
 
 from __future__ import annotations
 
-import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -13,47 +12,70 @@ from aolink.devices.gate import converter_margin
 from aolink.errors import DeviceError, RigError
 from aolink.rig import MirrorDriver
 
-
-def per_input(name: str, value: Any, n_inputs: int) -> NDArray[np.float64]:
-    """A number for each input, (n_inputs,); one number stands for all. Raises RigError."""
-    values = value if isinstance(value, list) else [value] * n_inputs
-    numbers = [each for each in values if isinstance(each, int | float) and not isinstance(each, bool)]
-    array = np.array(numbers, dtype=np.float64)
-    if len(values) != n_inputs or len(numbers) != n_inputs or not np.isfinite(array).all():
-        raise RigError(
-            f"devices.mirror.{name}: expected a finite number, or a list of {n_inputs} for the rig's inputs,"
-            f" found {value!r}"
-        )
-    return array
+_ROUNDING = 1e-9
 
 
-def scale_per_input(name: str, value: Any, n_inputs: int) -> NDArray[np.float64]:
-    """A factor for each input, as `per_input`; it must not be zero."""
-    scale = per_input(name, value, n_inputs)
-    if not scale.all():
-        raise RigError(f"devices.mirror.{name}: expected a number that is not zero, found {value!r}")
-    return scale
+class Scale:
+    """A device's own numbers for the inputs, (n_inputs,): zero + unit * input.
 
+    Parameters
+    ----------
+    unit, zero:
+        A number for each input in a list, or one that stands for all; no unit may be 0. ``keys`` are their names in the
+        rig file.
 
-def text(name: str, value: Any) -> str:
-    """A key whose value is a text. Raises RigError."""
-    if not isinstance(value, str):
-        raise RigError(f"devices.mirror.{name}: expected a text, found {value!r}")
-    return value
+    Raises
+    ------
+    RigError
+        There are more or fewer numbers than inputs, or one of them cannot be used.
+    """
 
+    def __init__(
+        self, mirror: MirrorDriver, unit: float | list[float], zero: float | list[float] = 0.0,
+        keys: tuple[str, str] = ("unit", "zero"),
+    ) -> None:  # fmt: skip
+        self._mirror, self._keys, n_inputs = mirror, " and ".join(keys), len(mirror.park)
+        for key, value in zip(keys, (unit, zero), strict=True):
+            if np.size(value) not in {n_inputs, -1 if isinstance(value, list) else 1} or not np.isfinite(value).all():
+                raise RigError(
+                    f"devices.mirror.{key}: expected a finite number, or a list of {n_inputs} for the rig's inputs,"
+                    f" found {value!r}"
+                )
+        if not np.all(unit):
+            raise RigError(f"devices.mirror.{keys[0]}: expected a number that is not zero, found {unit!r}")
+        self.unit, self.zero = (np.broadcast_to(np.asarray(each, dtype=float), n_inputs) for each in (unit, zero))
 
-def seconds(name: str, value: Any) -> float:
-    """A time in seconds. Raises RigError."""
-    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value < math.inf:
-        raise RigError(f"devices.mirror.{name}: expected a number of seconds, found {value!r}")
-    return float(value)
+    def of(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The device's numbers for inputs (..., n_inputs)."""
+        return self.zero + self.unit * u
 
+    def inputs(self, numbers: Any) -> NDArray[np.float64]:
+        """The inputs for the device's numbers."""
+        return np.asarray((np.asarray(numbers) - self.zero) / self.unit)
 
-def speed(name: str, value: Any) -> int:
-    """The speed of a serial line, bits per second. Raises RigError."""
-    if isinstance(value, bool) or not isinstance(value, int) or not 50 <= value <= 10_000_000:
-        raise RigError(f"devices.mirror.{name}: expected a whole number of bits per second, found {value!r}")
-    return value
+    def check(self, low: Any, high: Any, device: str | Sequence[str], unit: str = "", step: Any = 0.0) -> None:
+        """Refuse a rig file whose inputs go beyond what a device reaches, or in finer steps. Raises DeviceError.
+
+        Parameters
+        ----------
+        low, high, step:
+            The ends of its range and its steps in its own numbers, (n_inputs,) or a number; ``unit`` is their unit.
+        device:
+            Its name, or that of each input.
+        """
+        ends = np.sort(self.of(np.array([self._mirror.input_min, self._mirror.input_max])), axis=0)
+        slack = _ROUNDING * np.maximum(np.abs(low), np.abs(high))
+        beyond = np.flatnonzero((ends[0] < low - slack) | (ends[1] > high + slack))
+        if len(beyond):
+            at, shape = beyond[0], ends[0].shape
+            least, most = np.broadcast_to(low, shape)[at], np.broadcast_to(high, shape)[at]
+            raise DeviceError(
+                f"mirror.input_min .. input_max are {ends[0][at]:g} to {ends[1][at]:g}{unit} by devices.mirror's"
+                f" {self._keys}, {device if isinstance(device, str) else device[at]} goes from {least:g} to"
+                f" {most:g}{unit}: correct one of them"
+            )
+        if np.any(step):
+            check_resolution(self._mirror, np.abs(step / self.unit), str(device))
 
 
 def check_resolution(mirror: MirrorDriver, step: float | NDArray[np.float64], device: str) -> None:
@@ -70,7 +92,7 @@ def check_resolution(mirror: MirrorDriver, step: float | NDArray[np.float64], de
         It is finer: the input that the device holds would count as another input than the one commanded.
     """
     if (converter_margin(mirror) < step).any():
-        bits = int(np.log2(((mirror.input_max - mirror.input_min) / step).min() * (1 + 1e-9) + 1))
+        bits = int(np.log2(((mirror.input_max - mirror.input_min) / step).min() * (1 + _ROUNDING) + 1))
         raise DeviceError(
             f"mirror.dac_bits = {mirror.dac_bits} is finer than {device}, which goes in steps of"
             f" {np.max(step):.3g} of an input: set it to {bits}"

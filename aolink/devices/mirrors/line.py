@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Self
 
 from serial.tools import list_ports
 
@@ -12,6 +15,8 @@ from aolink.wire.port import SerialPort
 
 TIMEOUT_S = 1.0
 """How long a device may take for an answer, unless a request says otherwise."""
+QUIET_S = 0.05
+"""After this time without a byte no late answer is on the line, s."""
 _LONGEST = 65_536
 """Bytes without the expected end after which the driver stops waiting: the device is sending something else."""
 _SHOWN = 48
@@ -44,6 +49,15 @@ class SerialLine:
         """Bytes that came and were not taken."""
         self._asked = b""
         """The latest request, for the errors."""
+
+    @contextmanager
+    def opening(self) -> Iterator[Self]:
+        """A context in which a device is opened: where that fails, the port is given back."""
+        try:
+            yield self
+        except BaseException:
+            self.close()
+            raise
 
     def tell(self, request: bytes) -> None:
         """Send a command that the device does not answer."""

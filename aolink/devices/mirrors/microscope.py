@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from aolink.devices.mirrors.keys import per_input, scale_per_input, text
+from aolink.devices.mirrors.keys import Scale
 from aolink.devices.simple import Lacks
 from aolink.errors import DeviceError, RigError
 from aolink.extensions import installed, loaded, needs_extra
@@ -46,14 +46,9 @@ class MicroscopeMirror:
         self, rig: Rig, *, device: str, settings: dict[str, Any] | None = None, unit: float | list[float] = 0.5,
         zero: float | list[float] = 0.5,
     ) -> None:  # fmt: skip
-        self._scale, self._zero = scale_per_input("unit", unit, rig.n_inputs), per_input("zero", zero, rig.n_inputs)
-        ends = self._zero + self._scale * np.array([rig.mirror.input_min, rig.mirror.input_max])
-        if ends.min() < -1e-9 or ends.max() > 1 + 1e-9:
-            raise DeviceError(
-                f"mirror.input_min .. input_max are {ends.min():g} to {ends.max():g} of the device's range by"
-                " devices.mirror.unit and zero, which must be 0 to 1: correct one of them"
-            )
-        make = _class_of(text("device", device))
+        self._scale = Scale(rig.mirror, unit, zero)
+        self._scale.check(0, 1, device, " of the range")
+        make = _class_of(device)
         try:
             self._device = make(**(settings or {}))
         except Exception as error:  # a vendor's library may raise anything
@@ -70,7 +65,7 @@ class MicroscopeMirror:
             raise
 
     def put(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
-        self._device.apply_pattern(np.clip(self._zero + self._scale * u, 0.0, 1.0))
+        self._device.apply_pattern(np.clip(self._scale.of(u), 0.0, 1.0))
         return u
 
     def park(self) -> None:

@@ -10,14 +10,14 @@ from __future__ import annotations
 import itertools
 import math
 import time
-from contextlib import ExitStack, suppress
+from contextlib import suppress
 from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from aolink.devices.mirrors.keys import scale_per_input, text
-from aolink.devices.mirrors.line import SerialLine, shown, usb_ports
+from aolink.devices.mirrors.keys import Scale
+from aolink.devices.mirrors.line import QUIET_S, SerialLine, shown, usb_ports
 from aolink.devices.simple import Lacks
 from aolink.errors import DeviceError
 from aolink.rig import Rig
@@ -35,8 +35,6 @@ _LEAVE_PRO_MODE = bytes.fromhex("7e 00 06 02 0000 0000 7e") + b"\r\n"
 """A frame of the Pro mode, where the maker's programs leave the driver: go to the Simple mode. A driver that is in it
 already treats this as a command that it does not know."""
 _FIRST_ANSWER_S = 0.3
-_QUIET_S = 0.05
-"""After this time without a byte no late answer is on the line, s."""
 _STATUS_S = 1.0
 """The time between two status queries while inputs are sent, s."""
 _TROUBLE = {
@@ -69,18 +67,16 @@ class OptotuneMirror:
     def __init__(self, rig: Rig, *, port: str, unit_rad: float | list[float] = 1.0) -> None:
         if rig.n_inputs != 2:
             raise DeviceError(f"the Optotune mirror has 2 inputs, x and y; the rig file has {rig.n_inputs}")
-        self._unit_rad, self._park = scale_per_input("unit_rad", unit_rad, 2), rig.mirror.park
+        self._unit_rad = Scale(rig.mirror, unit_rad, keys=("unit_rad", "")).unit
+        self._park = rig.mirror.park
         self._check_reach(rig)
-        with ExitStack() as opened:
-            self._line = SerialLine("the Optotune mirror driver", text("port", port), _BAUD_RATE)
-            opened.callback(self._line.close)
+        with SerialLine("the Optotune mirror driver", port, _BAUD_RATE).opening() as self._line:
             self._start()
             model, serial_number, firmware = (self._ask(what) for what in ("GETID", "GETSN", "GETVERSION"))
             self.description = f"Optotune {model}, serial number {serial_number}, firmware {firmware}"
             self._check_status(self._ask("STATUS"))
             self._status_asked, self._status_due_s = False, time.monotonic() + _STATUS_S
             self.park()
-            opened.pop_all()
 
     def put(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
         if self._status_asked:  # while the input before was held, so that no input waits for the answer
@@ -98,10 +94,10 @@ class OptotuneMirror:
         if time.monotonic() > self._status_due_s:
             self._line.tell(b"STATUS\r\n")
             self._status_asked, self._status_due_s = True, time.monotonic() + _STATUS_S
-        return np.arctan(xy * _LIMIT) / self._unit_rad
+        return np.asarray(np.arctan(xy * _LIMIT) / self._unit_rad)
 
     def park(self) -> None:
-        self._line.drain(_QUIET_S)
+        self._line.drain(QUIET_S)
         self._status_asked = False
         self.put(self._park)
 
@@ -125,7 +121,7 @@ class OptotuneMirror:
             if self._ask("START", _FIRST_ANSWER_S) == "OK":
                 return
         self._line.tell(_LEAVE_PRO_MODE)
-        self._line.drain(_QUIET_S)
+        self._line.drain(QUIET_S)
         if (answer := self._ask("START")) != "OK":
             raise DeviceError(
                 f"what is at {self._line.url} answers START with {answer!r}, an Optotune mirror driver with OK:"

@@ -9,14 +9,13 @@ ever awaited, so a controller that is slower than the fast rate makes steps late
 from __future__ import annotations
 
 import time
-from contextlib import ExitStack
 from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from aolink.devices.mirrors.keys import per_input, scale_per_input, seconds, speed, text
-from aolink.devices.mirrors.line import SerialLine, usb_ports
+from aolink.devices.mirrors.keys import Scale
+from aolink.devices.mirrors.line import QUIET_S, SerialLine, usb_ports
 from aolink.devices.simple import Lacks
 from aolink.errors import DeviceError, RigError
 from aolink.rig import Rig
@@ -41,8 +40,6 @@ _UNKNOWN_COMMAND = 2
 _POLL_S = 0.02
 _MOST_LINES = 100
 """The most lines of an answer, or of earlier answers still waiting; more of them are not an answer."""
-_QUIET_S = 0.05
-"""After this time without a byte no late answer is on the line, s."""
 _DECIMALS = 6
 """Decimals of a position: below what the stages resolve, in micrometres, microradians and milliradians."""
 
@@ -73,28 +70,31 @@ class PiMirror:
         offset: float | list[float] = 0.0, baud_rate: int = 115_200, settling_s: float = 5.0,
     ) -> None:  # fmt: skip
         self._axes = _checked_axes(axes, rig.n_inputs)
-        self._scale = scale_per_input("scale", scale, rig.n_inputs)
-        self._offset = per_input("offset", offset, rig.n_inputs)
-        self._park = rig.mirror.park
-        self._settling_s = seconds("settling_s", settling_s)
+        self._scale = Scale(rig.mirror, scale, offset, ("scale", "offset"))
+        self._safe = self._scale.of(rig.mirror.park)
+        if not (50 <= baud_rate <= 10_000_000 and 0 <= settling_s < np.inf):
+            raise RigError(
+                "devices.mirror: expected baud_rate in bits per second and settling_s in seconds, found"
+                f" {baud_rate!r} and {settling_s!r}"
+            )
+        self._settling_s = settling_s
         self._unanswered = ""
         """The command whose ERR? has not been answered."""
-        with ExitStack() as opened:
-            self._line = SerialLine("the PI controller", text("port", port), speed("baud_rate", baud_rate))
-            opened.callback(self._line.close)
+        with SerialLine("the PI controller", port, baud_rate).opening() as self._line:
             self._identity = self._identify()
             self._check_axes()
-            self._check_limits(rig)
+            lowest, highest = self._numbers("TMN?"), self._numbers("TMX?")
+            if lowest is not None and highest is not None:
+                self._scale.check(lowest, highest, [f"the PI axis {axis}" for axis in self._axes])
             self._switch_on()
             self.park()
             self._settle()
-            opened.pop_all()
 
     def put(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
         self._take_answer()
-        positions = np.round(self._offset + self._scale * u, _DECIMALS)
+        positions = np.round(self._scale.of(u), _DECIMALS)
         self._send(self._move_to(positions))
-        return (positions - self._offset) / self._scale
+        return self._scale.inputs(positions)
 
     def park(self) -> None:
         """Stop all motion, including motion that the controller generates by itself, and go to the safe input."""
@@ -102,7 +102,7 @@ class PiMirror:
         # sent before the first of them is awaited, for a controller that hears and does not answer.
         self._unanswered = ""
         self._line.tell(b"STP\n*IDN?\nERR?\n")
-        self._send(self._move_to(self._offset + self._scale * self._park))
+        self._send(self._move_to(self._safe))
         for _ in range(_MOST_LINES):
             if self._next_line().strip() == self._identity:
                 break
@@ -116,18 +116,14 @@ class PiMirror:
         """Wait for the answer to the latest command, where there is one. Raises DeviceError where that failed."""
         if command := self._unanswered:
             self._unanswered = ""
-            self._check(command, self._error_number(command, self._next_line()))
-
-    def _command(self, command: str) -> None:
-        self._send(command)
-        self._take_answer()
+            self._check(command, self._next_line())
 
     def _send(self, command: str) -> None:
         self._unanswered = command
         self._line.tell(f"{command}\nERR?\n".encode())
 
     def _identify(self) -> str:
-        self._line.drain(_QUIET_S)
+        self._line.drain(QUIET_S)
         identity = self._answer("*IDN?")
         if "physik instrumente" not in identity.lower():
             raise DeviceError(
@@ -158,24 +154,10 @@ class PiMirror:
                 " devices.mirror.axes"
             )
 
-    def _check_limits(self, rig: Rig) -> None:
-        """Check that the rig's limits lie within the controller's, where it reports them."""
-        ends = self._offset + self._scale * np.array([rig.mirror.input_min, rig.mirror.input_max])
-        low, high = ends.min(axis=0), ends.max(axis=0)
-        lowest, highest = self._numbers("TMN?"), self._numbers("TMX?")
-        if lowest is None or highest is None:
-            return
-        for axis, *reach, first, last in zip(self._axes, low, high, lowest, highest, strict=True):
-            if reach[0] < first - 10**-_DECIMALS or reach[1] > last + 10**-_DECIMALS:
-                raise DeviceError(
-                    f"mirror.input_min .. input_max are positions from {reach[0]:g} to {reach[1]:g} of the PI axis"
-                    f" {axis}, which goes from {first:g} to {last:g}: make the limits or devices.mirror.scale smaller,"
-                    " or correct devices.mirror.offset"
-                )
-
     def _switch_on(self) -> None:
         if (servos := self._numbers("SVO?")) is None or not servos.all():
-            self._command(" ".join(["SVO", *(f"{axis} 1" for axis in self._axes)]))
+            self._send(" ".join(["SVO", *(f"{axis} 1" for axis in self._axes)]))
+            self._take_answer()
             if (servos := self._numbers("SVO?")) is not None and not servos.all():
                 raise DeviceError(
                     f"the servo of the PI axes {' '.join(self._axes)} does not switch on: are stage and high voltage"
@@ -189,7 +171,7 @@ class PiMirror:
                 positions = self._numbers("POS?")
                 raise DeviceError(
                     f"the PI axes {' '.join(self._axes)} do not reach their safe position"
-                    f" {self._offset + self._scale * self._park} in {self._settling_s:g} s, they are at {positions}:"
+                    f" {self._safe} in {self._settling_s:g} s, they are at {positions}:"
                     " are they zeroed (ATZ) or referenced, and do the stage's parameters fit?"
                 )
             time.sleep(_POLL_S)
@@ -200,19 +182,15 @@ class PiMirror:
         self._line.tell(f"{asked}\nERR?\n".encode())
         lines = self._lines()
         if "=" not in lines[0]:  # the answer to ERR? alone
-            if (number := self._error_number(asked, lines[0])) != _UNKNOWN_COMMAND:
-                self._check(asked, number)
+            if not self._check(asked, lines[0], _UNKNOWN_COMMAND):
                 raise self._strange(asked, lines[0])
             return None
-        self._check(asked, self._error_number(asked, self._next_line()))
+        self._check(asked, self._next_line())
         try:
             answers = {axis.strip(): float(number) for axis, _, number in (line.partition("=") for line in lines)}
-            numbers = np.array([answers[axis] for axis in self._axes])
+            return np.asarray_chkfinite([answers[axis] for axis in self._axes])
         except (ValueError, KeyError):
             raise self._strange(asked, " ".join(lines)) from None
-        if not np.isfinite(numbers).all():
-            raise self._strange(asked, " ".join(lines))
-        return numbers
 
     def _move_to(self, positions: NDArray[np.float64]) -> str:
         pairs = zip(self._axes, positions, strict=True)
@@ -232,18 +210,18 @@ class PiMirror:
     def _next_line(self) -> str:
         return self._line.read_until(b"\n").decode("latin-1")
 
-    def _error_number(self, command: str, answer: str) -> int:
+    def _check(self, command: str, answer: str, allowed: int = 0) -> int:
+        """The error number in an answer to ``ERR?``. Raises DeviceError unless it is 0 or ``allowed``."""
         try:
-            return int(answer)
+            number = int(answer)
         except ValueError:
             raise self._strange(f"{command} and ERR?", answer) from None
-
-    def _check(self, command: str, number: int) -> None:
-        if number:
+        if number not in (0, allowed):
             raise DeviceError(
                 f"the PI controller refuses {command} with its error {number}"
                 f" ({_ERRORS.get(number, 'see the manual of its commands')})"
             )
+        return number
 
     def _strange(self, command: str, answer: str) -> DeviceError:
         return DeviceError(

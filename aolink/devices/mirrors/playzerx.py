@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from itertools import count
 from typing import ClassVar
@@ -16,11 +16,11 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from aolink.devices.drivers import Failure
-from aolink.devices.mirrors.keys import check_resolution, text
-from aolink.devices.mirrors.line import SerialLine, shown
+from aolink.devices.mirrors.keys import check_resolution
+from aolink.devices.mirrors.line import QUIET_S, SerialLine, shown
 from aolink.devices.mirrors.sample_clock import SampleClock
-from aolink.devices.simple import Held, Lacks
+from aolink.devices.paced import Played
+from aolink.devices.simple import Lacks
 from aolink.errors import AolinkError, DeviceError
 from aolink.rig import Rig
 
@@ -43,7 +43,6 @@ _SLOW_NS = 3_000_000
 """An answer that takes longer shows that something was held up, but not on which side."""
 _TRIES = 3
 """Number of attempts, for a machine that is held up right at the beginning."""
-_QUIET_S = 0.05
 _INFO_S = 0.3
 """How long to wait for older firmware to report its data format, s."""
 
@@ -98,7 +97,7 @@ def remaining(answer: bytes) -> int:
     return left
 
 
-class PlayzerX:
+class PlayzerX(Played):
     """A simple driver (`aolink.devices.simple.SimpleMirror`).
 
     The device takes a sample from its queue in each fast step, and the driver keeps the samples of the next ``ahead_s``
@@ -129,14 +128,15 @@ class PlayzerX:
     lacks: ClassVar[tuple[Lacks, ...]] = (Lacks.READ_BACK, Lacks.WATCHDOG, Lacks.STOP)
 
     def __init__(self, rig: Rig, *, port: str, laser: int = 0, ahead_s: float = 0.1) -> None:
+        super().__init__()
         self._n_inputs, self._step_ns = rig.n_inputs, rig.timing.fast_step_ns
-        rate = _checked_rate(rig)
+        rate = round(1e9 / self._step_ns)
         self._ahead = round(ahead_s * rate)
-        _check(rig, laser, self._ahead)
+        _check(rig, rate, laser, self._ahead)
         self._park = codes_of(rig.mirror.park[None])
         self._laser: list[int] = []
         """Levels of its colours, once it is known how many it has."""
-        self._line = SerialLine("the PlayzerX", text("port", port), BAUD_RATE)
+        self._line = SerialLine("the PlayzerX", port, BAUD_RATE)
         try:
             self.description, data_format = self._identify()
             self._laser = [laser] * _COLOURS[data_format]
@@ -147,22 +147,13 @@ class PlayzerX:
                 )
             self._clock = SampleClock(self._step_ns)
             self._pauses = (min(_PERIOD_S, ahead_s / 10) * (0.5 + k * _GOLDEN % 1) for k in count())
-            self._commands: dict[int, Codes] = {}
-            """Commands by fast step, (2,); only those that have not been handed over."""
-            self._next = 0
-            """The first step whose sample has not been handed over."""
-            self._steps: list[tuple[Codes, bool]] = []
-            """The positions held in the steps before ``_next`` that were not yet reported, and whether each command
-            came too late."""
             self._handed = self._offset = 0
             """Samples handed over, and the difference of a step's number from its sample's."""
             self._taken = 0
             """The step that the mirror was in at the latest count."""
             self._batch = 0
             """The first step of the samples that were handed over last."""
-            self._changed = threading.Lock()
             self._closing = threading.Event()
-            self._failure = Failure()
             self._line.tell(USB_INPUT + sample_rate(rate))
             self._begin()
             for _ in range(_WARM_UP):
@@ -175,7 +166,6 @@ class PlayzerX:
                     self._leave_safe()
             self._line.close()
             raise
-        self._thread = threading.Thread(target=self._run, name="aolink-playzerx", daemon=True)
         self._thread.start()
 
     @property
@@ -188,28 +178,18 @@ class PlayzerX:
             return self._clock.time_ns(time.monotonic_ns())
 
     def send(self, first_step: int, u: NDArray[np.float64]) -> int:
-        codes = codes_of(u)
-        with self._changed:
-            self._failure.check()
-            late = min(max(self._next - first_step, 0), len(u))
-            self._commands.update(enumerate(codes[late:], first_step + late))
-        return late
+        return super().send(first_step, codes_of(u))
 
-    def applied(self) -> Iterable[Held]:
-        with self._changed:
-            self._failure.check()
-            first = self._next - len(self._steps)
-            n_steps = max(self._taken - first, 0)
-            reported, self._steps = self._steps[:n_steps], self._steps[n_steps:]
-        if not reported:
-            return []
-        u = np.array([codes for codes, _ in reported])[:, : self._n_inputs] / _HALF - 1
-        return [Held(first, u, np.array([late for _, late in reported]))]
+    def _n_over(self) -> int:
+        return max(self._taken - self._reported, 0)
+
+    def _inputs(self, held: Codes) -> NDArray[np.float64]:
+        return held[:, : self._n_inputs] / _HALF - 1
 
     def park(self) -> int:
         with self._changed:
-            self._failure.check()
-            self._commands.clear()
+            self._check()
+            self._queue.clear()
             return self._next
 
     def close(self) -> None:
@@ -219,7 +199,7 @@ class PlayzerX:
         try:
             self._leave_safe()
         except AolinkError:
-            if self._failure.error is None:  # otherwise the session knows of it already
+            if self._failure is None:  # otherwise the session knows of it already
                 raise
         finally:
             self._line.close()
@@ -232,7 +212,7 @@ class PlayzerX:
         # The first command ends a command that another program may have left half sent; the second one stops what that
         # program started.
         self._line.tell(NO_UPDATES + NO_UPDATES)
-        self._line.drain(_QUIET_S)
+        self._line.drain(QUIET_S)
         for request, expected in ((PING, b"pl-ok"), (INFO, b"pl-info")):
             if (answer := self._line.ask(request)) != expected:
                 raise DeviceError(
@@ -249,7 +229,7 @@ class PlayzerX:
     def _begin(self) -> None:
         """Queue the first samples. Raises DeviceError where the device does not take them."""
         for _ in range(_TRIES):
-            self._steps, self._next, self._handed = [], 0, 0
+            self._held, self._next, self._handed = [], 0, 0
             self._line.tell(CLEAR)
             self._hand_over(self._ahead)
             asked_ns = time.monotonic_ns()
@@ -261,13 +241,9 @@ class PlayzerX:
             " them, or this machine was held up for longer than they last (devices.mirror.ahead_s)"
         )
 
-    def _run(self) -> None:
-        try:
-            while not self._closing.wait(next(self._pauses)):
-                self._serve()
-        except Exception as error:  # the session gets the error when it asks next
-            with self._changed:
-                self._failure.error = error
+    def _play(self) -> None:
+        while not self._closing.wait(next(self._pauses)):
+            self._serve()
 
     def _serve(self) -> None:
         """Count the samples, and fill the queue."""
@@ -319,10 +295,10 @@ class PlayzerX:
     def _delay(self, step: int, n_steps: int) -> None:
         """Note that the queue had run dry: from ``step`` on, the samples handed over are held ``n_steps`` later."""
         if n_steps > 0:
-            at = step - (self._next - len(self._steps))
-            before, _ = self._steps[at - 1]
-            late = [self._commands.pop(k, None) is not None for k in range(self._next, self._next + n_steps)]
-            self._steps[at:at] = [(before, each) for each in late]
+            at = step - self._reported
+            before, _ = self._held[at - 1]
+            late = [self._queue.pop(k, None) is not None for k in range(self._next, self._next + n_steps)]
+            self._held[at:at] = [(before, each) for each in late]
             self._next, self._offset = self._next + n_steps, self._offset + n_steps
 
     def _hand_over(self, n_samples: int) -> None:
@@ -331,24 +307,20 @@ class PlayzerX:
             return
         with self._changed:
             steps = range(self._next, self._next + n_samples)
-            codes = np.array([self._commands.pop(step, self._park[0]) for step in steps])
-            self._steps += [(each, False) for each in codes]
+            codes = np.array([self._queue.pop(step, self._park[0]) for step in steps])
+            self._held += [(each, False) for each in codes]
             self._batch, self._next, self._handed = steps.start, steps.stop, self._handed + n_samples
         self._line.tell(samples(codes, self._laser))
 
 
-def _checked_rate(rig: Rig) -> int:
-    rate = round(1e9 / rig.timing.fast_step_ns)
+def _check(rig: Rig, rate: int, laser: int, ahead: int) -> None:
+    """Refuse what the device cannot do. Raises DeviceError."""
+    mirror = rig.mirror
     if rate not in RATES or rate * rig.timing.fast_step_ns != 1_000_000_000:
         raise DeviceError(
             f"timing.fast_step_s = {rig.timing.fast_step_s:g} is {1 / rig.timing.fast_step_s:g} samples a second: the"
             f" PlayzerX plays a whole number from {RATES.start} to {RATES.stop - 1}; take one that divides 10^9"
         )
-    return rate
-
-
-def _check(rig: Rig, laser: int, ahead: int) -> None:
-    mirror = rig.mirror
     if rig.n_inputs > 2 or (mirror.input_min < -1).any() or (mirror.input_max > 1).any():
         raise DeviceError(
             f"the PlayzerX has two axes, each from -1 to 1: the rig file's mirror has {rig.n_inputs} input(s) from"

@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import time
 from contextlib import ExitStack, suppress
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from aolink.devices.mirrors.keys import check_resolution, per_input, scale_per_input, text
-from aolink.devices.mirrors.line import TIMEOUT_S, SerialLine, shown, usb_ports
+from aolink.devices.mirrors.keys import Scale
+from aolink.devices.mirrors.line import QUIET_S, TIMEOUT_S, SerialLine, shown, usb_ports
 from aolink.devices.simple import Lacks
 from aolink.errors import AolinkError, DeviceError, RigError
 from aolink.extensions import needs_extra
@@ -35,7 +35,6 @@ _ALIGNER_OUTPUTS = 0x0D
 """The group of the aligner's parameters that holds its outputs."""
 _ALIGNER_GET, _CODEC_ALIGNER_GET = 0x0872, 0x0870
 """The aligner's answer, and the number under which version 29 of the codec reads it: that of the command."""
-_QUIET_S = 0.05
 _LONGEST = 255
 
 
@@ -58,12 +57,12 @@ class AptUnit:
             import thorlabs_apt_protocol
             from thorlabs_apt_protocol.parsing import id_to_func
         self._codec, self._parsers = thorlabs_apt_protocol, id_to_func
-        self._line, self._address = line, address
+        self.line, self._address = line, address
         self.is_cube = address == _CUBE
 
     def tell(self, name: str, *values: int) -> None:
         """Send the message of this name in the codec."""
-        self._line.tell(getattr(self._codec, name)(self._address, _HOST, *values))
+        self.line.tell(getattr(self._codec, name)(self._address, _HOST, *values))
 
     def ask(self, name: str, answer: str, *values: int) -> dict[str, Any]:
         """Send a request, and give the fields of the message that answers it.
@@ -78,58 +77,80 @@ class AptUnit:
             if fields["msg"] in ("hw_response", "hw_richresponse"):
                 notes = bytes(fields.get("notes", b"")).split(b"\0")[0].decode("ascii", "replace")
                 raise DeviceError(
-                    f"the Thorlabs unit at {self._line.url} reports an error as it is asked {name}: code"
+                    f"the Thorlabs unit at {self.line.url} reports an error as it is asked {name}: code"
                     f" {fields.get('code', 'unknown')} {notes}".rstrip()
                 )
             if fields["msg"] == answer and fields["source"] == self._address:
                 return fields
 
-    def drain(self) -> None:
-        """Throw away the bytes that are on their way from the unit."""
-        self._line.drain(_QUIET_S)
-
-    def description(self) -> str:
-        """Model, serial number and firmware."""
+    def greeted(self) -> str:
+        """Make the unit send nothing but answers; gives model, serial number and firmware. Raises DeviceError."""
+        self.tell("hw_no_flash_programming")
+        self.tell("hw_stop_updatemsgs")
+        self.line.drain(QUIET_S)
         info = self.ask("hw_req_info", "hw_get_info")
         model = bytes(info["model_number"]).split(b"\0")[0].decode("ascii", "replace").strip()
         firmware = ".".join(str(each) for each in info["firmware_version"])
         return f"{model}, serial number {info['serial_number']}, firmware {firmware}"
 
     def _read(self, timeout_s: float) -> dict[str, Any]:
-        head = self._line.read_exactly(6, timeout_s)
+        head = self.line.read_exactly(6, timeout_s)
         number, length, is_long = head[0] | head[1] << 8, head[2] | head[3] << 8, head[4] & 0x80
         if number == _ALIGNER_GET:
             head, number = _CODEC_ALIGNER_GET.to_bytes(2, "little") + head[2:], _CODEC_ALIGNER_GET
         parse = self._parsers.get(number)
         if parse is None or (is_long and length > _LONGEST):
             raise DeviceError(
-                f"what is at {self._line.url} sends {shown(head)}, which is no message of Thorlabs' APT protocol that"
+                f"what is at {self.line.url} sends {shown(head)}, which is no message of Thorlabs' APT protocol that"
                 " this driver knows: is this its port, and does no other program use it?"
             )
-        data = self._line.read_exactly(length, timeout_s) if is_long else b""
+        data = self.line.read_exactly(length, timeout_s) if is_long else b""
         try:
             return dict(parse(head + data))
         except Exception as error:  # a message of another length than the codec expects
-            raise DeviceError(f"the Thorlabs unit at {self._line.url} sends {shown(head + data)}: {error}") from None
+            raise DeviceError(f"the Thorlabs unit at {self.line.url} sends {shown(head + data)}: {error}") from None
 
 
-class _Output(NamedTuple):
-    """A piezo's channel."""
+class _Output:
+    """A piezo's channel: its unit follows the host alone, in open or closed loop."""
 
-    unit: AptUnit
-    closed_loop: bool
-    most: float
-    """Full scale: volts, or micrometres in closed loop."""
+    def __init__(self, unit: AptUnit, closed_loop: bool, travel_um: float | None) -> None:
+        self.unit, self._closed_loop = unit, closed_loop
+        unit.tell("pz_set_inputvoltssrc", _CHANNEL, 0)  # the host alone: no knob, no other input
+        mode, of = (_CLOSED_LOOP, "closed") if closed_loop else (_OPEN_LOOP, "open")
+        unit.tell("pz_set_positioncontrolmode", _CHANNEL, mode)
+        if (found := self._asked("positioncontrolmode")["mode"]) != mode:
+            raise DeviceError(
+                f"the Thorlabs unit stays in control mode {found}, asked for {mode} ({of} loop): is its strain gauge"
+                " connected?"
+            )
+        if unit.is_cube:
+            most = travel_um or 0.0
+            if not closed_loop:
+                most = _CUBE_VOLTS.get(self._asked("tpz_iosettings")["voltage_limit"], 0.0)
+        else:  # it counts 100 nm, and tenths of a volt
+            what, named = ("maxtravel", "travel") if closed_loop else ("outputmaxvolts", "voltage")
+            most = self._asked(what)[named] / 10
+        if most <= 0:
+            raise DeviceError(
+                f"the Thorlabs unit says that its range is {most:g} {'um' if closed_loop else 'V'}: is an actuator"
+                " connected?"
+            )
+        self.most = most
+        """Full scale: volts, or micrometres in closed loop."""
+
+    def _asked(self, what: str) -> dict[str, Any]:
+        return self.unit.ask(f"pz_req_{what}", f"pz_get_{what}", _CHANNEL)
 
     def put(self, value: float) -> float:
         """Put out volts or micrometres; gives the value that the unit took."""
         code = int(np.clip(round(value / self.most * _FULL_SCALE), 0, _FULL_SCALE))
-        if self.closed_loop:
+        if self._closed_loop:
             self.unit.tell("pz_set_outputpos", _CHANNEL, code)
-            self.unit.ask("pz_req_outputpos", "pz_get_outputpos", _CHANNEL)
+            self._asked("outputpos")
         else:
             self.unit.tell("pz_set_outputvolts", _CHANNEL, code)
-            code = int(self.unit.ask("pz_req_outputvolts", "pz_get_outputvolts", _CHANNEL)["voltage"])
+            code = int(self._asked("outputvolts")["voltage"])
         return code * self.most / _FULL_SCALE
 
     def enable(self) -> None:
@@ -166,42 +187,37 @@ class ThorlabsPiezo:
         travel_um: float | None = None, unit: float | list[float] = 1.0, zero: float | list[float] = 0.0,
     ) -> None:  # fmt: skip
         places = _places(port, bays, rig.n_inputs)
-        if closed_loop and not bays and not (isinstance(travel_um, int | float) and travel_um > 0):
+        if closed_loop and not bays and not (travel_um or 0) > 0:
             raise RigError(
                 f"devices.mirror.travel_um: in closed loop cubes need the travel of their actuators, found {travel_um}"
             )
-        self._scale, self._zero = (scale_per_input("unit", unit, rig.n_inputs), per_input("zero", zero, rig.n_inputs))
-        self._closed_loop, self._travel_um, self._park = closed_loop, travel_um, rig.mirror.park
+        self._scale, self._park = Scale(rig.mirror, unit, zero), rig.mirror.park
         with ExitStack() as opened:
             self._lines: dict[str, SerialLine] = {}
             for path, _ in places:
                 if path not in self._lines:
-                    self._lines[path] = SerialLine("the Thorlabs unit", path, _BAUD_RATE)
-                    opened.callback(self._lines[path].close)
-            self._outputs: list[_Output] = []
-            found = []
-            for path, address in places:
-                apt = AptUnit(self._lines[path], address)
-                found.append(_greeted(self._lines[path], apt))
-                self._outputs.append(_Output(apt, closed_loop, self._prepare(apt)))
-            self.description = "Thorlabs " + "; ".join(dict.fromkeys(found))
-            self._check_reach(rig)
+                    line = SerialLine("the Thorlabs unit", path, _BAUD_RATE)
+                    self._lines[path] = opened.enter_context(line.opening())
+            units = [AptUnit(self._lines[path], address) for path, address in places]
+            greeted = [(each.greeted(), _Output(each, closed_loop, travel_um)) for each in units]
+            self.description = "Thorlabs " + "; ".join(dict.fromkeys(text for text, _ in greeted))
+            self._outputs = [output for _, output in greeted]
+            most = np.array([output.most for output in self._outputs])
+            self._scale.check(0, most, "the Thorlabs unit", " um" if closed_loop else " V", most / _FULL_SCALE)
             self.put(self._park)
             for output in self._outputs:
                 output.enable()
-            opened.pop_all()
 
     def put(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
-        values = (self._zero + self._scale * u).tolist()
-        taken = [output.put(value) for output, value in zip(self._outputs, values, strict=True)]
-        return np.asarray((np.array(taken) - self._zero) / self._scale)
+        values = self._scale.of(u).tolist()
+        return self._scale.inputs([each.put(value) for each, value in zip(self._outputs, values, strict=True)])
 
     def park(self) -> None:
         """Hold the safe input; where one unit is lost, the others do all the same."""
         lost = None
-        for output, value in zip(self._outputs, (self._zero + self._scale * self._park).tolist(), strict=True):
+        for output, value in zip(self._outputs, self._scale.of(self._park).tolist(), strict=True):
             try:
-                output.unit.drain()
+                output.unit.line.drain(QUIET_S)
                 output.put(value)
             except AolinkError as error:
                 lost = error
@@ -214,42 +230,6 @@ class ThorlabsPiezo:
             self.park()
         for line in self._lines.values():
             line.close()
-
-    def _prepare(self, apt: AptUnit) -> float:
-        """Set the control mode and the input source; gives the volts or micrometres of full scale."""
-        unit = "um" if self._closed_loop else "V"
-        apt.tell("pz_set_inputvoltssrc", _CHANNEL, 0)  # the host alone: no knob, no other input
-        mode = _CLOSED_LOOP if self._closed_loop else _OPEN_LOOP
-        apt.tell("pz_set_positioncontrolmode", _CHANNEL, mode)
-        found = apt.ask("pz_req_positioncontrolmode", "pz_get_positioncontrolmode", _CHANNEL)["mode"]
-        if found != mode:
-            raise DeviceError(
-                f"the Thorlabs unit stays in control mode {found}, asked for {mode}"
-                f" ({'closed' if self._closed_loop else 'open'} loop): is its strain gauge connected?"
-            )
-        if self._closed_loop and apt.is_cube:
-            most = float(self._travel_um or 0.0)
-        elif self._closed_loop:
-            most = apt.ask("pz_req_maxtravel", "pz_get_maxtravel", _CHANNEL)["travel"] / 10  # it counts 100 nm
-        elif apt.is_cube:
-            limit = apt.ask("pz_req_tpz_iosettings", "pz_get_tpz_iosettings", _CHANNEL)["voltage_limit"]
-            most = _CUBE_VOLTS.get(limit, 0.0)
-        else:
-            most = apt.ask("pz_req_outputmaxvolts", "pz_get_outputmaxvolts", _CHANNEL)["voltage"] / 10
-        if most <= 0:
-            raise DeviceError(f"the Thorlabs unit says that its range is {most:g} {unit}: is an actuator connected?")
-        return float(most)
-
-    def _check_reach(self, rig: Rig) -> None:
-        ends = self._zero + self._scale * np.array([rig.mirror.input_min, rig.mirror.input_max])
-        most = np.array([output.most for output in self._outputs])
-        if (ends < 0).any() or (ends > most * (1 + 1e-9)).any():
-            unit = "um" if self._closed_loop else "V"
-            raise DeviceError(
-                f"mirror.input_min .. input_max are {ends.min():g} to {ends.max():g} {unit} by devices.mirror.unit and"
-                f" zero, the Thorlabs unit goes from 0 to {most.min():g} {unit}: correct one of them"
-            )
-        check_resolution(rig.mirror, np.abs(most / _FULL_SCALE / self._scale), "the Thorlabs unit")
 
 
 class ThorlabsAligner:
@@ -270,36 +250,26 @@ class ThorlabsAligner:
     ) -> None:  # fmt: skip
         if rig.n_inputs != 2:
             raise DeviceError(f"the Thorlabs aligner has 2 outputs, x and y; the rig file has {rig.n_inputs} input(s)")
-        self._scale, self._zero = scale_per_input("unit", unit, 2), per_input("zero", zero, 2)
-        self._park, volt = rig.mirror.park, _ALIGNER_VOLTS / _FULL_SCALE
-        ends = self._zero + self._scale * np.array([rig.mirror.input_min, rig.mirror.input_max])
-        if np.abs(ends).max() > _ALIGNER_VOLTS * (1 + 1e-9):
-            raise DeviceError(
-                f"mirror.input_min .. input_max are {ends.min():g} to {ends.max():g} V by devices.mirror.unit and zero,"
-                f" the Thorlabs aligner goes from {-_ALIGNER_VOLTS:g} to {_ALIGNER_VOLTS:g} V: correct one of them"
-            )
-        check_resolution(rig.mirror, np.abs(volt / self._scale), "the Thorlabs aligner")
-        self._line = SerialLine("the Thorlabs aligner", text("port", port), _BAUD_RATE)
-        with ExitStack() as opened:
-            opened.callback(self._line.close)
+        self._scale, self._park = Scale(rig.mirror, unit, zero), rig.mirror.park
+        most = _ALIGNER_VOLTS
+        self._scale.check(-most, most, "the Thorlabs aligner", " V", most / _FULL_SCALE)
+        with SerialLine("the Thorlabs aligner", port, _BAUD_RATE).opening() as self._line:
             self._apt = AptUnit(self._line, _CUBE)
-            self.description = f"Thorlabs {_greeted(self._line, self._apt)}"
+            self.description = f"Thorlabs {self._apt.greeted()}"
             self.put(self._park)
             self._apt.tell("quad_set_opermode", _ALIGNER_OPEN_LOOP)
             self.put(self._park)
-            opened.pop_all()
 
     def put(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
-        volts = np.clip((self._zero + self._scale * u) / _ALIGNER_VOLTS, -1, 1)
+        volts = np.clip(self._scale.of(u) / _ALIGNER_VOLTS, -1, 1)
         self._apt.tell("quad_set_positionoutputs", *(round(each) for each in (volts * _FULL_SCALE).tolist()))
         found = self._apt.ask("quad_req_positionoutputs", "quad_get_params")
         if found["submsgid"] != _ALIGNER_OUTPUTS:
             raise DeviceError(f"the Thorlabs aligner answers with its parameters {found['submsgid']}, not its outputs")
-        taken = np.array([found["x_pos"], found["y_pos"]]) * _ALIGNER_VOLTS / _FULL_SCALE
-        return np.asarray((taken - self._zero) / self._scale)
+        return self._scale.inputs(np.array([found["x_pos"], found["y_pos"]]) * _ALIGNER_VOLTS / _FULL_SCALE)
 
     def park(self) -> None:
-        self._line.drain(_QUIET_S)
+        self._line.drain(QUIET_S)
         self.put(self._park)
 
     def close(self) -> None:
@@ -323,15 +293,6 @@ def _places(port: str | list[str], bays: list[int] | None, n_inputs: int) -> lis
             f"devices.mirror: the rig file has {n_inputs} input(s), and port = {port!r}, bays = {bays!r} name"
             f" {min(len(paths), len(numbers))} unit(s): give a list of ports, or of bays, with one for each"
         )
-    for each in numbers:
-        if not isinstance(each, int) or not 0 <= each <= 10:
-            raise RigError(f"devices.mirror.bays: expected whole numbers from 1 to 10, found {each!r}")
-    return [(text("port", path), _FIRST_BAY + bay if bay else _CUBE) for path, bay in zip(paths, numbers, strict=True)]
-
-
-def _greeted(line: SerialLine, apt: AptUnit) -> str:
-    """Make a unit send nothing but answers; gives its description. Raises DeviceError."""
-    apt.tell("hw_no_flash_programming")
-    apt.tell("hw_stop_updatemsgs")
-    line.drain(_QUIET_S)
-    return apt.description()
+    if strange := [each for each in numbers if not 0 <= each <= 10]:
+        raise RigError(f"devices.mirror.bays: expected whole numbers from 1 to 10, found {strange[0]!r}")
+    return [(path, _FIRST_BAY + bay if bay else _CUBE) for path, bay in zip(paths, numbers, strict=True)]

@@ -10,7 +10,7 @@ import pytest
 
 from aolink.devices.cameras.aravis import discover
 from aolink.devices.cameras.pixel_formats import PIXEL_FORMATS
-from aolink.devices.interfaces import Lacks
+from aolink.devices.simple import Lacks, Trigger
 from tests.devices.cameras.gige import (
     LONGEST_S,
     PICTURES,
@@ -71,13 +71,29 @@ def test_a_camera_with_a_trigger_takes_a_frame_for_each_edge_and_none_without(tm
     frames = packed(noise(16, 16), PIXEL_FORMATS["Mono16"])
     with (
         gige_camera(tmp_path, frames, {}, Faults(edges_hz=50.0)) as relay,
-        opened(fast_rig(), trigger="Line1") as camera,
+        opened(fast_rig(), trigger=Trigger("hardware", "Line1")) as camera,
     ):
         assert camera.lacks == ()
         numbers = numbers_of(taken(started(camera), 20))
         edges = relay.said()[0]["edges"]
     assert (len(numbers) >= 20, np.diff(numbers).tolist()) == (True, [1] * (len(numbers) - 1))
     assert len(numbers) <= edges
+
+
+def test_a_camera_that_the_host_triggers_takes_a_frame_in_each_period_and_none_unasked(tmp_path: Path) -> None:
+    """At 20 commands a second; left to itself it would take 25."""
+    frames, rig = packed(noise(16, 16), PIXEL_FORMATS["Mono16"]), fast_rig(period_steps=500)
+    with gige_camera(tmp_path, frames, {}) as relay, opened(rig, trigger=Trigger("software")) as camera:
+        assert camera.lacks == ()
+        begun_ns = camera.time_ns()
+        assert begun_ns is not None
+        camera.start(begun_ns + 50_000_000, 0)
+        found = taken(camera, 20)
+        camera.stop()
+        commands, passed_ns = relay.said()[0]["commands"], (camera.time_ns() or 0) - begun_ns
+    assert np.diff(numbers_of(found)).tolist() == [1] * (len(found) - 1)
+    assert 20 <= len(found) <= commands <= passed_ns / 50_000_000 + 1
+    assert (found[0].start_ns or 0) >= begun_ns + 50_000_000
 
 
 def test_each_packet_that_is_lost_is_counted_and_masks_its_pixels(tmp_path: Path) -> None:

@@ -28,7 +28,7 @@ need_aravis()
     ("address", "keys", "lacks"),
     [
         (RELAY, {}, Lacks.TRIGGER),
-        (RELAY, {"trigger": '"Line1"'}, ""),
+        (RELAY, {"trigger": '"hardware:Line1"'}, ""),
         (FAKE, {}, f"{Lacks.TIME}; {Lacks.TRIGGER}"),
     ],
     ids=["clock", "trigger", "no clock"],

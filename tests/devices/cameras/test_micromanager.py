@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from aolink.devices.cameras.micromanager import MicroManagerCamera
+from aolink.devices.simple import FREE_RUNNING, Lacks, Trigger
 from aolink.errors import DeviceError
 from aolink.recording.reader import Recording
 from aolink.session import record
@@ -49,11 +50,16 @@ def test_a_session_records_what_the_camera_shows(tmp_path: Path) -> None:
     assert np.abs(beside - slope * inner).max() < 0.02 * np.abs(middle).max()
 
 
-def test_a_frame_has_the_cameras_own_count(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("trigger", "lacks"), [(FREE_RUNNING, (Lacks.TIME, Lacks.TRIGGER)), (Trigger("hardware"), (Lacks.TIME,))]
+)
+def test_a_frame_has_the_cameras_own_count(trigger: Trigger, lacks: tuple[Lacks, ...], tmp_path: Path) -> None:
+    """A hardware trigger is only declared: the demo camera has none, and runs."""
     camera = MicroManagerCamera(
         rig_of(table(), tmp_path), adapter="DemoCamera", device="DCam", folder=FOLDER,
-        properties={"PixelType": "16bit", "BitDepth": 16},
+        properties={"PixelType": "16bit", "BitDepth": 16}, trigger=trigger,
     )  # fmt: skip
+    assert camera.lacks == lacks
     try:
         camera.start(0, 0)
         found: list[int | None] = []

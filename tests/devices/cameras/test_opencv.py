@@ -119,7 +119,7 @@ def test_a_camera_on_the_network_that_goes_away_ends_the_session(stream: str, tm
         ("none.avi", {}, r"OpenCV cannot open none.avi"),
         ("text.avi", {}, r"OpenCV cannot open text.avi"),
         ("film.avi", {"pixels": (40, 80)}, r"film.avi gives \(48, 64\) pixels, the rig file's sensor has \(1, 80\)"),
-        ("film.avi", {"fast_step_s": (0.001, 0.002)}, r"gives 25 frames a second, the rig file says 12.5: correct"),
+        ("film.avi", {"fast_step_s": (0.001, 0.002)}, r"takes 25 frames a second, the rig file says 12.5: correct"),
     ],
 )
 def test_what_cannot_be_read_is_refused_when_it_is_opened(
@@ -130,7 +130,7 @@ def test_what_cannot_be_read_is_refused_when_it_is_opened(
     (tmp_path / "text.avi").write_text("no film")
     rig = rig_of(table(source), tmp_path, **BITS_8, **changes)
     with pytest.raises(DeviceError, match=what):
-        OpenCVCamera(rig, source=source, corner=CORNER)
+        OpenCVCamera(rig, source=source, corner=[*CORNER])
     assert capfd.readouterr().err == ""
 
 

@@ -12,7 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 from aolink import estimate
-from aolink.devices.outages import Outages
+from aolink.devices.paced import Outages
 from aolink.estimation import Estimate
 from aolink.exposure import Exposure
 from aolink.extensions import installed

@@ -82,7 +82,7 @@ class Relay:
         self._faults, self._write_register = faults, write_register
         self._random = random.Random(faults.seed)
         self.counts: Counter[str] = Counter()
-        """Packets dropped and sent again, by kind."""
+        """Packets dropped and sent again, by kind, and the host's software triggers (``commands``)."""
         self.dropped: dict[int, list[int]] = {}
         """Packets that were dropped, by frame id."""
         self._front, self._stream = _bound(RELAY, CONTROL_PORT), _bound(FAKE, 0)
@@ -131,6 +131,8 @@ class Relay:
             elif register == STREAM_PORT and (value & 0xFFFF or sender == self._listening):
                 self._port, self._listening = value & 0xFFFF, sender
                 value = self._stream.getsockname()[1] if self._port else value
+            elif register == TRIGGER:
+                self.counts["commands"] += 1
             elif register == CLOCK_CONTROL and value == 2 and self._faults.latch:
                 now_ns = self._clock_ns(time.time_ns())
                 self._write_register(CLOCK_VALUE, now_ns >> 32)
