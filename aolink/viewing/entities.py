@@ -41,6 +41,7 @@ PUPIL = "pupil"
 
 COMMAND = _of(topics.COMMAND)
 APPLIED = _of(topics.APPLIED)
+INPUTS = (COMMAND, APPLIED)
 CONTROL = _of(topics.CONTROL)
 LATENCY = _of(topics.LATENCY)
 ESTIMATION = f"{LATENCY}/{_of(topics.ESTIMATION)}"
