@@ -14,10 +14,11 @@ from typing import TYPE_CHECKING, Any
 from aolink.errors import AolinkError, ExportError
 from aolink.estimation.score import Score, score_table
 from aolink.files import writing
+from aolink.gathered import has_pupil, lacks
 from aolink.plotting.devices import incidents, plot_latency, plot_losses
-from aolink.plotting.exposure import draw_exposure, exposure_with_estimates
+from aolink.plotting.exposure import draw_exposure, step_of
 from aolink.plotting.overview import Overview, overview
-from aolink.plotting.pupil import has_pupil, plot_pupil
+from aolink.plotting.pupil import plot_pupil
 from aolink.plotting.scene import plot_scene
 from aolink.plotting.session import plot_blur, plot_errors, plot_nis
 from aolink.plotting.style import TimeUnit, new_figure, paper
@@ -25,6 +26,7 @@ from aolink.recording import topics
 from aolink.recording.answers import Answers
 from aolink.recording.facts import Counted, recording_facts
 from aolink.recording.reader import Recording
+from aolink.series import Step
 from aolink.units import duration, with_unit
 
 if TYPE_CHECKING:
@@ -143,22 +145,8 @@ class _Session:
 
     def lacks(self) -> list[str]:
         """Sentences about the data that the recording lacks."""
-        recording, said = self.recording, []
-        if self.view is not None and not len(self.view):
-            said.append("It holds no exposure: there is nothing to draw.")
-        if not recording.estimators:
-            said.append("It holds no estimates; `aolink estimate` makes them.")
-        if not recording.has_truth:
-            said.append("The truth is not known, so there are no errors, only NIS.")
-        if topics.COMMAND not in recording.counts:
-            said.append("It holds no commands.")
-        if topics.APPLIED not in recording.counts:
-            said.append("It holds no reports of the mirror; inputs are those commanded, or zero.")
-        if recording.rig.scene is not None and topics.RESTORED_SCENE not in recording.counts:
-            said.append("Its pictures were not restored; `aolink deblur` does that.")
-        if recording.damage:
-            said.append(f"It is damaged: {recording.damage}.")
-        return said
+        empty = self.view is not None and not len(self.view)
+        return (["It holds no exposure: there is nothing to draw."] if empty else []) + lacks(self.recording)
 
     def scores(self) -> str:
         """The table of scores, which `aolink estimate` prints too."""
@@ -172,18 +160,18 @@ class _Session:
             return _note(self.problem)
         parts = []
         for number, why in self.view.telling().items():
-            exposure, estimates = exposure_with_estimates(self.recording, number)
+            step = step_of(self.recording, number)
             status = "; ".join(
-                f"{name}: {each.status.name.lower()} ({each.reason})" for name, each in estimates.items() if each.reason
-            )
-            caption = f"Exposure {number} (frame {exposure.frame_id}): {why}. {status}"
+                f"{name}: {each.status.name.lower()} ({each.reason})"
+                for name, each in step.estimates.items() if each.reason
+            )  # fmt: skip
+            caption = f"Exposure {number} (frame {step.exposure.frame_id}): {why}. {status}"
             size = (_WIDE[0], _WIDE[1] * (1.45 if self.recording.rig.sensor.directions == 2 else 1.0))
-
-            def draw(_: Overview, figure: Figure, exposure: Any = exposure, estimates: Any = estimates) -> None:
-                draw_exposure(self.recording, exposure, estimates, figure, unit=self.unit)
-
-            parts.append(self.drawn(size, caption, draw))
+            parts.append(self.drawn(size, caption, partial(self._draw_exposure, step)))
         return "".join(parts) or _note("No exposure.")
+
+    def _draw_exposure(self, step: Step, _: Overview, figure: Figure) -> None:
+        draw_exposure(self.recording.rig, step, figure, unit=self.unit)
 
     def scene(self) -> str:
         """The picture of the first exposure that was restored; without one, of the one that is blurred most."""
@@ -259,7 +247,7 @@ def _sections(sessions: Sequence[_Session]) -> Iterable[str]:
     else:
         for title in _OVER_SESSION:
             yield beside(title, partial(_Session.over_session, title=title))
-    if any(has_pupil(each.recording) for each in sessions):
+    if any(has_pupil(each.recording.rig) for each in sessions):
         yield beside("Over the pupil", _Session.pupil)
     if any(each.recording.rig.scene is not None or topics.RESTORATION in each.recording.counts for each in sessions):
         yield beside("Before and after", _Session.scene)

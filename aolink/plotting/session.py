@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from aolink.errors import ExportError
 from aolink.estimation.estimate import Status
+from aolink.gathered import NIS_COVERAGE, PER_SLOPE, SLOPES, limits_of, nis_bounds
 from aolink.numerics.arrays import FloatArray
-from aolink.plotting.overview import NIS_COVERAGE, Overview, limits_of, need_exposures, nis_bounds, overview
+from aolink.plotting.overview import Overview, need_exposures, overview
 from aolink.plotting.style import TimeUnit, axes_or_new, colour, colour_bar, figure_or_new, is_narrow, legend_above
 from aolink.series import Series
 
@@ -69,11 +70,11 @@ def plot_blur(
         np.ravel(view.spans) * scale, line.edges, blur, cmap="Greys", vmin=0, vmax=1.2 * max(top, 1e-12),
         rasterized=True,
     )  # fmt: skip
-    colour_bar(grey, axes, "1 / slope unit" if is_narrow(axes.figure) else "intensity (1 / slope unit)")
+    colour_bar(grey, axes, PER_SLOPE if is_narrow(axes.figure) else f"intensity ({PER_SLOPE})")
     chosen = ["truth", *view.names[-1:]] if names is None else names
     for name in [each for each in chosen if each in view.paths]:
         _draw_paths(axes, view, name, scale)
-    axes.set(ylabel=f"output {view.output} (slope units)", xlim=(0, view.spans[-1, 1] * scale))
+    axes.set(ylabel=f"output {view.output} ({SLOPES})", xlim=(0, view.spans[-1, 1] * scale))
     drawn = [each for name, of in view.paths.items() if name in chosen for each in (of.low, of.high)]
     axes.set_ylim(limits_of(line, drawn))
     axes.set_xlabel(time_label(unit))
@@ -161,7 +162,7 @@ def plot_errors(view: Overview, axes: Axes | None = None, *, unit: TimeUnit = "s
         times = np.convolve(view.steps[known] * scale, kernel, mode="valid")
         running = np.sqrt(np.convolve(errors[known] ** 2, kernel, mode="valid"))
         axes.plot(*thinned(times, running), color=colour(name), label=name)
-    axes.set(yscale="log", xlabel=time_label(unit), ylabel="RMSE of the path (slope units)")
+    axes.set(yscale="log", xlabel=time_label(unit), ylabel=f"RMSE of the path ({SLOPES})")
     axes.grid(alpha=0.3)
     legend_above(axes)
     return axes

@@ -11,8 +11,7 @@ import pytest
 import aolink
 from aolink import plotting
 from aolink.errors import ExportError, RecordingError
-from aolink.plotting.overview import nis_bounds
-from aolink.plotting.style import extremes, hides_swings
+from aolink.gathered import extremes, hides_swings, nis_bounds
 from aolink.recording.reader import Recording
 from aolink.recording.reestimate import write_reestimated
 from tests.needs import needed
