@@ -119,14 +119,15 @@ class Blur:
         share = np.diff(np.interp(u, _ERF_AT, _ERF).mean(axis=0)) / (2 * line.pixel_width)
         return np.asarray(self.sensor.light_of(self.output) * share)
 
-    def histogram(self, name: str) -> tuple[FloatArray, FloatArray]:
-        """How long a path stays at a position: density in each bin of half a pixel, and the bins' edges."""
+    def histogram(self, name: str, width: float | None = None) -> tuple[FloatArray, FloatArray]:
+        """How long a path stays at a position: density in each bin of a width (half a pixel by default), and the bins'
+        edges."""
         line, path = self.line, self.paths[name]
-        half = 0.5 * line.pixel_width
-        bins = np.clip(((path - line.field[0]) / half).astype(int), 0, 2 * line.pixels - 1)
+        bin_width = width or 0.5 * line.pixel_width
+        bins = ((np.clip(path, *line.field) - line.field[0]) / bin_width).astype(int)
         low, high = int(bins.min()), int(bins.max())
-        density = np.bincount(bins - low, minlength=high - low + 1) / (len(path) * half)
-        return density, np.asarray(line.field[0] + half * np.arange(low, high + 2), dtype=np.float64)
+        density = np.bincount(bins - low) / (len(path) * bin_width)
+        return density, np.asarray(line.field[0] + bin_width * np.arange(low, high + 2), dtype=np.float64)
 
 
 def paths_of(step: Step, outputs: Sequence[int] | None = None) -> dict[str, FloatArray]:

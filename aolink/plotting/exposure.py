@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure, SubFigure
 
 _SIZE_IN = (9.0, 3.4)
+_BINS = 48
+"""Bins of a path's histogram over the drawn part of the field."""
 _SEGMENTS = 120
 """Segments of a path that is drawn as an envelope."""
 
@@ -91,7 +93,7 @@ def draw_exposure(
     figure = figure_or_new(figure, (_SIZE_IN[0], _SIZE_IN[1] * (1.6 if on_plane else 1.0)))
     narrow, rows = is_narrow(figure), len(blurs)
     if narrow:  # the paths above, and below them what else there is
-        grid = figure.add_gridspec(rows + 1, 2 * rows, height_ratios=[1.0] * rows + [1.6])
+        grid = figure.add_gridspec(rows + 1, 2 * rows, height_ratios=[1.2] * rows + [1.6])
     else:
         widths = [3.0, 1.0, 1.2, 2.0] if on_plane else [3.0, 1.0, 1.2]
         grid = figure.add_gridspec(rows, len(widths), width_ratios=widths)
@@ -127,11 +129,13 @@ def _draw_row(panels: Sequence[Axes], rig: Rig, step: Step, blur: Blur, unit: Ti
         return
     histogram, intensity = others
     draw_intensity(intensity, blur, orientation="horizontal")
+    low, high = blur.limits
     for name in blur.paths:
-        histogram.stairs(*blur.histogram(name), orientation="horizontal", color=colour(name), linewidth=0.9)
+        stairs = blur.histogram(name, (high - low) / _BINS)
+        histogram.stairs(*stairs, orientation="horizontal", color=colour(name), linewidth=0.9)
     for panel, what in ((histogram, "time at a position"), (intensity, "intensity")):
         panel.set_xlabel(f"{what}\n({PER_SLOPE})")
-        panel.tick_params(labelleft=False)
+        panel.tick_params(labelleft=panel is histogram and is_narrow(panel.figure))
         panel.set_xlim(left=0)
 
 

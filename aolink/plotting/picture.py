@@ -7,14 +7,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from aolink.errors import ExportError
-from aolink.extensions import install_command
+from aolink.exporting.common import needed
 from aolink.files import writing
 from aolink.gathered import PER_SLOPE, SLOPES, Blur
 from aolink.plotting.exposure import draw_intensity, draw_paths, draw_spot, step_of
 from aolink.plotting.overview import need_exposures, overview
 from aolink.plotting.scene import plot_scene
 from aolink.plotting.session import plot_blur
-from aolink.plotting.style import legend_above
+from aolink.plotting.style import MM, legend_above, new_figure
 from aolink.recording.reader import Recording
 
 if TYPE_CHECKING:
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
     from aolink.series import Series, Step
 
-_SIZE_IN, _DPI = (16.0, 10.0), 110
+_SIZE_MM, _DPI = (16 / MM, 10 / MM), 110
 _NEAR = 4
 """Exposures before and after the one that is explained whose blur is drawn."""
 _STYLE: dict[Any, Any] = {
@@ -48,17 +48,13 @@ def draw_session(series: Series, path: str | Path) -> Path:
     ExportError
         matplotlib is missing, the series has no exposure, or the file cannot be written.
     """
-    try:
-        import matplotlib as mpl
-        from matplotlib.figure import Figure
-    except ImportError:
-        raise ExportError(f"a picture without the viewer needs matplotlib: {install_command('plot')}") from None
+    plain = needed("matplotlib", "plot", "a picture without the viewer")
     view = overview(series)
     need_exposures(view)
     number, why = next(iter(view.telling().items()))
     step, rig = step_of(series, number, view.names), series.rig
-    with mpl.rc_context(_STYLE):
-        figure = Figure(figsize=_SIZE_IN, layout="constrained")
+    with plain.rc_context(_STYLE):
+        figure = new_figure(*_SIZE_MM)
         figure.suptitle(f"{rig.name}: exposure {number}, {why}", x=0.01, ha="left", fontsize=13)
         has_scene = isinstance(series, Recording) and step.exposure.scene is not None
         shares = [1.0, 1.0, 0.55] if has_scene else [1.0, 1.0]

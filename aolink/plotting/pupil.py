@@ -11,7 +11,7 @@ from aolink.errors import ExportError
 from aolink.exporting.common import check_frame
 from aolink.gathered import MAPS, has_pupil, maps_of
 from aolink.numerics.arrays import FloatArray
-from aolink.plotting.style import colour_bar, figure_or_new
+from aolink.plotting.style import colour_bar, figure_or_new, is_narrow
 from aolink.series import Series
 
 if TYPE_CHECKING:
@@ -21,7 +21,7 @@ _EXPOSURES = 24
 """Most exposures that are read for the maps, spread evenly over the series."""
 _MAP_IN = (2.6, 2.3)
 _COLUMNS = 3
-"""Maps in a row."""
+"""Maps in a row; on a narrow figure there is one less."""
 
 
 def plot_pupil(
@@ -58,9 +58,10 @@ def plot_pupil(
     if not seen:
         raise ExportError(f"{series.path} holds no exposure to draw; `aolink info` says what it holds")
     figure = figure_or_new(figure, (_MAP_IN[0] * _COLUMNS, _MAP_IN[1] * -(-len(seen) // _COLUMNS)))
+    columns = _COLUMNS - is_narrow(figure)
     for place, what in enumerate([what for what in MAPS if what in seen], 1):
         (title, label, cmap), values = MAPS[what], np.mean(seen[what], axis=0)
-        axes = figure.add_subplot(-(-len(seen) // _COLUMNS), _COLUMNS, place)
+        axes = figure.add_subplot(-(-len(seen) // columns), columns, place)
         reach = float(np.nanmax(np.abs(values))) if np.isfinite(values).any() else 1.0
         picture = axes.imshow(values, cmap=cmap, vmin=-reach if cmap == "RdBu_r" else 0.0, vmax=reach or 1.0)
         axes.set(title=title if what == "light" else f"{title} ({(*names, 'centroid')[0]})", xticks=[], yticks=[])

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from aolink.errors import AolinkError, ExportError
-from aolink.estimation.score import Score, score_table
+from aolink.estimation.score import score_table
 from aolink.files import writing
 from aolink.gathered import has_pupil, lacks
 from aolink.plotting.devices import incidents, plot_latency, plot_losses
@@ -152,7 +152,9 @@ class _Session:
         """The table of scores, which `aolink estimate` prints too."""
         if self.view is None or not self.view.scores:
             return _note(self.problem or "No estimates.")
-        return _score_table(self.view.scores)
+        found = score_table(self.view.scores)
+        rows = [[name, *cells] for name, cells in found.rows.items()]
+        return _table(["estimator", *found.heads], rows) + "".join(map(_note, found.notes))
 
     def exposures(self) -> str:
         """The most telling exposures."""
@@ -259,36 +261,24 @@ def _comparison(sessions: Sequence[_Session]) -> str:
     wanted = ("RMSE path", "RMSE end", "NIS", "NEES end", "gated")
     rows = []
     for each in sessions:
-        begin = [_text(each.name), _text(each.recording.rig.name), _number(str(len(each.recording)))]
         found = score_table(each.view.scores if each.view is not None else {}, wanted)
         for name, cells in (found.rows or {"none": []}).items():
             of = dict(zip(found.heads, cells, strict=bool(cells)))
-            rows.append([*begin, _text(name), *(_number(of.get(head, "")) for head in wanted)])
+            begin = [each.name, each.recording.rig.name, str(len(each.recording)), name]
+            rows.append([*begin, *(of.get(head, "") for head in wanted)])
     return _table(("recording", "rig", "exposures", "estimator", *wanted), rows, text_columns=(0, 1, 3))
 
 
-def _score_table(scores: Mapping[str, Score]) -> str:
-    """The table that `aolink estimate` prints."""
-    found = score_table(scores)
-    rows = [[_text(name), *map(_number, cells)] for name, cells in found.rows.items()]
-    return _table(["estimator", *found.heads], rows, text_columns=(0,)) + "".join(map(_note, found.notes))
+def _table(heads: Sequence[str], rows: Sequence[Sequence[str]], *, text_columns: Sequence[int] = (0,)) -> str:
+    """A table; cells outside of the columns of texts are numbers, which stand out where they end with an exclamation
+    mark."""
 
+    def line(tag: str, cells: Sequence[str]) -> str:
+        kinds = ["" if k in text_columns else f' class="n{" off" * t.endswith("!")}"' for k, t in enumerate(cells)]
+        return "".join(f"<{tag}{kind}>{escape(text)}</{tag}>" for kind, text in zip(kinds, cells, strict=True))
 
-def _text(text: str) -> str:
-    return f"<td>{escape(text)}</td>"
-
-
-def _number(text: str) -> str:
-    return f'<td class="n{" off" if text.endswith("!") else ""}">{escape(text)}</td>'
-
-
-def _table(heads: Sequence[str], rows: Sequence[Sequence[str]], *, text_columns: Sequence[int]) -> str:
-    """A table of cells that are HTML."""
-    head = "".join(
-        f"<th>{name}</th>" if k in text_columns else f'<th class="n">{name}</th>' for k, name in enumerate(heads)
-    )
-    body = "".join(f"<tr>{''.join(row)}</tr>" for row in rows)
-    return f'<div class="scroll"><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
+    body = "".join(f"<tr>{line('td', row)}</tr>" for row in rows)
+    return f'<div class="scroll"><table><thead><tr>{line("th", heads)}</tr></thead><tbody>{body}</tbody></table></div>'
 
 
 def _facts(rows: Mapping[str, str]) -> str:

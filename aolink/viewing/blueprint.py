@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 
 import rerun.blueprint as rrb
 
@@ -49,7 +49,7 @@ class _Layout:
         self.sides = [drawn, *([compared] if compared else [])]
         self.names = drawn.estimators
         self.truth = drawn.has(f"{entities.PATH}/truth")
-        self.states = min(drawn.rig.plant.n_states, MOST_STATES)
+        self.states = range(1, 1 + min(drawn.rig.plant.n_states, MOST_STATES))
 
     def all(self) -> list[rrb.Container | rrb.BlueprintPanel | rrb.SelectionPanel | rrb.TimePanel]:
         layout: rrb.Container
@@ -135,59 +135,41 @@ class _Layout:
     def paths(self) -> View:
         """A tab for each estimator with its band, with the estimator of the highest rank in front, and a tab with all
         of them. In a layout that is about one exposure they are under each other, by rank."""
-        truth, names = self.path("truth") if self.truth else [], self.names
+        names, truth = self.names, [f"{entities.PATH}/truth/**"] if self.truth else []
         unit = f"({SLOPES}{', y fainter' if len(self.drawn.labels) > 1 else ''})"
         tabs: list[View] = [
-            self.lines(
-                f"Path, {name}, 95 % band {unit}",
-                [*truth, *self.path(name), entities.band(f"{entities.PATH}/{name}")], window=not self.alone,
-            )
+            self.lines(f"Path, {name}, 95 % band {unit}", [*truth, f"{entities.PATH}/{name}/**"], window=not self.alone)
             for name in reversed(names)
-        ]  # fmt: skip
+        ]
         if self.about is not None and names:
             return rrb.Vertical(contents=tabs[::-1])
         if not truth and not names:
             return rrb.TextDocumentView(origin=entities.SESSION, name="No paths: no estimates, no truth")
-        everyone = [path for name in names for path in self.path(name)]
-        return _tabs([*tabs, self.lines(f"Path, all {unit}", [*truth, *everyone], window=not self.alone)])
-
-    def path(self, name: str, what: str = entities.PATH) -> list[str]:
-        """A path's line with its percentiles, or its range."""
-        path = f"{what}/{name}"
-        if self.drawn.swinging.get(path):
-            return [entities.extremes(path)]
-        has_band = what == entities.PATH and name != "truth"
-        return entities.with_percentiles([entities.mean(path) if has_band else path])
+        bands = [entities.band(f"{entities.PATH}/{name}") for name in names]
+        everyone = self.lines(f"Path, all {unit}", [f"{entities.PATH}/**"], bands, window=not self.alone)
+        return _tabs([*tabs, everyone])
 
     def errors(self) -> list[View]:
         if not self.truth or not self.names:
             return []
-        every_step = [path for name in self.names for path in self.path(name, entities.PATH_ERROR)]
-        rms = [f"{entities.RMS_ERROR}/{name}" for name in self.names]
-        ends = [[entities.end_error(i, name) for name in self.names] for i in range(self.states)]
+        ends = [(f"End state x{i} error (plant's units)", f"{entities.END_ERROR}/x{i}/**") for i in self.states]
         views = [
-            self.lines(f"Path error, RMS an exposure ({SLOPES})", entities.with_percentiles(rms)),
-            self.lines(f"Path error at fast steps ({SLOPES})", every_step, window=True),
-            *(
-                self.lines(f"End state x{i + 1} error (plant's units)", entities.with_percentiles(shown))
-                for i, shown in enumerate(ends)
-            ),
+            self.lines(f"Path error, RMS an exposure ({SLOPES})", [f"{entities.RMS_ERROR}/**"]),
+            self.lines(f"Path error at fast steps ({SLOPES})", [f"{entities.PATH_ERROR}/**"], window=True),
+            *(self.lines(title, [path]) for title, path in ends),
         ]
         return [_tabs(views)]
 
     def nis(self) -> list[View]:
-        names = [name for name in self.names if self.drawn.has(entities.nis_values(name))]
-        shown = [*entities.with_percentiles(map(entities.nis_values, names)), *map(entities.nis_bounds, names)]
-        return [self.lines(f"NIS (no unit) with its {NIS_COVERAGE:.0%} bounds", shown)] if shown else []
+        title = f"NIS (no unit) with its {NIS_COVERAGE:.0%} bounds"
+        return [self.lines(title, [f"{entities.NIS}/**"])] if self.drawn.has(entities.NIS) else []
 
     def all_states(self) -> list[View]:
         tabs = []
-        for where in ("end", "start"):
-            for i in range(self.states if self.names else 0):
-                shown = [entities.state(where, i, "truth")] if self.truth else []
-                shown += [entities.mean(entities.state(where, i, name)) for name in self.names]
-                shown = [*entities.with_percentiles(shown), entities.band(entities.state(where, i, self.names[-1]))]
-                tabs.append(self.lines(f"{where.capitalize()} state x{i + 1} (plant's units)", shown))
+        for where, i in [(where, i) for where in ("end", "start") for i in self.states if self.names]:
+            path = f"{entities.STATE}/{where}/x{i}"
+            bands = [entities.band(f"{path}/{name}") for name in self.names[:-1]]
+            tabs.append(self.lines(f"{where.capitalize()} state x{i} (plant's units)", [f"{path}/**"], bands))
         return [_tabs(tabs)] if tabs else []
 
     def maps(self) -> list[View]:
@@ -208,7 +190,7 @@ class _Layout:
 
     def devices(self) -> list[View]:
         """The devices, and the texts."""
-        views = self.legended({"Mirror input (mirror's units)": entities.with_percentiles(entities.INPUTS)})
+        views = self.legended({"Mirror input (mirror's units)": [f"{entities.COMMAND}/**", f"{entities.APPLIED}/**"]})
         controls: dict[str, list[str]] = {}
         for name, (title, *_) in CONTROLS.items():
             controls.setdefault(title, []).append(f"{entities.CONTROL}/{name}")
@@ -245,14 +227,20 @@ class _Layout:
         tabs = [self.lines(title, shown, legend=True) for title, shown in there.items() if shown]
         return [_tabs(tabs)] if tabs else []
 
-    def lines(self, name: str, shown: list[str], *, window: bool = False, legend: bool = False) -> rrb.TimeSeriesView:
+    def lines(
+        self, name: str, shown: list[str], hidden: Sequence[str] = (), *, window: bool = False, legend: bool = False
+    ) -> rrb.TimeSeriesView:
         """A plot over time: of the whole session, or of `PATH_WINDOW` exposures about the time cursor; in a layout that
-        is about one exposure, of that length.
+        is about one exposure, of that length. Beside each path that is shown is its twin of the recording compared.
 
         A ``legend`` stands above the lines; without one, the profile's key has the colours.
         """
         corner = rrb.PlotLegend(rrb.Corner2D.LeftTop, visible=legend)
-        expressions = [f"+ /{path}" for path in self.with_compared(shown)]
+        expressions = [f"+ /{path}" for path in shown]
+        if self.compared is not None:
+            theirs = [path for path in shown if self.compared.has(path.removesuffix("/**"))]
+            expressions += [f"+ /{self.compared.root}{path}" for path in theirs]
+        expressions += [f"- /{each.root}{path}" for each in self.sides for path in hidden]
         if not window:
             whole = rrb.TimeRange(rrb.TimeRangeBoundary.infinite(), rrb.TimeRangeBoundary.infinite())
             axis_x = rrb.archetypes.TimeAxis(view_range=whole)
@@ -269,22 +257,14 @@ class _Layout:
 
     def room_above(self, shown: list[str]) -> rrb.ScalarAxis | None:
         """An axis with room above the lines for a legend of them all; None where their extents are not known yet."""
-        extents = self.drawn.extents
-        found = [ends for path, ends in extents.items() if any(_names(each, path) for each in shown)]
+        chosen = tuple(path.removesuffix("**") for path in shown)
+        found = [ends for path, ends in self.drawn.extents.items() if f"{path}/".startswith(chosen)]
         if not found:
             return None
         low, high = min(ends[0] for ends in found), max(ends[1] for ends in found)
         span = high - low or abs(high) or 1.0
         share = min(_LEGEND_MOST, _LEGEND_ROW * (len(found) + 1))
         return rrb.ScalarAxis(range=(low - 0.05 * span, low + span / (1 - share)))
-
-    def with_compared(self, paths: Iterable[str]) -> list[str]:
-        """The paths, and beside each its twin of the recording that is compared."""
-        every = list(paths)
-        if self.compared is None:
-            return every
-        there, root = self.compared.extents, self.compared.root
-        return every + [root + path for path in every if any(_names(path, each) for each in there)]
 
 
 def _tabs(views: Sequence[View]) -> View:
@@ -297,8 +277,3 @@ def _picture(
     (top, left) = corner
     bounds = rrb.VisualBounds2D(x_range=(left, left + columns), y_range=(top, top + rows))
     return rrb.Spatial2DView(name=name, contents=[f"+ /{root}{path}" for path in paths], visual_bounds=bounds)
-
-
-def _names(expression: str, path: str) -> bool:
-    """Whether an expression of a view selects a path."""
-    return path == expression or (expression.endswith("/**") and path.startswith(expression[:-2]))

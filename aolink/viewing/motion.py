@@ -16,9 +16,9 @@ from aolink.exposure import Exposure, Truth, residual_rms
 from aolink.gathered import BAND, NIS_COVERAGE, extremes, hides_swings, nis_bounds
 from aolink.numerics.arrays import FloatArray
 from aolink.series import Step
-from aolink.viewing import entities
 from aolink.viewing.camera import colour_of
-from aolink.viewing.entities import ESTIMATE, PATH, PATH_ERROR, RESIDUAL, RMS_ERROR
+from aolink.viewing.entities import END_ERROR, ESTIMATE, NIS, PATH, PATH_ERROR, RESIDUAL, RMS_ERROR, STATE, mean
+from aolink.viewing.entities import band as band_of
 from aolink.viewing.series import Drawing, Style, send_axes, send_line
 from aolink.viewing.timebase import Timebase
 
@@ -68,7 +68,7 @@ def log_estimates(drawing: Drawing, timebase: Timebase, name: str, steps: Sequen
         send_axes(drawing, f"{RMS_ERROR}/{name}", times, rms, style, drawing.outputs, drawing.labels)
         ended = np.array([estimate.end_state - truth.end_state for _, estimate, truth in judged])
         for i in range(min(ended.shape[2], MOST_STATES)):
-            _send_axes(drawing, entities.end_error(i, name), timebase.at_ends(exposures), ended[:, :, i], style)
+            _send_axes(drawing, f"{END_ERROR}/x{i + 1}/{name}", timebase.at_ends(exposures), ended[:, :, i], style)
 
 
 def log_residual(
@@ -102,13 +102,13 @@ def _log_nis(drawing: Drawing, timebase: Timebase, measured: Sequence[tuple[Expo
         return
     name, exposures = style.name, [exposure for exposure, _ in measured]
     values = np.array([each.nis for _, each in measured])
-    _send_axes(drawing, entities.nis_values(name), timebase.at_starts(exposures), values, style)
+    _send_axes(drawing, f"{NIS}/{name}/value", timebase.at_starts(exposures), values, style)
     bounds = np.array([nis_bounds(each.innovation.shape[1]) for _, each in measured])
     # A constant is a line between its ends.
     kept = sorted({0, len(bounds) - 1}) if (bounds == bounds[0]).all() else range(len(bounds))
     times, label = timebase.at_starts([exposures[k] for k in kept]), f"{name}, {NIS_COVERAGE:.0%} bounds"
     thin = replace(style, name=label, width=1.0, alpha=140)
-    send_line(drawing, entities.nis_bounds(name), times, bounds[list(kept)], thin)
+    send_line(drawing, f"{NIS}/{name}/bounds", times, bounds[list(kept)], thin)
 
 
 def _send_path(
@@ -142,11 +142,11 @@ def _send_path(
     times, values = timebase.every_step(np.concatenate(steps)), np.concatenate(lines)
     if swings:
         labels = [f"{label}, {end}" for label in drawing.labels for end in ("highest", "lowest")]
-        send_line(drawing, entities.extremes(path), times, values, replace(style, width=1.2), labels)
+        send_line(drawing, f"{path}/range", times, values, replace(style, width=1.2), labels)
     else:
-        send_axes(drawing, entities.mean(path) if band else path, times, values, style, outputs, drawing.labels)
+        send_axes(drawing, mean(path) if band else path, times, values, style, outputs, drawing.labels)
     if band:
-        send_line(drawing, entities.band(path), times, np.concatenate(limits), band)
+        send_line(drawing, band_of(path), times, np.concatenate(limits), band)
 
 
 def _line(
@@ -185,12 +185,12 @@ def _send_states(
     for where, times in (("start", timebase.at_starts(exposures)), ("end", timebase.at_ends(exposures))):
         states = np.array([getattr(each, f"{where}_state") for _, each in known])
         for i in range(min(states.shape[2], MOST_STATES)):
-            path = entities.state(where, i, name)
-            _send_axes(drawing, entities.mean(path) if band else path, times, states[:, :, i], style)
+            path = f"{STATE}/{where}/x{i + 1}/{name}"
+            _send_axes(drawing, mean(path) if band else path, times, states[:, :, i], style)
             if band:
                 variance = np.array([getattr(each, f"{where}_covariance")[axes, i, i] for _, each in known])
                 limits = _about(states[:, axes, i], BAND * np.sqrt(variance))
-                send_line(drawing, entities.band(path), times, limits, band)
+                send_line(drawing, band_of(path), times, limits, band)
 
 
 def _send_axes(drawing: Drawing, path: str, times: Sequence[rr.TimeColumn], values: FloatArray, style: Style) -> None:

@@ -15,7 +15,6 @@ from numpy.typing import ArrayLike, NDArray
 from aolink.colours import Colour
 from aolink.numerics.arrays import IntArray
 from aolink.rig import Rig
-from aolink.viewing.entities import percentiles
 from aolink.viewing.palette import STATUS_COLOURS
 from aolink.viewing.timebase import Timebase
 
@@ -155,7 +154,7 @@ def send_axes(
     if columns.shape[1] > len(shown):
         words = f"{style.name}, {'/'.join(map(str, PERCENTILES))} % of {columns.shape[1]}"
         spread = Style(words, style.colour, 0.8, 130, style.steps)
-        send_line(drawing, percentiles(path), times, np.percentile(columns, PERCENTILES, axis=1).T, spread)
+        send_line(drawing, f"{path}/axes", times, np.percentile(columns, PERCENTILES, axis=1).T, spread)
 
 
 def send_states(drawing: Drawing, path: str, timebase: Timebase, states: Sequence[tuple[int, str]]) -> None:

@@ -55,17 +55,21 @@ def without_breaks(values: np.ndarray) -> np.ndarray:
 
 
 def absent_from_views(path: Path) -> list[str]:
-    """Entities that a view names and the file does not hold; percentiles are only there with many axes."""
+    """Entities that a view names and the file does not hold, or of which nothing is below one that it names."""
     entities = read_rrd(path)
-    queries = [
-        expression
+    queries = {
+        expression.removeprefix("+ ").removeprefix("- ")
         for view in read_blueprint(path).values()
         for row in view.get("ViewContents:query", [])
         for expression in row
-    ]
-    exact = [q.removeprefix("+ ") for q in queries if "*" not in q and "$" not in q]
-    assert len(exact) > 2
-    return [name for name in exact if not name.endswith("/axes") and name not in entities]
+        if "$" not in expression
+    }
+    assert len(queries) > 2
+    known = [f"{entity}/" for entity in entities]
+    return sorted(
+        name for name in queries
+        if not any(each == f"{name}/" or (name.endswith("/**") and each.startswith(name[:-2])) for each in known)
+    )  # fmt: skip
 
 
 def steps_of(recording: StandIn, estimates: Sequence[Estimate]) -> list[Step]:
