@@ -15,7 +15,7 @@ import numpy as np
 from aolink.estimation.estimate import Estimate, Status
 from aolink.estimation.frames.measure import profiles_of
 from aolink.exposure import Exposure, Truth
-from aolink.numerics.arrays import FloatArray
+from aolink.numerics.arrays import FloatArray, IntArray
 from aolink.numerics.chi_square import chi_square_quantile
 from aolink.optics.camera import to_density
 from aolink.optics.frame import spot_windows
@@ -34,7 +34,7 @@ NIS_COVERAGE = 0.95
 """Probability that a consistent estimator's NIS lies inside the bounds drawn."""
 SLOPES, PER_SLOPE = "slope units", "1/slope unit"
 """Units of a position, and of a density over positions."""
-LATENCY = "since exposure end (ms)"
+LATENCY = "since exposure end"
 LATENCY_STEPS = {
     "first_byte_ns": "first byte",
     "complete_ns": "frame complete",
@@ -165,6 +165,20 @@ def hides_swings(path: FloatArray, count: int) -> bool:
     places = np.linspace(0, len(path) - 1, min(count, len(path)))
     drawn = np.interp(np.arange(len(path)), places, path[places.astype(int)])
     return bool(np.std(path - drawn) > _ENVELOPE_FROM * np.std(path))
+
+
+def some_rows(values: FloatArray, count: int) -> IntArray:
+    """The rows to keep of curves, (rows, curves), that have more than ``count`` rows: the extremes of each part, and
+    the ends; NaN is no extreme."""
+    rows, curves = values.shape
+    if rows <= count:
+        return np.arange(rows)
+    size = -(-rows // max(1, count // (2 * curves)))
+    known = np.where(np.isfinite(values), values, np.nanmean(values) if np.isfinite(values).any() else 0.0)
+    parts = np.pad(known, ((0, -rows % size), (0, 0)), mode="edge").reshape(-1, size, curves)
+    starts = size * np.arange(len(parts))[:, None]
+    kept = [np.minimum(starts + find(parts, axis=1), rows - 1).ravel() for find in (np.argmin, np.argmax)]
+    return np.unique(np.concatenate([[0, rows - 1], *kept]))
 
 
 @lru_cache(maxsize=64)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from aolink.errors import ExportError
-from aolink.gathered import REFUSED
+from aolink.gathered import LATENCY, REFUSED
 from aolink.numerics.arrays import FloatArray
 from aolink.plotting.overview import Overview, need_exposures
 from aolink.plotting.session import thinned, time_label
@@ -71,7 +71,7 @@ def plot_latency(view: Overview, axes: Axes | None = None, *, unit: TimeUnit = "
     for name, points in lines.items():
         if len(points):
             axes.plot(*thinned(*points.T), "--" if name.endswith(" takes") else "-", linewidth=0.8, label=name)
-    axes.set(xlabel=time_label(unit), ylabel="after the exposure's end, or taken (ms)", yscale="log")
+    axes.set(xlabel=time_label(unit), ylabel=f"{LATENCY}, or taken (ms)", yscale="log")
     axes.grid(alpha=0.3)
     legend_above(axes, 3)
     return axes

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from aolink.errors import ExportError
 from aolink.estimation.estimate import Status
-from aolink.gathered import NIS_COVERAGE, PER_SLOPE, SLOPES, limits_of, nis_bounds
+from aolink.gathered import NIS_COVERAGE, PER_SLOPE, SLOPES, limits_of, nis_bounds, some_rows
 from aolink.numerics.arrays import FloatArray
 from aolink.plotting.overview import Overview, need_exposures, overview
 from aolink.plotting.style import TimeUnit, axes_or_new, colour, colour_bar, figure_or_new, is_narrow, legend_above
@@ -174,9 +174,5 @@ def time_label(unit: TimeUnit) -> str:
 
 def thinned(times: NDArray[Any], values: FloatArray) -> tuple[FloatArray, FloatArray]:
     """A curve of at most some thousand points that shows the same ranges: it has the extremes of each run of points."""
-    if len(times) <= _MOST_POINTS:
-        return np.asarray(times, dtype=np.float64), values
-    runs = np.array_split(np.arange(len(times)), _MOST_POINTS // 2)
-    filled = np.where(np.isfinite(values), values, np.nanmean(values) if np.isfinite(values).any() else 0.0)
-    chosen = np.unique([run[pick] for run in runs for pick in (filled[run].argmin(), filled[run].argmax())])
+    chosen = some_rows(values[:, None], _MOST_POINTS)
     return np.asarray(times, dtype=np.float64)[chosen], values[chosen]

@@ -195,7 +195,7 @@ class _Layout:
         for name, (title, *_) in CONTROLS.items():
             controls.setdefault(title, []).append(f"{entities.CONTROL}/{name}")
         views += self.legended(controls)
-        views += self.legended({f"Latency {LATENCY}": [f"{entities.LATENCY}/**"]})
+        views += self.legended({f"Latency {LATENCY} (ms)": [f"{entities.LATENCY}/**"]})
         faulty = self.drawn.has(entities.FAULTS)
         devices = [f"{entities.FAULTS}/{device}" for device in ("camera", "mirror")]
         lost = f"Lost {'and faulty ' if faulty else ''}since start (count)"

@@ -9,12 +9,12 @@ import numpy as np
 import rerun as rr
 
 from aolink.colours import estimator_colour
-from aolink.gathered import LATENCY_STEPS, SLOPES
+from aolink.gathered import LATENCY_STEPS, SLOPES, some_rows
 from aolink.recording import schemas_pb2, topics
 from aolink.viewing import entities
 from aolink.viewing.entities import CLOCK, CONTROL, ESTIMATION, FAULTS, LATENCY, LOG, LOST, RECEIVED, ROUND_TRIP, STATUS
 from aolink.viewing.palette import APPLIED, COMMANDED, series_colour
-from aolink.viewing.series import Drawing, Style, send_axes, send_line, send_states, some_rows
+from aolink.viewing.series import Drawing, Style, send_axes, send_line, send_states
 from aolink.viewing.timebase import Timebase
 from aolink.wire.messages_pb2 import Applied
 

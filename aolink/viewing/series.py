@@ -13,7 +13,6 @@ import rerun as rr
 from numpy.typing import ArrayLike, NDArray
 
 from aolink.colours import Colour
-from aolink.numerics.arrays import IntArray
 from aolink.rig import Rig
 from aolink.viewing.palette import STATUS_COLOURS
 from aolink.viewing.timebase import Timebase
@@ -168,29 +167,6 @@ def send_states(drawing: Drawing, path: str, timebase: Timebase, states: Sequenc
     drawing.log(path, rr.StateConfiguration(values=names, labels=names, colors=list(STATUS_COLOURS.values())))
     columns = rr.StateChange.columns(state=[state for _, state in changed])
     drawing.send_columns(path, timebase.at_steps([step for step, _ in changed]), columns)
-
-
-def some_rows(values: NDArray[np.float64], count: int) -> IntArray:
-    """The rows to keep of lines with more than ``count`` rows: those of the extremes of each part, and the ends.
-
-    Parameters
-    ----------
-    values:
-        (rows, lines).
-    """
-    rows, lines = values.shape
-    if rows <= count:
-        return np.arange(rows)
-    parts = max(1, count // (2 * lines))
-    length, longer = divmod(rows, parts)
-    kept = [np.array([0, rows - 1])]
-    # All parts of one length at once: the first ones have a row more.
-    for first, of, size in ((0, longer, length + 1), (longer * (length + 1), parts - longer, length)):
-        if of:
-            some = values[first : first + of * size].reshape(of, size, lines)
-            starts = first + size * np.arange(of)[:, None]
-            kept += [(starts + find(some, axis=1)).ravel() for find in (np.argmin, np.argmax)]
-    return np.unique(np.concatenate(kept))
 
 
 def send_pictures(
