@@ -181,8 +181,7 @@ class _Gathered:
         self.spans: list[tuple[int, int]] = []
         self.blur: list[FloatArray] = []
         self.paths: dict[str, list[FloatArray]] = {name: [] for name in ("truth", *names)}
-        """Points, low and high of each column, (3, points)."""
-        self.swings: dict[str, list[bool]] = {name: [] for name in self.paths}
+        """Points, low and high of each column, and whether the path swings more than its points show, (4, points)."""
 
     def beside(self, also: Also) -> Also:
         """``also``, with the function that takes the messages about times."""
@@ -244,13 +243,13 @@ class _Gathered:
         for name, columns in self.paths.items():
             known = [each.paths[name] for each in self.column if name in each.paths]
             if not known:
-                columns.append(np.full((3, self.points), np.nan))
+                columns.append(np.full((4, self.points), np.nan))
                 continue
             path = np.concatenate(known)
             path = np.resize(path, max(len(path), self.points))  # one of fewer steps than points
             some = np.linspace(0, len(path) - 1, self.points).astype(int)
-            columns.append(np.stack([path[some], *extremes(path, self.points)]))
-            self.swings[name].append(hides_swings(path, self.points))
+            swings = np.full(self.points, hides_swings(path, self.points), dtype=np.float64)
+            columns.append(np.stack([path[some], *extremes(path, self.points), swings]))
         self.column = []
 
     def result(self) -> Overview:
@@ -262,10 +261,11 @@ class _Gathered:
         steps = n_steps[0] if len(n_steps) else 1
         places = np.linspace(0, (steps - 1) / steps, self.points) if self.points > 1 else np.array([0.5])
         paths = {}
-        for name in [name for name, swings in self.swings.items() if swings]:
-            points, low, high = np.array(self.paths[name]).swapaxes(0, 1)
-            envelope = self.stride > 1 or float(np.mean(self.swings[name])) > 0.5
-            paths[name] = Paths(points=points, places=places, low=low, high=high, envelope=envelope)
+        for name, columns in self.paths.items():
+            points, low, high, swings = np.array(columns).reshape(-1, 4, self.points).swapaxes(0, 1)
+            if np.isfinite(swings).any():
+                envelope = self.stride > 1 or float(np.nanmean(swings)) > 0.5
+                paths[name] = Paths(points=points, places=places, low=low, high=high, envelope=envelope)
         words = (*REFUSED.values(), NO_TIME)
         kinds = [*FRAME_INCIDENTS, *(f"{name}: {word}" for name in self.names for word in words)]
         since = first_steps[0] if len(first_steps) else 0

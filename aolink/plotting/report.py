@@ -111,9 +111,6 @@ class _Session:
         # Damage is known after all of it was read.
         self.facts = recording_facts(recording, None if self.view is None else counted)
 
-    def title(self) -> str:
-        return f"<h3>{escape(self.name)}</h3>"
-
     def drawn(self, size: tuple[float, float], caption: str, draw: Callable[[Overview, Figure], object]) -> str:
         """A figure with its caption; where it cannot be drawn, the reason."""
         if self.view is None:
@@ -222,7 +219,7 @@ def _page(sessions: Sequence[_Session]) -> str:
         parts.append("<h2>Each of them</h2>")
         for each in sessions:
             figures = _row([each.over_session("Blur and paths"), each.scores()])
-            parts += [each.title(), *map(_note, each.lacks()), figures]
+            parts += [f"<h3>{escape(each.name)}</h3>", *map(_note, each.lacks()), figures]
     else:
         parts.extend(_sections(sessions))
     body = "\n".join(parts)
@@ -238,7 +235,9 @@ def _sections(sessions: Sequence[_Session]) -> Iterable[str]:
     one = len(sessions) == 1
 
     def beside(title: str, give: Callable[[_Session], str]) -> str:
-        return f"<h2>{title}</h2>" + _row([("" if one else each.title()) + give(each) for each in sessions])
+        return f"<h2>{title}</h2>" + _row(
+            [("" if one else f"<h3>{escape(each.name)}</h3>") + give(each) for each in sessions]
+        )
 
     yield beside("The session", lambda each: each.what_it_was() + "".join(map(_note, each.lacks())))
     yield beside("The estimates", _Session.scores)

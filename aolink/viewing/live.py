@@ -10,7 +10,6 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from aolink.colours import by_rank
-from aolink.errors import ViewerError
 from aolink.estimation import Estimate
 from aolink.exposure import Exposure
 from aolink.restoration import deblur
@@ -20,7 +19,7 @@ from aolink.viewing import entities, scene
 from aolink.viewing.blueprint import blueprint
 from aolink.viewing.camera import HISTORY
 from aolink.viewing.feed import fed
-from aolink.viewing.process import has_display, window
+from aolink.viewing.process import check_display, window
 from aolink.viewing.sender import Sender
 from aolink.viewing.series import Drawing
 
@@ -79,7 +78,6 @@ def live_viewer(
     ViewerError
         There is no display, or the viewer does not start.
     """
-    if not has_display():
-        raise ViewerError("there is no display for --view: record or replay without it, then `aolink view --web`")
+    check_display("there is no display for --view: record or replay without it, then `aolink view --web`")
     with window() as server, fed(server) as stream:
         yield LiveView(stream, rig, estimators, true_scene)

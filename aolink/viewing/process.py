@@ -46,15 +46,12 @@ _NO_DRIVER = (
 )
 
 
-def has_display() -> bool:
-    """Whether a window can be opened."""
-    return sys.platform != "linux" or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
-
-
-def check_display() -> None:
+def check_display(
+    instead: str = "there is no display: use `aolink view --web` for a browser, or --screenshot for a picture",
+) -> None:
     """Raise `ViewerError` where a window cannot be opened."""
-    if not has_display():
-        raise ViewerError("there is no display: use `aolink view --web` for a browser, or --screenshot for a picture")
+    if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        raise ViewerError(instead)
 
 
 def open_viewer(rrd_path: str | Path) -> None:
