@@ -11,7 +11,8 @@ import pytest
 import aolink
 from aolink import plotting
 from aolink.errors import ExportError, RecordingError
-from aolink.gathered import extremes, hides_swings, nis_bounds, some_rows
+from aolink.gathered import Blur, extremes, hides_swings, nis_bounds, some_rows
+from aolink.optics.kernel import exposure_density
 from aolink.recording.reader import Recording
 from aolink.recording.reestimate import write_reestimated
 from tests.needs import needed
@@ -101,6 +102,18 @@ def test_a_curve_keeps_the_extremes_of_each_part_and_its_ends(rows: int, curves:
         part = values[first : first + size]
         expected |= {first + int(find(curve)) for curve in part.T for find in (np.nanargmin, np.nanargmax)}
     assert set(kept.tolist()) == expected
+
+
+def test_a_path_predicts_what_the_kernel_makes_of_it() -> None:
+    series = reference("tip-tilt")
+    step = next(series[4:5].steps(["o3"]))
+    blur = Blur.of(series.rig, step, 1)
+    line, path = series.rig.sensor.profile, step.estimates["o3"].path[1]
+    expected = exposure_density(line.kernel, line.edges, path)
+    np.testing.assert_allclose(blur.predicted("o3"), expected, atol=1e-4 * line.peak_density)
+    density, edges = blur.histogram("o3", 0.01)
+    counts = np.histogram(path, edges)[0]
+    np.testing.assert_allclose(density, counts / (0.01 * len(path)))
 
 
 def test_one_exposure_shows_path_histogram_and_profile_on_one_axis_of_position() -> None:
