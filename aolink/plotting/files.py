@@ -37,16 +37,18 @@ class _Figure:
     """Height of the figure as a share of its width."""
     draw: Callable[..., Axes] | None = None
     """Function that draws it from an overview, on axes; None for figures of one exposure, or of the pupil."""
+    narrow: float = 1.5
+    """Its height on a narrow figure, as a multiple."""
 
 
 FIGURES = {
     "blur": _Figure("the camera's blur over the session, and the paths", 0.42, plot_blur),
-    "exposure": _Figure("one exposure: path over blur, its histogram, the intensity profile", 0.40),
+    "exposure": _Figure("one exposure: path over blur, its histogram, the intensity profile", 0.40, narrow=2.6),
     "nis": _Figure("the NIS of each estimator with its bounds", 0.55, plot_nis),
     "errors": _Figure("the error of each estimator's path along the session", 0.55, plot_errors),
     "losses": _Figure("frames and exposures lost, late, gated or skipped, and when", 0.45, plot_losses),
     "latency": _Figure("when each step of the loop was done", 0.55, plot_latency),
-    "pupil": _Figure("maps over the lenslets: light, slopes, blur, NIS", 0.62),
+    "pupil": _Figure("maps over the lenslets: light, slopes, blur, NIS", 0.62, narrow=2.2),
     "scene": _Figure("the picture of one exposure as it came, restored, and at rest", 0.36),
 }
 """Single figures by name."""
@@ -93,34 +95,27 @@ def save_figure(
         raise ExportError(f"there is no figure {what!r}; there are: {', '.join(FIGURES)}")
     if path.suffix.lower() not in FORMATS:
         raise ExportError(f"cannot write {path}: a figure is a {', '.join(FORMATS)} file; give such a name")
-    kind = FIGURES[what]
+    kind, on_plane = FIGURES[what], what == "exposure" and recording.rig.sensor.directions == 2
     with paper():
         figure = new_figure(width_mm, width_mm * kind.height)
         narrow = is_narrow(figure)
-        if narrow:
-            figure.set_figheight(figure.get_figheight() * (2.2 if what == "exposure" else 1.5))
-        if kind.draw is not None:
+        higher = (kind.narrow if narrow else 1.0) * ((1.2 if narrow else 1.5) if on_plane else 1.0)
+        figure.set_figheight(figure.get_figheight() * higher)
+        if what == "pupil":
+            plot_pupil(recording, figure, estimator=by_rank(list(estimators))[-1] if estimators else None)
+        elif kind.draw is not None:
             view = overview(recording, estimators, output=output, progress=progress)
-            if kind.draw is plot_blur:
-                names = None if estimators is None else ["truth", *view.names]
-                plot_blur(view, figure.subplots(), names=names, unit=unit)
-            else:
-                kind.draw(view, figure.subplots(), unit=unit)
-        elif what == "pupil":
-            name = by_rank(list(estimators))[-1] if estimators else None
-            plot_pupil(recording, figure, estimator=name)
+            named = {"names": ["truth", *view.names]} if kind.draw is plot_blur and estimators is not None else {}
+            kind.draw(view, figure.subplots(), unit=unit, **named)
         else:
-            number = exposure
-            if number is None:
+            if exposure is None:
                 view = overview(recording, estimators, progress=progress)
                 need_exposures(view)
-                number = next(iter(view.telling()))
+                exposure = next(iter(view.telling()))
             if what == "scene":
-                plot_scene(recording, number, figure)
+                plot_scene(recording, exposure, figure)
             else:
-                if recording.rig.sensor.directions == 2:
-                    figure.set_figheight(figure.get_figheight() * (1.2 if narrow else 1.5))
-                plot_exposure(recording, number, figure, estimators=estimators, spot=spot, unit=unit)
+                plot_exposure(recording, exposure, figure, estimators=estimators, spot=spot, unit=unit)
         metadata = {key: None for suffix, key in _DATED.items() if suffix == path.suffix.lower()}
         with writing(path, overwrite=overwrite, sources=recording.files, error=ExportError) as partial:
             figure.savefig(partial, format=path.suffix.lower()[1:], metadata=metadata)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from functools import lru_cache, partial
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -12,36 +12,21 @@ import numpy as np
 from aolink.colours import by_rank
 from aolink.errors import ExportError
 from aolink.estimation.estimate import Status
-from aolink.estimation.frames.measure import profiles_of
 from aolink.estimation.score import Score, Scorer
 from aolink.exporting.common import Progress, check_frame, no_progress
 from aolink.exposure import Exposure
+from aolink.gathered import FRAME_INCIDENTS, LATENCY_STEPS, NO_TIME, REFUSED, Blur, extremes, hides_swings, incidents_of
 from aolink.numerics.arrays import FloatArray, IntArray
-from aolink.numerics.chi_square import chi_square_quantile
 from aolink.numerics.rms import rms
-from aolink.optics.camera import to_density
-from aolink.optics.sensor import BaseSensor, Sensor
-from aolink.plotting.style import TimeUnit, extremes, hides_swings
+from aolink.plotting.style import TimeUnit
 from aolink.recording import topics
 from aolink.recording.schemas_pb2 import Estimation, Latency
 from aolink.series import NOTHING, Also, Series, Step
 
-NIS_COVERAGE = 0.95
-"""Probability that a consistent estimator's NIS lies inside the bounds drawn."""
 _COLUMNS = 1500
 """Columns of the blur over a session: a longer session has several exposures in a column."""
 _POINTS = 17
 """Points of a path within its exposure."""
-_KERNELS = 4.0
-"""The drawn field reaches this many of the kernel's standard deviations beyond the paths."""
-LATENCY_STEPS = (
-    ("first_byte_ns", "first byte"),
-    ("complete_ns", "frame complete"),
-    ("estimated_ns", "estimated"),
-    ("command_sent_ns", "command sent"),
-    ("command_acknowledged_ns", "acknowledged"),
-)
-"""Fields of a Latency in the order in which they happen, and their names."""
 _NONE = -1
 """The number instead of a status where there is no estimate."""
 
@@ -74,10 +59,6 @@ class Overview:
     frame_ids: IntArray
     first_steps: IntArray
     n_steps: IntArray
-    missing: FloatArray
-    """Share of the frame's pixels that never came, (n,)."""
-    assumed: IntArray
-    """Steps of each exposure whose input the mirror did not report, (n,)."""
     moved: FloatArray
     """Motion of the spots: RMS of the path about its mean, slope units, (n,), from the truth or from the last name's
     estimates."""
@@ -94,8 +75,8 @@ class Overview:
     measurements: dict[str, int]
     """Number of measurements of an estimator for an axis."""
     scores: dict[str, Score]
-    skipped: dict[str, IntArray]
-    """First steps of the exposures that an estimator had no time for in the session, by estimator."""
+    incidents: dict[str, FloatArray]
+    """What went wrong: fast steps, from the first exposure on, by the kinds of `incidents_of`."""
     timings: dict[str, list[tuple[int, float]]]
     """When each step of the loop was done, after the end of its exposure, and how long estimates took: frame ids and
     ms, by name."""
@@ -115,38 +96,29 @@ class Overview:
         """First step of each exposure, from that of the first one on, (n,)."""
         return self.first_steps - self.first_steps[:1]
 
-    @property
-    def frames_lost(self) -> IntArray:
-        """Frames lost between each exposure and the one before it, (n,)."""
-        return np.asarray(np.maximum(np.diff(self.frame_ids, prepend=self.frame_ids[:1] - 1) - 1, 0))
-
     def scale(self, unit: TimeUnit) -> float:
         """The length of a fast step in a unit."""
         return self.series.rig.timing.fast_step_s if unit == "s" else 1.0
 
     def telling(self) -> dict[int, str]:
         """The most telling exposures, by number, each with the reason; fewer where one exposure has several reasons."""
-        reasons: dict[int, str] = {}
-
-        def tell(number: int, why: str) -> None:
-            reasons[number] = f"{reasons[number]}; {why}" if number in reasons else why
-
+        reasons: dict[int, list[str]] = {}
         if np.isfinite(self.moved).any():
-            tell(int(np.nanargmax(self.moved)), "the largest blur")
+            reasons.setdefault(int(np.nanargmax(self.moved)), []).append("the largest blur")
         if np.isfinite(self.apart).any():
-            against = "the truth" if self.errors else f"{self.names[0]}"
-            tell(int(np.nanargmax(self.apart)), f"{self.names[-1]} is furthest from {against}")
+            why = f"{self.names[-1]} is furthest from {'the truth' if self.errors else self.names[0]}"
+            reasons.setdefault(int(np.nanargmax(self.apart)), []).append(why)
         refused = [
             (int(np.flatnonzero(bad)[0]), name)
             for name, status in self.status.items()
-            if (bad := (status == Status.GATED) | (status == Status.DIVERGED)).any()
+            if (bad := np.isin(status, (Status.GATED, Status.DIVERGED))).any()
         ]
         if refused:
             number, name = min(refused)
-            tell(number, f"the first that was gated, by {name}")
+            reasons.setdefault(number, []).append(f"the first that was gated, by {name}")
         if not reasons and len(self):
-            tell(0, "the first")
-        return reasons
+            reasons[0] = ["the first"]
+        return {number: "; ".join(why) for number, why in reasons.items()}
 
 
 def overview(
@@ -195,22 +167,21 @@ class _Gathered:
 
     def __init__(self, series: Series, names: list[str], output: int) -> None:
         self.series, self.names, self.output = series, names, output
-        self.axis = output // series.rig.plant.n_outputs
         self.stride = max(1, -(-len(series) // _COLUMNS))
-        self.facts: list[tuple[int, int, int, float, int]] = []
-        self.moved: list[float] = []
-        self.apart: list[float] = []
-        self.errors: dict[str, list[float]] = {name: [] for name in names}
-        self.status: dict[str, list[int]] = {name: [] for name in names}
-        self.nis: dict[str, list[tuple[float, float]]] = {name: [] for name in names}
+        self.points = _POINTS if self.stride == 1 else 1
+        self.facts: list[tuple[int, int, int, float, float]] = []
+        self.of_names: list[list[tuple[float, float, float, float]]] = []
+        """Of each exposure and estimator: status, NIS of the output's axis, mean NIS, error."""
         self.measurements: dict[str, int] = {}
         self.scorers = {name: Scorer() for name in names}
-        self.skipped: dict[str, list[int]] = {name: [] for name in names}
+        self.incidents: dict[str, list[int]] = {}
         self.timings: dict[str, list[tuple[int, float]]] = {}
-        self.column: list[tuple[Exposure, dict[str, FloatArray]]] = []
+        self.last: Exposure | None = None
+        self.column: list[Blur] = []
         self.spans: list[tuple[int, int]] = []
         self.blur: list[FloatArray] = []
-        self.paths: dict[str, list[tuple[FloatArray, FloatArray, FloatArray, bool]]] = {}
+        self.paths: dict[str, list[FloatArray]] = {name: [] for name in ("truth", *names)}
+        """Points, low and high of each column, and whether the path swings more than its points show, (4, points)."""
 
     def beside(self, also: Also) -> Also:
         """``also``, with the function that takes the messages about times."""
@@ -222,7 +193,7 @@ class _Gathered:
             before(recorded)
         message = recorded.message
         if isinstance(message, Latency):
-            for key, name in LATENCY_STEPS:
+            for key, name in LATENCY_STEPS.items():
                 if (done := getattr(message, key)) > 0:
                     took_ms = (done - message.exposure_end_ns) / 1e6
                     self.timings.setdefault(name, []).append((message.frame_id, took_ms))
@@ -231,35 +202,32 @@ class _Gathered:
             taken.append((message.frame_id, message.took_ns / 1e6))
 
     def add(self, step: Step) -> None:
-        exposure, estimates = step.exposure, step.estimates
-        for name in step.skipped:
-            self.skipped[name].append(exposure.first_step)
-        missing = 0.0 if exposure.slopes is not None else 1 - float(np.mean(exposure.mask))
-        self.facts.append((exposure.frame_id, exposure.first_step, exposure.n_steps, missing, exposure.inputs_assumed))
-        truth = None if exposure.truth is None else exposure.truth.path
-        known = slice(None) if exposure.truth is None else exposure.truth.known
-        found = {"truth": truth} if truth is not None else {}
+        e, estimates, axis = step.exposure, step.estimates, self.output // self.series.rig.plant.n_outputs
+        for kind, _ in incidents_of(self.last, step):
+            self.incidents.setdefault(kind, []).append(e.first_step)
+        self.last = e
+        truth = None if e.truth is None else e.truth.path
+        known = slice(None) if e.truth is None else e.truth.known
+        rows = []
         for name in self.names:
-            estimate = estimates.get(name)
-            self.status[name].append(_NONE if estimate is None else int(estimate.status))
-            nis, error = (np.nan, np.nan), np.nan
-            if estimate is not None:
+            status, nis, mean_nis, error = float(_NONE), np.nan, np.nan, np.nan
+            if (estimate := estimates.get(name)) is not None:
+                status = float(estimate.status)
                 error = np.nan if truth is None else rms((estimate.path - truth)[known])
-                self.scorers[name].add(exposure, estimate)
-                found[name] = estimate.path
+                self.scorers[name].add(e, estimate)
                 if estimate.innovation.shape[1]:
                     self.measurements[name] = estimate.innovation.shape[1]
                     seen = estimate.nis[estimate.nis > 0]
-                    nis = (float(estimate.nis[self.axis]), float(seen.mean()) if len(seen) else np.nan)
-            self.errors[name].append(error)
-            self.nis[name].append(nis)
-        last = self.names[-1] if self.names else ""
-        about = truth if truth is not None else found.get(last)
-        self.moved.append(np.nan if about is None else rms((about - about.mean(axis=1, keepdims=True))[known]))
-        other = truth if truth is not None else found.get(self.names[0]) if len(self.names) > 1 else None
-        self.apart.append(np.nan if other is None or last not in found else rms((found[last] - other)[known]))
-        shown = {name: path[self.output] for name, path in found.items() if np.isfinite(path[self.output]).all()}
-        self.column.append((exposure, shown))
+                    nis, mean_nis = float(estimate.nis[axis]), float(seen.mean()) if len(seen) else np.nan
+            rows.append((status, nis, mean_nis, error))
+        self.of_names.append(rows)
+        found = [estimates[name].path if name in estimates else None for name in self.names]
+        last = found[-1] if found else None
+        about, other = (last, found[0] if len(found) > 1 else None) if truth is None else (truth, truth)
+        moved = np.nan if about is None else rms((about - about.mean(axis=1, keepdims=True))[known])
+        apart = np.nan if other is None or last is None else rms((last - other)[known])
+        self.facts.append((e.frame_id, e.first_step, e.n_steps, moved, apart))
+        self.column.append(Blur.of(self.series.rig, step, self.output))
         if len(self.column) == self.stride:
             self._close_column()
 
@@ -267,82 +235,49 @@ class _Gathered:
         """Finish a column: the mean blur of its exposures, and the range of their paths."""
         if not self.column:
             return
-        exposures = [exposure for exposure, _ in self.column]
-        self.spans.append((exposures[0].first_step, exposures[-1].first_step + exposures[-1].n_steps))
-        seen = np.stack([profile_density(self.series.rig.sensor, each, self.output) for each in exposures])
+        begin, end = self.column[0].exposure, self.column[-1].exposure
+        self.spans.append((begin.first_step, end.first_step + end.n_steps))
+        seen = np.stack([each.measured for each in self.column])
         counted = np.isfinite(seen).sum(axis=0)
         self.blur.append(np.where(counted > 0, np.nansum(seen, axis=0) / np.maximum(counted, 1), np.nan))
-        for name in ("truth", *self.names):
-            known = [paths[name] for _, paths in self.column if name in paths]
-            lines = self.paths.setdefault(name, [])
-            count = _POINTS if self.stride == 1 else 1
+        for name, columns in self.paths.items():
+            known = [each.paths[name] for each in self.column if name in each.paths]
             if not known:
-                unknown = np.full(count, np.nan)
-                lines.append((unknown, unknown, unknown, False))
+                columns.append(np.full((4, self.points), np.nan))
                 continue
             path = np.concatenate(known)
-            low, high = extremes(path, count)
-            if len(low) < count:  # a path of fewer steps than points
-                low, high = np.resize(low, count), np.resize(high, count)
-            some = np.linspace(0, len(path) - 1, count).astype(int)
-            points = path[some] if count > 1 else path.mean(keepdims=True)
-            lines.append((points, low, high, hides_swings(path, count)))
+            path = np.resize(path, max(len(path), self.points))  # one of fewer steps than points
+            some = np.linspace(0, len(path) - 1, self.points).astype(int)
+            swings = np.full(self.points, hides_swings(path, self.points), dtype=np.float64)
+            columns.append(np.stack([path[some], *extremes(path, self.points), swings]))
         self.column = []
 
     def result(self) -> Overview:
         self._close_column()
-        facts = np.array(self.facts, dtype=np.float64).reshape(-1, 5)
-        frame_ids, first_steps, n_steps, missing, assumed = facts.T
+        frame_ids, first_steps, n_steps, moved, apart = np.array(self.facts, dtype=np.float64).reshape(-1, 5).T
+        of_names = np.array(self.of_names).reshape(len(self.facts), len(self.names), 4).transpose(2, 1, 0)
+        status, nis, mean_nis, errors = (dict(zip(self.names, rows, strict=True)) for rows in of_names)
         spans = np.array(self.spans, dtype=np.float64).reshape(-1, 2)
-        count = _POINTS if self.stride == 1 else 1
+        steps = n_steps[0] if len(n_steps) else 1
+        places = np.linspace(0, (steps - 1) / steps, self.points) if self.points > 1 else np.array([0.5])
         paths = {}
-        for name, lines in self.paths.items():
-            points, low, high = (np.array([line[k] for line in lines]) for k in range(3))
-            if np.isfinite(points).any():
-                swings = [line[3] for line in lines if np.isfinite(line[0]).any()]
-                steps = float(n_steps[0])
-                places = np.linspace(0, (steps - 1) / steps, count) if count > 1 else np.array([0.5])
-                envelope = self.stride > 1 or float(np.mean(swings)) > 0.5
+        for name, columns in self.paths.items():
+            points, low, high, swings = np.array(columns).reshape(-1, 4, self.points).swapaxes(0, 1)
+            if np.isfinite(swings).any():
+                envelope = self.stride > 1 or float(np.nanmean(swings)) > 0.5
                 paths[name] = Paths(points=points, places=places, low=low, high=high, envelope=envelope)
-        truth = any(np.isfinite(each).any() for each in self.errors.values())
-        nis = {name: np.array(values).reshape(-1, 2).T for name, values in self.nis.items()}
+        words = (*REFUSED.values(), NO_TIME)
+        kinds = [*FRAME_INCIDENTS, *(f"{name}: {word}" for name in self.names for word in words)]
+        since = first_steps[0] if len(first_steps) else 0
         return Overview(
             series=self.series, names=self.names, output=self.output, frame_ids=frame_ids.astype(np.int64),
-            first_steps=first_steps.astype(np.int64), n_steps=n_steps.astype(np.int64), missing=missing,
-            assumed=assumed.astype(np.int64), moved=np.array(self.moved), apart=np.array(self.apart),
-            errors={name: np.array(values) for name, values in self.errors.items()} if truth else {},
-            status={name: np.array(values, dtype=np.int64) for name, values in self.status.items()},
-            nis={name: nis[name][0] for name in self.measurements},
-            mean_nis={name: nis[name][1] for name in self.measurements},
-            measurements=self.measurements,
+            first_steps=first_steps.astype(np.int64), n_steps=n_steps.astype(np.int64), moved=moved, apart=apart,
+            errors=errors if any(np.isfinite(each).any() for each in errors.values()) else {},
+            status={name: values.astype(np.int64) for name, values in status.items()},
+            nis={name: nis[name] for name in self.measurements},
+            mean_nis={name: mean_nis[name] for name in self.measurements}, measurements=self.measurements,
             scores={name: scorer.result() for name, scorer in self.scorers.items()},
-            skipped={name: np.array(steps, dtype=np.int64) for name, steps in self.skipped.items()},
-            timings=self.timings,
-            spans=spans - (spans[0, 0] if len(spans) else 0), blur=np.array(self.blur), paths=paths,
+            incidents={kind: np.array(self.incidents[kind]) - since for kind in kinds if kind in self.incidents},
+            timings=self.timings, spans=spans - (spans[0, 0] if len(spans) else 0), blur=np.array(self.blur),
+            paths=paths,
         )  # fmt: skip
-
-
-def profile_density(sensor: BaseSensor, exposure: Exposure, output: int) -> FloatArray:
-    """Intensity density over the positions of one output, one over slope units, (pixels,); NaN where a pixel never
-    came."""
-    found = profiles_of(sensor, exposure.pixels, exposure.mask)
-    return np.where(found.mask[output], to_density(sensor.profile, found.counts[output]), np.nan)
-
-
-def limits_of(line: Sensor, paths: Sequence[FloatArray]) -> tuple[float, float]:
-    """The part of the field that holds the paths and their blur, slope units; the whole field where there are no
-    paths."""
-    known = [path for path in paths if np.isfinite(path).any()]
-    if not known:
-        return line.field
-    reach = _KERNELS * line.kernel.sigma
-    low = max(min(float(np.nanmin(path)) for path in known) - reach, line.field[0])
-    high = min(max(float(np.nanmax(path)) for path in known) + reach, line.field[1])
-    return (low, high) if low < high else line.field
-
-
-@lru_cache(maxsize=64)
-def nis_bounds(degrees_of_freedom: int) -> tuple[float, float]:
-    """The bounds of a consistent estimator's NIS in `NIS_COVERAGE` of the exposures (two-sided)."""
-    tail = (1 - NIS_COVERAGE) / 2
-    return chi_square_quantile(tail, degrees_of_freedom), chi_square_quantile(1 - tail, degrees_of_freedom)

@@ -2,29 +2,28 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from aolink.errors import ExportError
-from aolink.extensions import install_command
+from aolink.exporting.common import needed
 from aolink.files import writing
-from aolink.plotting.exposure import draw_intensity, draw_paths, draw_spot, exposure_with_estimates, paths_of
-from aolink.plotting.overview import limits_of, need_exposures, overview
+from aolink.gathered import PER_SLOPE, SLOPES, Blur
+from aolink.plotting.exposure import draw_intensity, draw_paths, draw_spot, step_of
+from aolink.plotting.overview import need_exposures, overview
 from aolink.plotting.scene import plot_scene
 from aolink.plotting.session import plot_blur
-from aolink.plotting.style import legend_above
+from aolink.plotting.style import MM, legend_above, new_figure
 from aolink.recording.reader import Recording
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import SubFigure
 
-    from aolink.estimation.estimate import Estimate
-    from aolink.exposure import Exposure
-    from aolink.series import Series
+    from aolink.series import Series, Step
 
-    Estimates = dict[str, Estimate]
-
-_SIZE_IN, _DPI = (16.0, 10.0), 110
+_SIZE_MM, _DPI = (16 / MM, 10 / MM), 110
 _NEAR = 4
 """Exposures before and after the one that is explained whose blur is drawn."""
 _STYLE: dict[Any, Any] = {
@@ -49,65 +48,55 @@ def draw_session(series: Series, path: str | Path) -> Path:
     ExportError
         matplotlib is missing, the series has no exposure, or the file cannot be written.
     """
-    try:
-        import matplotlib as mpl
-        from matplotlib.figure import Figure
-    except ImportError:
-        raise ExportError(f"a picture without the viewer needs matplotlib: {install_command('plot')}") from None
+    plain = needed("matplotlib", "plot", "a picture without the viewer")
     view = overview(series)
     need_exposures(view)
     number, why = next(iter(view.telling().items()))
-    exposure, estimates = exposure_with_estimates(series, number, view.names)
-    with mpl.rc_context(_STYLE):
-        figure = Figure(figsize=_SIZE_IN, layout="constrained")
-        figure.suptitle(f"{series.rig.name}: exposure {number}, {why}", x=0.01, ha="left", fontsize=13)
-        shares = [1.0, 1.0, 0.55] if isinstance(series, Recording) and exposure.scene is not None else [1.0, 1.0]
+    step, rig = step_of(series, number, view.names), series.rig
+    with plain.rc_context(_STYLE):
+        figure = new_figure(*_SIZE_MM)
+        figure.suptitle(f"{rig.name}: exposure {number}, {why}", x=0.01, ha="left", fontsize=13)
+        has_scene = isinstance(series, Recording) and step.exposure.scene is not None
+        shares = [1.0, 1.0, 0.55] if has_scene else [1.0, 1.0]
         columns: Any = figure.subfigures(1, len(shares), width_ratios=shares)
         above, below = columns[0].subfigures(2, 1)
-        _draw_blur(above, series, number, exposure, estimates)
-        _draw_profile(below, series, exposure, estimates)
-        _draw_bands(columns[1], series, exposure, estimates)
-        if isinstance(series, Recording) and exposure.scene is not None:
+        if rig.sensor.directions == 2:
+            draw_spot(_axes_titled(above, "The blur of a spot, and the paths through it"), rig, step, 0)
+        else:
+            first = max(0, number - _NEAR)
+            near = overview(series[first : number + _NEAR])
+            axes = _axes_titled(above, f"The blur of {len(near)} exposures, and the paths through it")
+            plot_blur(near, axes)
+            begin, end = near.spans[number - first] * near.scale("s")
+            axes.axvspan(begin, end, fill=False, edgecolor="tab:red", linewidth=1.5)
+        axes = _axes_titled(below, "The intensity profile, and what each path predicts for it")
+        blur = Blur.of(rig, step, 0)
+        draw_intensity(axes, blur)
+        axes.set(xlim=blur.limits, ylim=(0, None), xlabel=f"position ({SLOPES})", ylabel=f"intensity ({PER_SLOPE})")
+        legend_above(axes)
+        _draw_bands(columns[1], series, step)
+        if isinstance(series, Recording) and has_scene:
             plot_scene(series, number, columns[2])
         with writing(Path(path), overwrite=True, error=ExportError) as partial:
             figure.savefig(partial, format="png", dpi=_DPI)
     return Path(path)
 
 
-def _titled(figure: SubFigure, title: str) -> SubFigure:
+def _axes_titled(figure: SubFigure, title: str) -> Axes:
     figure.suptitle(title, x=0.02, ha="left", fontsize=11)
-    return figure
+    return figure.subplots()
 
 
-def _draw_blur(figure: SubFigure, series: Series, number: int, exposure: Exposure, estimates: Estimates) -> None:
-    if series.rig.sensor.directions == 2:
-        spot = _titled(figure, "The blur of a spot, and the paths through it").subplots()
-        draw_spot(spot, series.rig.sensor, exposure, estimates, 0)
-        return
-    first = max(0, number - _NEAR)
-    near = overview(series[first : number + _NEAR])
-    axes = _titled(figure, f"The blur of {len(near)} exposures, and the paths through it").subplots()
-    plot_blur(near, axes)
-    begin, end = near.spans[number - first] * near.scale("s")
-    axes.axvspan(begin, end, fill=False, edgecolor="tab:red", linewidth=1.5)
-
-
-def _draw_profile(figure: SubFigure, series: Series, exposure: Exposure, estimates: Estimates) -> None:
-    axes = _titled(figure, "The intensity profile, and what each path predicts for it").subplots()
-    draw_intensity(axes, series, exposure, estimates, 0)
-    limits = limits_of(series.rig.sensor.profile, list(paths_of(exposure, estimates, [0]).values()))
-    axes.set(xlim=limits, ylim=(0, None), xlabel="position (slope units)", ylabel="intensity (1 / slope unit)")
-    legend_above(axes)
-
-
-def _draw_bands(figure: SubFigure, series: Series, exposure: Exposure, estimates: Estimates) -> None:
+def _draw_bands(figure: SubFigure, series: Series, step: Step) -> None:
+    """Draw a panel for each estimator, with its path and the truth."""
     outputs = list(range(series.rig.sensor.directions))
-    shown = [[name] for name in estimates] or [[]]
+    shown = [[name] for name in step.estimates] or [[]]
     panels: Any = figure.subplots(len(shown), 1, sharex=True, sharey=True, squeeze=False)
     for axes, names in zip(panels[:, 0], shown, strict=True):
-        draw_paths(axes, series, exposure, {name: estimates[name] for name in names}, outputs)
+        only = replace(step, estimates={name: step.estimates[name] for name in names})
+        draw_paths(axes, series.rig, only, outputs)
         by = "".join(f" by {name}, its 95 % band" for name in names)
-        truth = ", and the truth (black)" if exposure.truth is not None else ""
+        truth = ", and the truth (black)" if step.exposure.truth is not None else ""
         axes.set_title(f"The path{by}{truth}", loc="left", fontsize=11)
-        axes.set_ylabel("slope units" if len(outputs) == 1 else "x and y (slope units)")
+        axes.set_ylabel(SLOPES if len(outputs) == 1 else f"x and y ({SLOPES})")
         axes.label_outer()

@@ -12,12 +12,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from aolink.errors import AolinkError, ExportError
-from aolink.estimation.score import Score, score_table
+from aolink.estimation.score import score_table
 from aolink.files import writing
+from aolink.gathered import has_pupil, lacks
 from aolink.plotting.devices import incidents, plot_latency, plot_losses
-from aolink.plotting.exposure import draw_exposure, exposure_with_estimates
+from aolink.plotting.exposure import draw_exposure, step_of
 from aolink.plotting.overview import Overview, overview
-from aolink.plotting.pupil import has_pupil, plot_pupil
+from aolink.plotting.pupil import plot_pupil
 from aolink.plotting.scene import plot_scene
 from aolink.plotting.session import plot_blur, plot_errors, plot_nis
 from aolink.plotting.style import TimeUnit, new_figure, paper
@@ -25,6 +26,7 @@ from aolink.recording import topics
 from aolink.recording.answers import Answers
 from aolink.recording.facts import Counted, recording_facts
 from aolink.recording.reader import Recording
+from aolink.series import Step
 from aolink.units import duration, with_unit
 
 if TYPE_CHECKING:
@@ -109,9 +111,6 @@ class _Session:
         # Damage is known after all of it was read.
         self.facts = recording_facts(recording, None if self.view is None else counted)
 
-    def title(self) -> str:
-        return f"<h3>{escape(self.name)}</h3>"
-
     def drawn(self, size: tuple[float, float], caption: str, draw: Callable[[Overview, Figure], object]) -> str:
         """A figure with its caption; where it cannot be drawn, the reason."""
         if self.view is None:
@@ -143,28 +142,16 @@ class _Session:
 
     def lacks(self) -> list[str]:
         """Sentences about the data that the recording lacks."""
-        recording, said = self.recording, []
-        if self.view is not None and not len(self.view):
-            said.append("It holds no exposure: there is nothing to draw.")
-        if not recording.estimators:
-            said.append("It holds no estimates; `aolink estimate` makes them.")
-        if not recording.has_truth:
-            said.append("The truth is not known, so there are no errors, only NIS.")
-        if topics.COMMAND not in recording.counts:
-            said.append("It holds no commands.")
-        if topics.APPLIED not in recording.counts:
-            said.append("It holds no reports of the mirror; inputs are those commanded, or zero.")
-        if recording.rig.scene is not None and topics.RESTORED_SCENE not in recording.counts:
-            said.append("Its pictures were not restored; `aolink deblur` does that.")
-        if recording.damage:
-            said.append(f"It is damaged: {recording.damage}.")
-        return said
+        empty = self.view is not None and not len(self.view)
+        return (["It holds no exposure: there is nothing to draw."] if empty else []) + lacks(self.recording)
 
     def scores(self) -> str:
         """The table of scores, which `aolink estimate` prints too."""
         if self.view is None or not self.view.scores:
             return _note(self.problem or "No estimates.")
-        return _score_table(self.view.scores)
+        found = score_table(self.view.scores)
+        rows = [[name, *cells] for name, cells in found.rows.items()]
+        return _table(["estimator", *found.heads], rows) + "".join(map(_note, found.notes))
 
     def exposures(self) -> str:
         """The most telling exposures."""
@@ -172,18 +159,18 @@ class _Session:
             return _note(self.problem)
         parts = []
         for number, why in self.view.telling().items():
-            exposure, estimates = exposure_with_estimates(self.recording, number)
+            step = step_of(self.recording, number)
             status = "; ".join(
-                f"{name}: {each.status.name.lower()} ({each.reason})" for name, each in estimates.items() if each.reason
-            )
-            caption = f"Exposure {number} (frame {exposure.frame_id}): {why}. {status}"
+                f"{name}: {each.status.name.lower()} ({each.reason})"
+                for name, each in step.estimates.items() if each.reason
+            )  # fmt: skip
+            caption = f"Exposure {number} (frame {step.exposure.frame_id}): {why}. {status}"
             size = (_WIDE[0], _WIDE[1] * (1.45 if self.recording.rig.sensor.directions == 2 else 1.0))
-
-            def draw(_: Overview, figure: Figure, exposure: Any = exposure, estimates: Any = estimates) -> None:
-                draw_exposure(self.recording, exposure, estimates, figure, unit=self.unit)
-
-            parts.append(self.drawn(size, caption, draw))
+            parts.append(self.drawn(size, caption, partial(self._draw_exposure, step)))
         return "".join(parts) or _note("No exposure.")
+
+    def _draw_exposure(self, step: Step, _: Overview, figure: Figure) -> None:
+        draw_exposure(self.recording.rig, step, figure, unit=self.unit)
 
     def scene(self) -> str:
         """The picture of the first exposure that was restored; without one, of the one that is blurred most."""
@@ -232,7 +219,7 @@ def _page(sessions: Sequence[_Session]) -> str:
         parts.append("<h2>Each of them</h2>")
         for each in sessions:
             figures = _row([each.over_session("Blur and paths"), each.scores()])
-            parts += [each.title(), *map(_note, each.lacks()), figures]
+            parts += [f"<h3>{escape(each.name)}</h3>", *map(_note, each.lacks()), figures]
     else:
         parts.extend(_sections(sessions))
     return html_page(title, parts)
@@ -253,7 +240,9 @@ def _sections(sessions: Sequence[_Session]) -> Iterable[str]:
     one = len(sessions) == 1
 
     def beside(title: str, give: Callable[[_Session], str]) -> str:
-        return f"<h2>{title}</h2>" + _row([("" if one else each.title()) + give(each) for each in sessions])
+        return f"<h2>{title}</h2>" + _row(
+            [("" if one else f"<h3>{escape(each.name)}</h3>") + give(each) for each in sessions]
+        )
 
     yield beside("The session", lambda each: each.what_it_was() + "".join(map(_note, each.lacks())))
     yield beside("The estimates", _Session.scores)
@@ -264,7 +253,7 @@ def _sections(sessions: Sequence[_Session]) -> Iterable[str]:
     else:
         for title in _OVER_SESSION:
             yield beside(title, partial(_Session.over_session, title=title))
-    if any(has_pupil(each.recording) for each in sessions):
+    if any(has_pupil(each.recording.rig) for each in sessions):
         yield beside("Over the pupil", _Session.pupil)
     if any(each.recording.rig.scene is not None or topics.RESTORATION in each.recording.counts for each in sessions):
         yield beside("Before and after", _Session.scene)
@@ -276,36 +265,24 @@ def _comparison(sessions: Sequence[_Session]) -> str:
     wanted = ("RMSE path", "RMSE end", "NIS", "NEES end", "gated")
     rows = []
     for each in sessions:
-        begin = [_text(each.name), _text(each.recording.rig.name), _number(str(len(each.recording)))]
         found = score_table(each.view.scores if each.view is not None else {}, wanted)
         for name, cells in (found.rows or {"none": []}).items():
             of = dict(zip(found.heads, cells, strict=bool(cells)))
-            rows.append([*begin, _text(name), *(_number(of.get(head, "")) for head in wanted)])
+            begin = [each.name, each.recording.rig.name, str(len(each.recording)), name]
+            rows.append([*begin, *(of.get(head, "") for head in wanted)])
     return _table(("recording", "rig", "exposures", "estimator", *wanted), rows, text_columns=(0, 1, 3))
 
 
-def _score_table(scores: Mapping[str, Score]) -> str:
-    """The table that `aolink estimate` prints."""
-    found = score_table(scores)
-    rows = [[_text(name), *map(_number, cells)] for name, cells in found.rows.items()]
-    return _table(["estimator", *found.heads], rows, text_columns=(0,)) + "".join(map(_note, found.notes))
+def _table(heads: Sequence[str], rows: Sequence[Sequence[str]], *, text_columns: Sequence[int] = (0,)) -> str:
+    """A table; cells outside of the columns of texts are numbers, which stand out where they end with an exclamation
+    mark."""
 
+    def line(tag: str, cells: Sequence[str]) -> str:
+        kinds = ["" if k in text_columns else f' class="n{" off" * t.endswith("!")}"' for k, t in enumerate(cells)]
+        return "".join(f"<{tag}{kind}>{escape(text)}</{tag}>" for kind, text in zip(kinds, cells, strict=True))
 
-def _text(text: str) -> str:
-    return f"<td>{escape(text)}</td>"
-
-
-def _number(text: str) -> str:
-    return f'<td class="n{" off" if text.endswith("!") else ""}">{escape(text)}</td>'
-
-
-def _table(heads: Sequence[str], rows: Sequence[Sequence[str]], *, text_columns: Sequence[int]) -> str:
-    """A table of cells that are HTML."""
-    head = "".join(
-        f"<th>{name}</th>" if k in text_columns else f'<th class="n">{name}</th>' for k, name in enumerate(heads)
-    )
-    body = "".join(f"<tr>{''.join(row)}</tr>" for row in rows)
-    return f'<div class="scroll"><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
+    body = "".join(f"<tr>{line('td', row)}</tr>" for row in rows)
+    return f'<div class="scroll"><table><thead><tr>{line("th", heads)}</tr></thead><tbody>{body}</tbody></table></div>'
 
 
 def facts_table(rows: Mapping[str, str]) -> str:

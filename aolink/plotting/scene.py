@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from aolink.errors import ExportError
+from aolink.gathered import SCENES, scene_of
 from aolink.numerics.arrays import FloatArray
-from aolink.plotting.exposure import exposure_with_estimates
+from aolink.plotting.exposure import step_of
 from aolink.plotting.style import figure_or_new
 from aolink.recording.reader import Recording
 
@@ -57,21 +58,19 @@ def plot_scene(recording: Recording, number: int, figure: Figure | SubFigure | N
 
 def _pictures(recording: Recording, number: int) -> dict[str, FloatArray]:
     """Pictures of one exposure by their description, intensity; NaN where a pixel never came."""
-    exposure, _ = exposure_with_estimates(recording, number, [])
+    exposure, sensor, found = step_of(recording, number, []).exposure, recording.rig.scene, {}
     restored = next((each for each in recording.restored() if each.frame_id == exposure.frame_id), None)
-    sensor, found = recording.rig.scene, {}
-    if sensor is not None and exposure.scene is not None:
-        found["as it came"] = np.where(exposure.scene.mask, sensor.to_intensity(exposure.scene.pixels), np.nan)
+    how = f"{SCENES['restored']} ({restored.estimator}, {restored.method})" if restored is not None else ""
+    if (came := scene_of(sensor, exposure)) is not None and sensor is not None:
+        found[SCENES["came"]] = came
         if restored is not None and restored.scene is not None:
-            found[f"restored ({restored.estimator}, {restored.method})"] = restored.scene.astype(np.float64)
+            found[how] = restored.scene.astype(np.float64)
         if (true := recording.true_scene) is not None:
-            found["at rest"] = sensor.to_intensity(true)
+            found[SCENES["true"]] = sensor.to_intensity(true)
     elif restored is not None and restored.spots is not None:
         light = exposure.pixels.astype(np.float64) - recording.rig.sensor.black_level
-        seen = np.where(exposure.mask, light, np.nan)
-        found["the frame as it came"] = seen / max(float(np.nanmax(seen)), 1e-12)
-        spots = restored.spots.astype(np.float64)
-        found[f"restored ({restored.estimator}, {restored.method})"] = spots / max(float(spots.max()), 1e-12)
+        pictures = {f"the frame {SCENES['came']}": np.where(exposure.mask, light, np.nan), how: restored.spots}
+        found = {title: picture / max(float(np.nanmax(picture)), 1e-12) for title, picture in pictures.items()}
     if not found:
         raise ExportError(f"exposure {number} of {recording.path} has no picture; `aolink deblur` restores frames")
     return found

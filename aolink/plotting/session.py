@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from aolink.errors import ExportError
 from aolink.estimation.estimate import Status
+from aolink.gathered import NIS_COVERAGE, PER_SLOPE, SLOPES, limits_of, nis_bounds, some_rows
 from aolink.numerics.arrays import FloatArray
-from aolink.plotting.overview import NIS_COVERAGE, Overview, limits_of, need_exposures, nis_bounds, overview
+from aolink.plotting.overview import Overview, need_exposures, overview
 from aolink.plotting.style import TimeUnit, axes_or_new, colour, colour_bar, figure_or_new, is_narrow, legend_above
 from aolink.series import Series
 
@@ -35,12 +36,11 @@ def plot_series(
     need_exposures(view)
     if axes is None:
         axes = figure_or_new(None, _SIZE_IN).subplots(2, 1, sharex=True, height_ratios=(3, 1))
-    above, below = axes
-    plot_blur(view, above, names=["truth", *view.names])
+    plot_blur(view, axes[0], names=["truth", *view.names])
     if view.nis:
-        plot_nis(view, below, one_axis=True)
-    above.set_xlabel("")
-    return above, below
+        plot_nis(view, axes[1], one_axis=True)
+    axes[0].set_xlabel("")
+    return axes
 
 
 def plot_blur(
@@ -69,11 +69,11 @@ def plot_blur(
         np.ravel(view.spans) * scale, line.edges, blur, cmap="Greys", vmin=0, vmax=1.2 * max(top, 1e-12),
         rasterized=True,
     )  # fmt: skip
-    colour_bar(grey, axes, "1 / slope unit" if is_narrow(axes.figure) else "intensity (1 / slope unit)")
+    colour_bar(grey, axes, PER_SLOPE if is_narrow(axes.figure) else f"intensity ({PER_SLOPE})")
     chosen = ["truth", *view.names[-1:]] if names is None else names
     for name in [each for each in chosen if each in view.paths]:
         _draw_paths(axes, view, name, scale)
-    axes.set(ylabel=f"output {view.output} (slope units)", xlim=(0, view.spans[-1, 1] * scale))
+    axes.set(ylabel=f"output {view.output} ({SLOPES})", xlim=(0, view.spans[-1, 1] * scale))
     drawn = [each for name, of in view.paths.items() if name in chosen for each in (of.low, of.high)]
     axes.set_ylim(limits_of(line, drawn))
     axes.set_xlabel(time_label(unit))
@@ -85,23 +85,22 @@ def _draw_paths(axes: Axes, view: Overview, name: str, scale: float) -> None:
     """Draw paths as one line with gaps between exposures; where they swing too fast for that, draw their range."""
     paths = view.paths[name]
     begin, end = view.spans[:, :1], view.spans[:, 1:]
-    gap = np.full((len(begin), 1), np.nan)
+    places = np.linspace(0, 1, len(paths.places) + 1).repeat(2)[1:-1] if paths.envelope else paths.places
+
+    def joined(values: FloatArray) -> FloatArray:
+        return np.pad(values, ((0, 0), (0, 1)), constant_values=np.nan).ravel()
+
+    times = joined((begin + (end - begin) * places) * scale)
+    look: Any = {"color": colour(name)}
+    if paths.envelope:
+        low, high = (joined(np.repeat(each, 2, axis=1)) for each in (paths.low, paths.high))
+        look |= {"alpha": 0.35, "linewidth": 0.3, "label": f"{name} (range)", "rasterized": True}
+        axes.fill_between(times, low, high, **look)
+        return
     # In a long session lines lie close to each other: thin ones leave the blur to be seen.
     room = 20 * axes.figure.bbox.width / axes.figure.dpi / len(begin)
     width = max(0.25, (1.4 if name == "truth" else 0.9) * min(1.0, room))
-    if paths.envelope:
-        edges = np.linspace(0, 1, len(paths.places) + 1)
-        times = begin + (end - begin) * np.repeat(edges, 2)[1:-1]
-        low, high = np.repeat(paths.low, 2, axis=1), np.repeat(paths.high, 2, axis=1)
-        times, low, high = (np.concatenate([each, gap], axis=1).ravel() for each in (times * scale, low, high))
-        axes.fill_between(
-            times, low, high, color=colour(name), alpha=0.35, linewidth=0.3, label=f"{name} (range)", rasterized=True
-        )
-        return
-    times = np.concatenate([(begin + (end - begin) * paths.places) * scale, gap], axis=1).ravel()
-    axes.plot(
-        times, np.concatenate([paths.points, gap], axis=1).ravel(), color=colour(name), linewidth=width, label=name
-    )
+    axes.plot(times, joined(paths.points), linewidth=width, label=name, **look)
 
 
 def plot_nis(view: Overview, axes: Axes | None = None, *, one_axis: bool = False, unit: TimeUnit = "s") -> Axes:
@@ -123,7 +122,8 @@ def plot_nis(view: Overview, axes: Axes | None = None, *, one_axis: bool = False
     count = 1 if one_axis else view.series.rig.plant.axes
     drawn: dict[int, list[str]] = {}
     for name, values in found.items():
-        _line(axes, times, values, name)
+        marker = ".-" if len(times) <= 200 else "-"
+        axes.plot(*thinned(times, values), marker, color=colour(name), linewidth=0.6, markersize=3, label=name)
         drawn.setdefault(view.measurements[name], []).append(name)
         gated = np.isin(view.status[name], (Status.GATED, Status.DIVERGED))
         if gated.any():
@@ -161,7 +161,7 @@ def plot_errors(view: Overview, axes: Axes | None = None, *, unit: TimeUnit = "s
         times = np.convolve(view.steps[known] * scale, kernel, mode="valid")
         running = np.sqrt(np.convolve(errors[known] ** 2, kernel, mode="valid"))
         axes.plot(*thinned(times, running), color=colour(name), label=name)
-    axes.set(yscale="log", xlabel=time_label(unit), ylabel="RMSE of the path (slope units)")
+    axes.set(yscale="log", xlabel=time_label(unit), ylabel=f"RMSE of the path ({SLOPES})")
     axes.grid(alpha=0.3)
     legend_above(axes)
     return axes
@@ -174,14 +174,5 @@ def time_label(unit: TimeUnit) -> str:
 
 def thinned(times: NDArray[Any], values: FloatArray) -> tuple[FloatArray, FloatArray]:
     """A curve of at most some thousand points that shows the same ranges: it has the extremes of each run of points."""
-    if len(times) <= _MOST_POINTS:
-        return np.asarray(times, dtype=np.float64), values
-    runs = np.array_split(np.arange(len(times)), _MOST_POINTS // 2)
-    filled = np.where(np.isfinite(values), values, np.nanmean(values) if np.isfinite(values).any() else 0.0)
-    chosen = np.unique([run[pick] for run in runs for pick in (filled[run].argmin(), filled[run].argmax())])
+    chosen = some_rows(values[:, None], _MOST_POINTS)
     return np.asarray(times, dtype=np.float64)[chosen], values[chosen]
-
-
-def _line(axes: Axes, times: FloatArray, values: FloatArray, name: str) -> None:
-    marker = ".-" if len(times) <= 200 else "-"
-    axes.plot(*thinned(times, values), marker, color=colour(name), linewidth=0.6, markersize=3, label=name)

@@ -6,11 +6,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, Literal
 
-import numpy as np
-
 from aolink.colours import estimator_colour
 from aolink.exporting.common import needed
-from aolink.numerics.arrays import FloatArray
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -19,8 +16,6 @@ if TYPE_CHECKING:
 TimeUnit = Literal["s", "steps"]
 """The unit of a time axis: seconds, or fast steps."""
 
-BAND = 2.0
-"""Standard deviations to each side of an estimate."""
 MM = 1 / 25.4
 """A millimetre in inches."""
 _PAPER: dict[Any, Any] = {
@@ -30,8 +25,6 @@ _PAPER: dict[Any, Any] = {
 }  # fmt: skip
 _NARROW_IN = 4.8
 """Figures of less width are narrow, inches."""
-_ENVELOPE_FROM = 0.5
-"""Where a curve through some points of a path misses it by this share of its motion (RMS), its range is drawn."""
 
 
 @contextmanager
@@ -85,16 +78,3 @@ def legend_above(axes: Axes, columns: int = 5) -> None:
 def colour_bar(mapped: Any, axes: Axes, label: str) -> None:
     """A colour bar beside the axes, with its quantity and unit."""
     axes.figure.colorbar(mapped, ax=axes, label=label, shrink=0.9)
-
-
-def extremes(path: FloatArray, segments: int) -> tuple[FloatArray, FloatArray]:
-    """The least and the largest value of a path in each of its segments, (segments,) each."""
-    parts = np.array_split(path, min(segments, len(path)))
-    return np.array([part.min() for part in parts]), np.array([part.max() for part in parts])
-
-
-def hides_swings(path: FloatArray, count: int) -> bool:
-    """Whether a curve through ``count`` points of a path, spread evenly, misses most of its motion."""
-    places = np.linspace(0, len(path) - 1, min(count, len(path)))
-    drawn = np.interp(np.arange(len(path)), places, path[places.astype(int)])
-    return bool(np.std(path - drawn) > _ENVELOPE_FROM * np.std(path))

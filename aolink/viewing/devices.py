@@ -2,24 +2,39 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, Protocol
 
 import numpy as np
 import rerun as rr
 
 from aolink.colours import estimator_colour
-from aolink.plotting.overview import LATENCY_STEPS
+from aolink.gathered import LATENCY_STEPS, SLOPES, some_rows
 from aolink.recording import schemas_pb2, topics
 from aolink.viewing import entities
 from aolink.viewing.entities import CLOCK, CONTROL, ESTIMATION, FAULTS, LATENCY, LOG, LOST, RECEIVED, ROUND_TRIP, STATUS
 from aolink.viewing.palette import APPLIED, COMMANDED, series_colour
-from aolink.viewing.series import Drawing, Style, send_axes, send_line, send_states, some_rows
+from aolink.viewing.series import Drawing, Style, send_axes, send_line, send_states
 from aolink.viewing.timebase import Timebase
 from aolink.wire.messages_pb2 import Applied
 
 CONNECTION_COUNTS = (*topics.CONNECTION_FAULTS, "retransmits", "reports_asked")
 """Fields of ConnectionStatistics that count faults."""
+CLOCKS = {
+    "sigma": ("Clock offset sd (µs)", "offset sd", "sigma_ns", 1e-3),
+    "offset": ("Clock offset change (µs)", "offset change", "offset_ns", 1e-3),
+    "frequency": ("Clock rate (ppm)", "runs fast by", "frequency_ppm", 1.0),
+    "round_trip": ("Clock round trip (µs)", "round trip", "round_trip_ns", 1e-3),
+}
+"""What is drawn of a ClockSample, by the name of its entity: title of the view, name of the line, field, and the length
+of its unit in that of the view."""
+CONTROLS: dict[str, tuple[str, str, Callable[[Any, Timebase], float]]] = {
+    "slope_rms": (f"Loop: residual ({SLOPES})", "RMS of the slopes", lambda m, _: m.slope_rms),
+    "path_rms": (f"Loop: residual ({SLOPES})", "RMS inside the exposure", lambda m, _: m.path_rms),
+    "delay": ("Loop: delay (ms)", "exposure's end to first input", lambda m, t: m.delay_steps * t.fast_step_ns / 1e6),
+    "clipped": ("Loop: steps clipped (count)", "steps that limits changed", lambda m, _: m.clipped_steps),
+}
+"""What is drawn of a Control: title, name of the line, value."""
 
 _MOST_INPUTS = 2
 """Most inputs with lines of their own; where there are more, the first ones have them, and percentiles show all."""
@@ -48,21 +63,17 @@ def log_applied(drawing: Drawing, timebase: Timebase, records: Sequence[Timed]) 
     ``/status/mirror``."""
     # A report that was requested again came out of order; steps that were never reported show only in the status.
     blocks = sorted((r.message for r in records if r.message.source != Applied.AWAITED), key=lambda b: b.first_step)
-    if not blocks:
-        return
     _send_blocks(drawing, entities.APPLIED, timebase, blocks, Style("applied", APPLIED, width=3.5, steps=True))
-    sources = Applied.Source.DESCRIPTOR.values_by_number
-    names = [sources[b.source].name if b.source in sources else f"UNKNOWN {b.source}" for b in blocks]
-    send_states(drawing, f"{STATUS}/mirror", timebase, [b.first_step for b in blocks], names)
+    states = [(b.first_step, _name(Applied.Source, b.source)) for b in blocks]
+    send_states(drawing, f"{STATUS}/mirror", timebase, states)
 
 
 def log_answers(drawing: Drawing, timebase: Timebase, records: Sequence[Timed]) -> None:
     """What the mirror answered to its command blocks (CommandAnswer): ``/status/commands``."""
     answers = sorted((r.message for r in records), key=lambda m: m.first_step)
-    known = schemas_pb2.CommandAnswer.Answer.DESCRIPTOR.values_by_number
-    names = [known[m.answer].name if m.answer in known else f"UNKNOWN {m.answer}" for m in answers]
-    names = ["LATE" if m.late_steps else name for m, name in zip(answers, names, strict=True)]
-    send_states(drawing, f"{STATUS}/commands", timebase, [m.first_step for m in answers], names)
+    kinds = schemas_pb2.CommandAnswer.Answer
+    states = [(m.first_step, "LATE" if m.late_steps else _name(kinds, m.answer)) for m in answers]
+    send_states(drawing, f"{STATUS}/commands", timebase, states)
 
 
 def log_latency(drawing: Drawing, timebase: Timebase, records: Sequence[Timed]) -> None:
@@ -72,10 +83,10 @@ def log_latency(drawing: Drawing, timebase: Timebase, records: Sequence[Timed]) 
     """
     latencies = [r.message for r in records]
     times = timebase.at_frames([m.frame_id for m in latencies])
-    for i, (field, name) in enumerate(LATENCY_STEPS):
+    for i, (field, name) in enumerate(LATENCY_STEPS.items()):
         at = [getattr(m, field) for m in latencies]
         milliseconds = [(t - m.exposure_end_ns) / 1e6 if t else np.nan for t, m in zip(at, latencies, strict=True)]
-        if not np.isnan(milliseconds).all():
+        if any(at):
             style = Style(name, series_colour(i))
             send_line(drawing, f"{LATENCY}/{field.removesuffix('_ns')}", times, milliseconds, style)
 
@@ -107,42 +118,33 @@ def log_connection(drawing: Drawing, timebase: Timebase, records: Sequence[Timed
     """
     for d, (device, samples) in enumerate(_by_device(records).items()):
         host = np.array([r.log_time_ns for r in samples], dtype=np.int64)
-        times = timebase.at_host(host)
-        total = [sum(getattr(r.message, field) for field in CONNECTION_COUNTS) for r in samples]
-        style = Style(f"{device} connection faults", series_colour(d), steps=True)
-        send_line(drawing, f"{FAULTS}/{device}", times, total, style)
-        for i, field in enumerate(CONNECTION_COUNTS):
-            counts = [getattr(r.message, field) for r in samples]
-            if not any(counts):
-                continue
+        times, plain = timebase.at_host(host), series_colour(d)
+        counts = np.array([[getattr(r.message, field) for field in CONNECTION_COUNTS] for r in samples])
+        style = Style(f"{device} connection faults", plain, steps=True)
+        send_line(drawing, f"{FAULTS}/{device}", times, counts.sum(axis=1), style)
+        for i in np.flatnonzero(counts.any(axis=0)).tolist():
+            field = CONNECTION_COUNTS[i]
             style = Style(f"{device} {field.replace('_', ' ')}", series_colour(i), width=2.5 - d, steps=True)
-            send_line(drawing, f"{FAULTS}/{device}/{field}", times, counts, style)
+            send_line(drawing, f"{FAULTS}/{device}/{field}", times, counts[:, i], style)
         trip = np.array([r.message.round_trip_s for r in samples]) * 1e3
         if not np.isnan(trip).all():
-            send_line(drawing, f"{ROUND_TRIP}/{device}", times, trip, Style(f"{device} round trip", series_colour(d)))
-        if len(samples) > 1:
-            rate = np.diff([r.message.bytes_received for r in samples]) / np.maximum(np.diff(host), 1) * 1e6
-            style = Style(f"{device} to host", series_colour(d))
-            send_line(drawing, f"{RECEIVED}/{device}", timebase.at_host(host[1:]), rate, style)
+            send_line(drawing, f"{ROUND_TRIP}/{device}", times, trip, Style(f"{device} round trip", plain))
+        rate = np.diff([r.message.bytes_received for r in samples]) / np.maximum(np.diff(host), 1) * 1e6
+        send_line(drawing, f"{RECEIVED}/{device}", timebase.at_host(host[1:]), rate, Style(f"{device} to host", plain))
 
 
 def log_clock(drawing: Drawing, timebase: Timebase, records: Sequence[Timed]) -> None:
-    """The regression of each device's clock on the host's.
-
-    ``/clock/sigma/DEVICE`` (standard deviation of the offset, us), ``/clock/offset/DEVICE`` (change of the offset
-    since the first sample, us), ``/clock/frequency/DEVICE`` (ppm) and ``/clock/round_trip/DEVICE`` (us).
-    """
+    """The regression of each device's clock on the host's: ``/clock/NAME/DEVICE`` for each of `CLOCKS`; the offset is
+    that since the first sample."""
     for d, (device, samples) in enumerate(_by_device(records).items()):
         messages = [r.message for r in samples]
         times = timebase.at_host([m.host_receive_ns for m in messages])
-        offset = np.array([m.offset_ns for m in messages])
-        for name, label, values in (
-            ("sigma", "offset sd", np.array([m.sigma_ns for m in messages]) / 1e3),
-            ("offset", "offset change", (offset - next(iter(offset[np.isfinite(offset)]), np.nan)) / 1e3),
-            ("frequency", "runs fast by", np.array([m.frequency_ppm for m in messages])),
-            ("round_trip", "round trip", np.array([m.round_trip_ns for m in messages]) / 1e3),
-        ):
-            send_line(drawing, f"{CLOCK}/{name}/{device}", times, values, Style(f"{device} {label}", series_colour(d)))
+        for name, (_, label, field, unit) in CLOCKS.items():
+            values = np.array([getattr(m, field) for m in messages], dtype=np.float64)
+            if name == "offset":
+                values -= next(iter(values[np.isfinite(values)]), np.nan)
+            style = Style(f"{device} {label}", series_colour(d))
+            send_line(drawing, f"{CLOCK}/{name}/{device}", times, unit * values, style)
 
 
 def log_log(drawing: Drawing, timebase: Timebase, records: Sequence[Timed]) -> None:
@@ -154,28 +156,30 @@ def log_log(drawing: Drawing, timebase: Timebase, records: Sequence[Timed]) -> N
 
 
 def log_control(drawing: Drawing, timebase: Timebase, records: Sequence[Timed]) -> None:
-    """The results of a controller for each exposure: ``/control/slope_rms`` of the centroids and ``/control/path_rms``
-    inside the exposures (slope units), ``/control/delay`` from the end of the exposure to the first step that it has
-    changed (ms), ``/control/clipped`` (fast steps), ``/status/loop``.
+    """The results of a controller for each exposure: ``/control/NAME`` for each of `CONTROLS`, of the centroids
+    (``slope_rms``) and inside the exposures (``path_rms``), the delay from the end of the exposure to the first step
+    that it has changed, and the fast steps clipped; ``/status/loop``.
     """
     changes = [r.message for r in records]
-    times = timebase.at_frames([m.frame_id for m in changes])
-    delay = [m.delay_steps * timebase.fast_step_ns / 1e6 for m in changes]
-    for k, (name, label, values) in enumerate((
-        ("slope_rms", "RMS of the slopes", [m.slope_rms for m in changes]),
-        ("path_rms", "RMS inside the exposure", [m.path_rms for m in changes]),
-        ("delay", "exposure's end to first input", delay),
-        ("clipped", "steps that limits changed", [m.clipped_steps for m in changes]),
-    )):  # fmt: skip
-        send_line(drawing, f"{CONTROL}/{name}", times, values, Style(label, series_colour(k)))
+    frames = [m.frame_id for m in changes]
+    times = timebase.at_frames(frames)
+    for k, (name, (_, label, value)) in enumerate(CONTROLS.items()):
+        send_line(
+            drawing, f"{CONTROL}/{name}", times, [value(m, timebase) for m in changes], Style(label, series_colour(k))
+        )
     states = [
-        f"{schemas_pb2.Control.State.Name(m.state)}{' LATE' if m.late else ''}"
-        f"{f' {m.acting.upper()}' if m.acting not in ('', m.controller) else ''}"
-        if m.state in schemas_pb2.Control.State.values()
-        else f"UNKNOWN {m.state}"
+        _name(schemas_pb2.Control.State, m.state) + (" LATE" if m.late else "")
+        + (f" {m.acting.upper()}" if m.acting not in ("", m.controller) else "")
         for m in changes
-    ]
-    send_states(drawing, f"{STATUS}/loop", timebase, timebase.step_of_frame([m.frame_id for m in changes]), states)
+    ]  # fmt: skip
+    send_states(
+        drawing, f"{STATUS}/loop", timebase, list(zip(timebase.step_of_frame(frames).tolist(), states, strict=True))
+    )
+
+
+def _name(kinds: Any, number: int) -> str:
+    """The name of an enumeration's value; other software may have written one that is not known here."""
+    return kinds.Name(number) if number in kinds.values() else f"UNKNOWN {number}"
 
 
 def _send_blocks(drawing: Drawing, path: str, timebase: Timebase, blocks: Sequence[Any], style: Style) -> None:

@@ -1,12 +1,9 @@
-"""The entities' paths, for the functions that send entities and for the layout that shows them: their roots, and the
-entities below an estimator's or a truth's own.
+"""The entities' paths, for the functions that send entities and for the layout that shows them.
 
 An entity that shows a topic's messages has the topic's name.
 """
 
 from __future__ import annotations
-
-from collections.abc import Iterable
 
 from aolink.recording import topics
 
@@ -65,38 +62,3 @@ def mean(path: str) -> str:
 def band(path: str) -> str:
     """The lines that are some standard deviations from the estimates."""
     return f"{path}/band"
-
-
-def extremes(path: str) -> str:
-    """The highest and the lowest values of a path that swings too often for a line."""
-    return f"{path}/range"
-
-
-def percentiles(path: str) -> str:
-    """The percentiles over all axes, where there are more than have lines of their own at ``path``."""
-    return f"{path}/axes"
-
-
-def with_percentiles(paths: Iterable[str]) -> list[str]:
-    """Each path, and its percentiles after it."""
-    return [each for path in paths for each in (path, percentiles(path))]
-
-
-def nis_values(name: str) -> str:
-    """The NIS of an estimator in each exposure."""
-    return f"{NIS}/{name}/value"
-
-
-def nis_bounds(name: str) -> str:
-    """The bounds of an estimator's NIS."""
-    return f"{NIS}/{name}/bounds"
-
-
-def state(where: str, component: int, name: str) -> str:
-    """A component of the states (from 0) at the exposures' ``start`` or ``end``, by an estimator or as "truth"."""
-    return f"{STATE}/{where}/x{component + 1}/{name}"
-
-
-def end_error(component: int, name: str) -> str:
-    """The error of a component (from 0) of an estimator's end states."""
-    return f"{END_ERROR}/x{component + 1}/{name}"

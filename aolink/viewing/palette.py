@@ -17,31 +17,15 @@ _SERIES: tuple[Colour, ...] = (
     (86, 180, 233), (240, 110, 50), (0, 175, 125), (204, 121, 167), (240, 228, 100), (190, 130, 80),
 )  # fmt: skip
 
+_GOOD, _WAITING, _DOUBTFUL, _BAD, _UNUSABLE = (45, 110, 75), (80, 80, 100), (190, 140, 30), (190, 50, 50), (120, 60, 60)
 STATUS_COLOURS: dict[str, Colour] = {
-    "OK": (45, 110, 75),
-    "PREDICTED": (80, 80, 100),
-    "GATED": (190, 140, 30),
-    "DIVERGED": (190, 50, 50),
-    "REINITIALISED": (150, 80, 170),
-    "INPUT_INVALID": (120, 60, 60),
-    "SKIPPED": (70, 70, 70),
-    "COMMAND": (45, 110, 75),
-    "PARKED": (80, 80, 100),
-    "CLIPPED": (190, 50, 50),
-    "WATCHDOG": (190, 50, 50),
-    "LATE": (190, 140, 30),
-    "TOO_LATE": (190, 140, 30),
-    "LATCHED": (190, 50, 50),
-    "NONE": (120, 60, 60),
-    "NOT_REPORTED": (120, 60, 60),
-    "CLOSED": (45, 110, 75),
-    "CLOSED LATE": (190, 140, 30),
-    "HELD": (190, 50, 50),
-    "EXPOSURE": (60, 90, 130),
-    "NEXT EXPOSURE": (40, 60, 95),
-    "READOUT": (25, 25, 25),
-    "LOST": (190, 50, 50),
-}
+    "OK": _GOOD, "PREDICTED": _WAITING, "GATED": _DOUBTFUL, "DIVERGED": _BAD, "REINITIALISED": (150, 80, 170),
+    "INPUT_INVALID": _UNUSABLE, "SKIPPED": (70, 70, 70),
+    "COMMAND": _GOOD, "PARKED": _WAITING, "CLIPPED": _BAD, "WATCHDOG": _BAD, "LATE": _DOUBTFUL, "TOO_LATE": _DOUBTFUL,
+    "LATCHED": _BAD, "NONE": _UNUSABLE, "NOT_REPORTED": _UNUSABLE,
+    "CLOSED": _GOOD, "CLOSED LATE": _DOUBTFUL, "HELD": _BAD,
+    "EXPOSURE": (60, 90, 130), "NEXT EXPOSURE": (40, 60, 95), "READOUT": (25, 25, 25), "LOST": _BAD,
+}  # fmt: skip
 """Colours of an estimate's status, of the source of the mirror's inputs and its answers, of the loop's state, and of
 the camera's state."""
 

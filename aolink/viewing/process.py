@@ -46,24 +46,19 @@ _NO_DRIVER = (
 )
 
 
-def has_display() -> bool:
-    """Whether a window can be opened."""
-    return sys.platform != "linux" or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
-
-
-def check_display() -> None:
+def check_display(
+    instead: str = "there is no display: use `aolink view --web` for a browser, or --screenshot for a picture",
+) -> None:
     """Raise `ViewerError` where a window cannot be opened."""
-    if not has_display():
-        raise ViewerError("there is no display: use `aolink view --web` for a browser, or --screenshot for a picture")
+    if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        raise ViewerError(instead)
 
 
 def open_viewer(rrd_path: str | Path) -> None:
     """Open the native viewer and wait until its window is closed. Raises `ViewerError` where there is no display."""
     path = existing(rrd_path)
-    check_display()
-    with tempfile.TemporaryFile() as said, running_rerun([str(path), "--port", "auto"], said) as process:
-        if process.wait() != 0:
-            raise why_it_ended(said)
+    with window(str(path)) as server:
+        server.wait()
 
 
 def serve_web(
@@ -107,14 +102,39 @@ class Server:
 
     def listen(self) -> None:
         """Wait until it listens, which takes some time after its start. Raises `ViewerError` if it never does."""
-        for port in (self.page_port, self.data_port):
-            if port is not None:
-                wait_for_server(port, self.process, self.said)
+        self.wait_for(lambda: not any(is_free(port) for port in (self.page_port, self.data_port) if port is not None))
+
+    def wait_for(self, ready: Callable[[], bool]) -> None:
+        """Wait until it is ready. Raises `ViewerError` if it never is."""
+        deadline = time.monotonic() + _START_S
+        while not ready():
+            if self.process.poll() is not None:
+                raise self.why_it_ended()
+            if time.monotonic() > deadline:
+                raise ViewerError(f"Rerun did not answer within {_START_S:g} s")
+            time.sleep(POLL_S)
 
     def wait(self) -> None:
         """Wait until it ends. Raises `ViewerError` if it ends by itself."""
         if self.process.wait() != 0:
-            raise why_it_ended(self.said)
+            raise self.why_it_ended()
+
+    def has_ended(self) -> bool:
+        """Whether it has ended, or ends soon: a viewer that fails writes its error before it ends."""
+        try:
+            self.process.wait(_LAST_WORDS_S)
+        except subprocess.TimeoutExpired:
+            return False
+        return True
+
+    def why_it_ended(self) -> ViewerError:
+        """The reason why it ended by itself: a driver that the machine lacks, or else Rerun's own first error."""
+        if sys.platform == "linux" and not has_vulkan():
+            return RendererError(_NO_DRIVER)
+        self.said.seek(0)
+        lines = [line.strip() for line in self.said.read().decode(errors="replace").splitlines() if line.strip()]
+        causes = [line for line in lines if "panicked at" in line or "ERROR" in line or line.startswith("Error")]
+        return ViewerError(f"Rerun ended: {(causes or lines)[0]}" if lines else "Rerun ended without saying why")
 
 
 @contextmanager
@@ -125,21 +145,18 @@ def serving(files: Sequence[str] = (), port: int | None = None) -> Iterator[Serv
     """
     if port is not None and not is_free(port):
         raise ViewerError(f"port {port} is in use: stop what uses it or choose another one")
-    with free_port() as another, free_port() as data_port, tempfile.TemporaryFile() as said:
+    with free_port() as another:
         port = port or (WEB_PORT if is_free(WEB_PORT) else another)
-        options = [*files, "--serve-web", "--web-viewer-port", str(port), "--port", str(data_port)]
-        with running_rerun(options, said) as process:
-            yield Server(process, said, data_port, port)
+        with running_rerun([*files, "--serve-web", "--web-viewer-port", str(port)], port) as server:
+            yield server
 
 
 @contextmanager
-def window() -> Iterator[Server]:
-    """The native viewer, empty, on the screen. Raises `ViewerError` where there is none."""
+def window(*files: str) -> Iterator[Server]:
+    """The native viewer on the screen, empty or with files. Raises `ViewerError` where there is none."""
     check_display()
-    with (
-        free_port() as port, tempfile.TemporaryFile() as said, running_rerun(["--port", str(port)], said) as process,
-    ):  # fmt: skip
-        yield Server(process, said, port)
+    with running_rerun(files) as server:
+        yield server
 
 
 @contextmanager
@@ -158,18 +175,21 @@ def free_port() -> Iterator[int]:
 
 
 @contextmanager
-def running_rerun(options: Sequence[str], said: IO[bytes]) -> Iterator[subprocess.Popen[bytes]]:
+def running_rerun(options: Sequence[str], page_port: int | None = None) -> Iterator[Server]:
     """Rerun's program, which ends with the block."""
     # It leaves its own temporary files behind when it is ended.
-    with tempfile.TemporaryDirectory(prefix="aolink-", ignore_cleanup_errors=True) as temporary:
+    with (
+        tempfile.TemporaryDirectory(prefix="aolink-", ignore_cleanup_errors=True) as temporary, free_port() as port,
+        tempfile.TemporaryFile() as said,
+    ):  # fmt: skip
         environment = {**os.environ, "NO_COLOR": "1", "TMPDIR": temporary}
         # With a session of its own: Ctrl-C comes to this process alone, which ends Rerun's.
         process = subprocess.Popen(
-            [str(_program()), "--bind", HOST, *options], stdin=subprocess.DEVNULL, stdout=said, stderr=said,
-            env=environment, start_new_session=True, preexec_fn=partial(end_with, os.getpid()),
+            [str(_program()), "--bind", HOST, "--port", str(port), *options], stdin=subprocess.DEVNULL, stdout=said,
+            stderr=said, env=environment, start_new_session=True, preexec_fn=partial(end_with, os.getpid()),
         )  # fmt: skip
         try:
-            yield process
+            yield Server(process, said, port, page_port)
         finally:
             process.terminate()
             try:
@@ -186,21 +206,6 @@ def _program() -> Path:
         if (folder / name).is_file():
             return folder / name
     raise ViewerError("the Rerun viewer is missing: install rerun-sdk again")
-
-
-def wait_for(ready: Callable[[], bool], process: subprocess.Popen[bytes], said: IO[bytes]) -> None:
-    deadline = time.monotonic() + _START_S
-    while not ready():
-        if process.poll() is not None:
-            raise why_it_ended(said)
-        if time.monotonic() > deadline:
-            raise ViewerError(f"Rerun did not answer within {_START_S:g} s")
-        time.sleep(POLL_S)
-
-
-def wait_for_server(port: int, process: subprocess.Popen[bytes], said: IO[bytes]) -> None:
-    """Wait until a viewer listens. Raises `ViewerError` if it does not."""
-    wait_for(lambda: not is_free(port), process, said)
 
 
 def is_free(port: int) -> bool:
@@ -221,22 +226,3 @@ def existing(path: str | Path) -> Path:
     if magic != _MAGIC:
         raise ViewerError(f"{path} is not a Rerun file: `aolink view RECORDING --save FILE.rrd` writes one")
     return path.resolve()
-
-
-def ended(process: subprocess.Popen[bytes]) -> bool:
-    """Whether a viewer has ended, or ends soon: one that fails writes its error before it ends."""
-    try:
-        process.wait(_LAST_WORDS_S)
-    except subprocess.TimeoutExpired:
-        return False
-    return True
-
-
-def why_it_ended(said: IO[bytes]) -> ViewerError:
-    """The reason why a viewer ended by itself: a driver that the machine lacks, or else Rerun's own first error."""
-    if sys.platform == "linux" and not has_vulkan():
-        return RendererError(_NO_DRIVER)
-    said.seek(0)
-    lines = [line.strip() for line in said.read().decode(errors="replace").splitlines() if line.strip()]
-    causes = [line for line in lines if "panicked at" in line or "ERROR" in line or line.startswith("Error")]
-    return ViewerError(f"Rerun ended: {(causes or lines)[0]}" if lines else "Rerun ended without saying why")

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -12,9 +13,7 @@ import rerun as rr
 from numpy.typing import ArrayLike, NDArray
 
 from aolink.colours import Colour
-from aolink.numerics.arrays import IntArray
 from aolink.rig import Rig
-from aolink.viewing.entities import percentiles
 from aolink.viewing.palette import STATUS_COLOURS
 from aolink.viewing.timebase import Timebase
 
@@ -26,32 +25,17 @@ _SECOND = 0.55
 """Opacity of the second of two lines that belong together, and of the lines of a recording that is compared."""
 
 
-@dataclass(frozen=True)
-class Chosen:
-    """The spot, of many, that is drawn as lines."""
-
-    outputs: tuple[int, ...]
-    """Rows of a path."""
-    axes: tuple[int, ...]
-    """Axes whose states and NIS belong to it."""
-    labels: tuple[str, ...] = ("",)
-    """The text that the legend adds for each output."""
-
-    @classmethod
-    def of(cls, rig: Rig, spot: int = 0) -> Chosen:
-        """x and y of a spot on a plane, or the one position of a spot on a line."""
-        n = rig.sensor.directions
-        outputs = tuple(range(n * spot, n * spot + n))
-        axes = tuple(dict.fromkeys(k // rig.plant.n_outputs for k in outputs))
-        return cls(outputs, axes, (" x", " y") if n == 2 else ("",))
-
-
 @dataclass(kw_only=True)
 class Drawing:
-    """A stream into a file or a viewer, the options of the drawing, and facts about the lines drawn so far."""
+    """A stream into a file or a viewer, the options of the drawing, and what has been drawn so far, which the layout
+    depends on."""
 
     stream: rr.RecordingStream
-    chosen: Chosen
+    rig: Rig
+    estimators: list[str] = field(default_factory=list)
+    """The estimators in rank order; the band of the last one is shown first."""
+    spot: int = 0
+    """Number of the spot, of many, that is drawn as lines."""
     root: str = ""
     """Prefix of every entity's name, with its slash, where a recording is shown beside another."""
     points: int | None = POINTS
@@ -59,6 +43,12 @@ class Drawing:
     near: tuple[float, float] | None = None
     """The part of the field that is drawn of one exposure's intensity profile, where the layout is about that exposure:
     its path and histogram are then not drawn beside it."""
+    sent: set[str] = field(default_factory=set)
+    """The entities that have data."""
+    top: float | None = None
+    """Density at the top of the intensity profile's plot, one over slope units; None before the first exposure."""
+    scales: dict[str, float] = field(default_factory=dict)
+    """Maps over the lenslets, and the value at the end of each one's colours."""
     extents: dict[str, tuple[float, float]] = field(default_factory=dict)
     """The least and the largest value of each entity's lines."""
     swinging: dict[str, bool] = field(default_factory=dict)
@@ -66,13 +56,35 @@ class Drawing:
     states: dict[str, str] = field(default_factory=dict)
     """The last state of each lane."""
 
+    @cached_property
+    def outputs(self) -> list[int]:
+        """Rows of a path that are drawn as lines: x and y of a spot on a plane, or the one position on a line."""
+        n = self.rig.sensor.directions
+        return list(range(n * self.spot, n * self.spot + n))
+
+    @cached_property
+    def axes(self) -> list[int]:
+        """Axes whose states and NIS belong to the spot."""
+        return list(dict.fromkeys(k // self.rig.plant.n_outputs for k in self.outputs))
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """The text that the legend adds for each output."""
+        return (" x", " y") if len(self.outputs) == 2 else ("",)
+
     def log(self, path: str, what: Any) -> None:
         """Log data that is valid for the whole session."""
         self.stream.log(self.root + path, what, static=True)
+        self.sent.add(path)
 
     def send_columns(self, path: str, times: Sequence[rr.TimeColumn], columns: Iterable[Any]) -> None:
         """Send rows of an entity."""
         self.stream.send_columns(self.root + path, times, columns)
+        self.sent.add(path)
+
+    def has(self, entity: str) -> bool:
+        """Whether an entity, or one below it, has data."""
+        return any(each == entity or each.startswith(f"{entity}/") for each in self.sent)
 
 
 @dataclass(frozen=True)
@@ -141,40 +153,32 @@ def send_axes(
     if columns.shape[1] > len(shown):
         words = f"{style.name}, {'/'.join(map(str, PERCENTILES))} % of {columns.shape[1]}"
         spread = Style(words, style.colour, 0.8, 130, style.steps)
-        send_line(drawing, percentiles(path), times, np.percentile(columns, PERCENTILES, axis=1).T, spread)
+        send_line(drawing, f"{path}/axes", times, np.percentile(columns, PERCENTILES, axis=1).T, spread)
 
 
-def send_states(drawing: Drawing, path: str, timebase: Timebase, steps: ArrayLike, states: Sequence[str]) -> None:
+def send_states(drawing: Drawing, path: str, timebase: Timebase, states: Sequence[tuple[int, str]]) -> None:
     """Send a lane of named states from fast steps on, coloured by `STATUS_COLOURS`, where they change."""
-    before = [drawing.states.get(path, ""), *states]
-    changed = [k for k, state in enumerate(states) if state != before[k]]
+    before = [drawing.states.get(path, ""), *(state for _, state in states)]
+    changed = [each for last, each in zip(before, states, strict=False) if each[1] != last]
     if not changed:
         return
-    drawing.states[path] = states[-1]
+    drawing.states[path] = before[-1]
     names = list(STATUS_COLOURS)
     drawing.log(path, rr.StateConfiguration(values=names, labels=names, colors=list(STATUS_COLOURS.values())))
-    times = timebase.at_steps(np.asarray(steps)[changed])
-    drawing.send_columns(path, times, rr.StateChange.columns(state=[states[k] for k in changed]))
+    columns = rr.StateChange.columns(state=[state for _, state in changed])
+    drawing.send_columns(path, timebase.at_steps([step for step, _ in changed]), columns)
 
 
-def some_rows(values: NDArray[np.float64], count: int) -> IntArray:
-    """The rows to keep of lines with more than ``count`` rows: those of the extremes of each part, and the ends.
-
-    Parameters
-    ----------
-    values:
-        (rows, lines).
-    """
-    rows, lines = values.shape
-    if rows <= count:
-        return np.arange(rows)
-    parts = max(1, count // (2 * lines))
-    length, longer = divmod(rows, parts)
-    kept = [np.array([0, rows - 1])]
-    # All parts of one length at once: the first ones have a row more.
-    for first, of, size in ((0, longer, length + 1), (longer * (length + 1), parts - longer, length)):
-        if of:
-            some = values[first : first + of * size].reshape(of, size, lines)
-            starts = first + size * np.arange(of)[:, None]
-            kept += [(starts + find(some, axis=1)).ravel() for find in (np.argmin, np.argmax)]
-    return np.unique(np.concatenate(kept))
+def send_pictures(
+    drawing: Drawing, path: str, times: Sequence[rr.TimeColumn], pictures: Sequence[NDArray[np.uint8 | np.uint16]]
+) -> None:
+    """Send pictures of one shape, (rows, columns) or (rows, columns, 3)."""
+    if not pictures:
+        return
+    (height, width), first = pictures[0].shape[:2], pictures[0]
+    model = rr.ColorModel.RGB if first.ndim == 3 else rr.ColorModel.L
+    datatype = rr.ChannelDatatype.from_np_dtype(first.dtype)
+    layout = rr.components.ImageFormat(width=width, height=height, color_model=model, channel_datatype=datatype)
+    drawing.log(path, rr.Image.from_fields(format=layout))
+    buffers = np.stack([np.ascontiguousarray(each).ravel().view(np.uint8) for each in pictures])
+    drawing.send_columns(path, times, rr.Image.columns(buffer=buffers))

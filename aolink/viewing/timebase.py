@@ -92,6 +92,14 @@ class Timebase:
         """Columns on all three timelines for values that belong to frames: at the start of their exposures."""
         return self.at_steps(self.step_of_frame(frames), frames)
 
+    def at_starts(self, exposures: Sequence[Exposure]) -> list[rr.TimeColumn]:
+        """Columns on all three timelines for one value of each exposure, at its start."""
+        return self.at_steps([e.first_step for e in exposures], [e.frame_id for e in exposures])
+
+    def at_ends(self, exposures: Sequence[Exposure]) -> list[rr.TimeColumn]:
+        """The same at the exposures' ends."""
+        return self.at_steps([e.first_step + e.n_steps for e in exposures], [e.frame_id for e in exposures])
+
     def step_of_frame(self, frames: ArrayLike) -> IntArray:
         """The fast step at which a frame's exposure begins."""
         since: IntArray = (np.asarray(frames, dtype=np.int64) - self.frame_id) * self.frame_period_steps

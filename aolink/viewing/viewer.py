@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import io
-import subprocess
-import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,8 +15,7 @@ from rerun.experimental import ViewerClient
 
 from aolink.errors import ViewerError
 from aolink.files import check_target, writing
-from aolink.viewing import process as rerun_process
-from aolink.viewing.process import HOST, POLL_S, ended, existing, free_port, is_free, running_rerun, wait_for
+from aolink.viewing.process import POLL_S, Server, existing, is_free, running_rerun
 from aolink.viewing.timebase import FAST_STEP, TIME
 
 PICTURE_SIZE = (1920, 1200)
@@ -87,12 +83,9 @@ def headless_viewer(rrd_path: str | Path, size: tuple[int, int] = PICTURE_SIZE) 
     """
     path = existing(rrd_path)
     more = ["--headless", "--window-size", f"{size[0]}x{size[1]}", "--hide-welcome-screen"]
-    with (
-        free_port() as port, tempfile.TemporaryFile() as said,
-        running_rerun([*more, "--port", str(port)], said) as process,
-    ):  # fmt: skip
+    with running_rerun(more) as server:
         try:
-            client = _connected(process, port, said)
+            client = _connected(server)
             client.open(str(path))
             timeline, inside = _inside_once_loaded(client)
             client.run_command("ui.toggle_top_panel")
@@ -104,8 +97,8 @@ def headless_viewer(rrd_path: str | Path, size: tuple[int, int] = PICTURE_SIZE) 
         except (RuntimeError, OSError, ViewerError) as error:
             # A viewer that cannot draw answers at first and ends with its first frame, during any of these calls;
             # the call's own error then ("transport error") is not the cause.
-            if ended(process):
-                raise rerun_process.why_it_ended(said) from None
+            if server.has_ended():
+                raise server.why_it_ended() from None
             if isinstance(error, ViewerError):
                 raise
             raise ViewerError(f"the viewer cannot show {path}: {_one_line(error)}") from None
@@ -135,23 +128,23 @@ def settled_picture(client: ViewerClient) -> NDArray[np.uint8]:
     return pixels
 
 
-def _connected(process: subprocess.Popen[bytes], port: int, said: IO[bytes]) -> ViewerClient:
+def _connected(server: Server) -> ViewerClient:
     """A client of a viewer, once that answers."""
     clients: list[ViewerClient] = []
 
     def answers() -> bool:
         # A connection to a port on which no program listens yet may block for seconds.
-        if is_free(port):
+        if is_free(server.data_port):
             return False
         try:
-            client = ViewerClient.connect(f"rerun+http://{HOST}:{port}/proxy")
+            client = ViewerClient.connect(server.data_address)
             client.get_state()
         except (RuntimeError, OSError):
             return False
         clients.append(client)
         return True
 
-    wait_for(answers, process, said)
+    server.wait_for(answers)
     return clients[0]
 
 

@@ -11,8 +11,8 @@ import pytest
 import aolink
 from aolink import plotting
 from aolink.errors import ExportError, RecordingError
-from aolink.plotting.overview import nis_bounds
-from aolink.plotting.style import extremes, hides_swings
+from aolink.gathered import Blur, extremes, hides_swings, nis_bounds, some_rows
+from aolink.optics.kernel import exposure_density
 from aolink.recording.reader import Recording
 from aolink.recording.reestimate import write_reestimated
 from tests.needs import needed
@@ -86,6 +86,34 @@ def test_a_path_that_swings_faster_than_its_points_show_is_drawn_as_its_range() 
         assert (low.min(), high.max()) == (path.min(), path.max())
     slow = plotting.plot_blur(plotting.overview(reference("jitter")), Figure().subplots())
     assert {each.get_label() for each in slow.get_lines()} == {"truth", "moments"}
+
+
+@pytest.mark.parametrize(("rows", "curves", "count"), [(1000, 1, 64), (37, 2, 5), (100, 3, 10), (7, 1, 8)])
+def test_a_curve_keeps_the_extremes_of_each_part_and_its_ends(rows: int, curves: int, count: int) -> None:
+    values = np.random.default_rng(rows).normal(size=(rows, curves))
+    values[3] = np.nan
+    kept = some_rows(values, count)
+    if rows <= count:
+        assert kept.tolist() == list(range(rows))
+        return
+    size = -(-rows // max(1, count // (2 * curves)))
+    expected = {0, rows - 1}
+    for first in range(0, rows, size):
+        part = values[first : first + size]
+        expected |= {first + int(find(curve)) for curve in part.T for find in (np.nanargmin, np.nanargmax)}
+    assert set(kept.tolist()) == expected
+
+
+def test_a_path_predicts_what_the_kernel_makes_of_it() -> None:
+    series = reference("tip-tilt")
+    step = next(series[4:5].steps(["o3"]))
+    blur = Blur.of(series.rig, step, 1)
+    line, path = series.rig.sensor.profile, step.estimates["o3"].path[1]
+    expected = exposure_density(line.kernel, line.edges, path)
+    np.testing.assert_allclose(blur.predicted("o3"), expected, atol=1e-4 * line.peak_density)
+    density, edges = blur.histogram("o3", 0.01)
+    counts = np.histogram(path, edges)[0]
+    np.testing.assert_allclose(density, counts / (0.01 * len(path)))
 
 
 def test_one_exposure_shows_path_histogram_and_profile_on_one_axis_of_position() -> None:

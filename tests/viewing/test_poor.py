@@ -53,7 +53,7 @@ CASES: dict[str, tuple[Callable[[Path], object], list[str], list[str]]] = {
     "bare": (
         lambda path: write_small(path, 3, applied=False),
         ["/camera/image", "/profile/measured", "/status/exposure"],
-        ["no estimates", "no truth", "no commands", "no latencies"],
+        ["no estimates", "truth is not known", "no commands", "no latencies"],
     ),
     "one frame": (
         lambda path: write_small(path, 1, truth=True),

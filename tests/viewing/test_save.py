@@ -3,6 +3,7 @@ from __future__ import annotations
 import resource
 import subprocess
 import sys
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,13 +14,15 @@ from scipy import stats
 
 from aolink.colours import estimator_colour
 from aolink.errors import ViewerError
-from aolink.plotting.overview import nis_bounds
+from aolink.estimation.estimate import Estimate
+from aolink.gathered import nis_bounds
 from aolink.recording.reader import Recording
+from aolink.series import Step
 from aolink.viewing.camera import HISTORY
 from aolink.viewing.motion import log_estimates
 from aolink.viewing.palette import MISSING, NOTHING, TRUTH
 from aolink.viewing.save import save_rrd
-from aolink.viewing.series import POINTS, Chosen, Drawing
+from aolink.viewing.series import POINTS, Drawing
 from aolink.viewing.timebase import Timebase
 from tests.conftest import Session
 from tests.kinds import truth_of
@@ -52,17 +55,27 @@ def without_breaks(values: np.ndarray) -> np.ndarray:
 
 
 def absent_from_views(path: Path) -> list[str]:
-    """Entities that a view names and the file does not hold; percentiles are only there with many axes."""
+    """Entities that a view names and the file does not hold, or of which nothing is below one that it names."""
     entities = read_rrd(path)
-    queries = [
-        expression
+    queries = {
+        expression.removeprefix("+ ").removeprefix("- ")
         for view in read_blueprint(path).values()
         for row in view.get("ViewContents:query", [])
         for expression in row
-    ]
-    exact = [q.removeprefix("+ ") for q in queries if "*" not in q and "$" not in q]
-    assert len(exact) > 2
-    return [name for name in exact if not name.endswith("/axes") and name not in entities]
+        if "$" not in expression
+    }
+    assert len(queries) > 2
+    known = [f"{entity}/" for entity in entities]
+    return sorted(
+        name for name in queries
+        if not any(each == f"{name}/" or (name.endswith("/**") and each.startswith(name[:-2])) for each in known)
+    )  # fmt: skip
+
+
+def steps_of(recording: StandIn, estimates: Sequence[Estimate]) -> list[Step]:
+    """The exposures, without their truth, with an estimator's estimates."""
+    exposures = [replace(each, truth=None) for each in recording.exposures()]
+    return [Step(k, e, {each.estimator: each}) for k, (e, each) in enumerate(zip(exposures, estimates, strict=True))]
 
 
 def test_a_recorded_session_shows_its_estimates(recorded: Session, tmp_path: Path) -> None:
@@ -211,7 +224,7 @@ def test_a_path_that_swings_too_often_for_a_line_is_drawn_as_its_range(tmp_path:
     with rr.RecordingStream("test") as stream:
         stream.save(path)
         timebase = Timebase.of(recording.rig, list(recording.exposures()))
-        log_estimates(Drawing(stream=stream, chosen=Chosen.of(recording.rig)), timebase, estimates)
+        log_estimates(Drawing(stream=stream, rig=recording.rig), timebase, "o3", steps_of(recording, estimates))
     entities = read_rrd(path)
     assert "/path/o3/mean" not in entities
     high, low = scalars(entities["/path/o3/range"]).T
@@ -339,7 +352,8 @@ def test_many_axes_become_percentiles(tmp_path: Path) -> None:
     with rr.RecordingStream("test") as stream:
         stream.save(path)
         timebase = Timebase.of(recording.rig, list(recording.exposures()))
-        log_estimates(Drawing(stream=stream, chosen=Chosen.of(recording.rig), points=None), timebase, estimates)
+        drawing = Drawing(stream=stream, rig=recording.rig, points=None)
+        log_estimates(drawing, timebase, "o3", steps_of(recording, estimates))
     entities = read_rrd(path)
     assert len(entities) < 30
     values = np.concatenate([e.path for e in estimates], axis=1)

@@ -372,19 +372,16 @@ def view_first(effort: Effort) -> Row:
     import rerun as rr
 
     from aolink.viewing import Look
-    from aolink.viewing.process import free_port, running_rerun, wait_for_server
+    from aolink.viewing.process import running_rerun
     from aolink.viewing.save import sent_parts
 
     times, path = [], hour(effort)
     for _ in range(effort.of(5)):
         start = time.perf_counter()
-        with (
-            free_port() as port, tempfile.TemporaryFile() as said,
-            running_rerun(["--serve-grpc", "--port", str(port)], said) as process,
-        ):  # fmt: skip
-            wait_for_server(port, process, said)
+        with running_rerun(["--serve-grpc"]) as server:
+            server.listen()
             stream = rr.RecordingStream("aolink")
-            stream.connect_grpc(f"rerun+http://127.0.0.1:{port}/proxy")
+            stream.connect_grpc(server.data_address)
             next(sent_parts(stream, Recording(path), Look(), at_once=True))
             stream.flush()
             times.append(time.perf_counter() - start)
