@@ -11,8 +11,8 @@ from tomlkit.exceptions import TOMLKitError
 from tomlkit.items import InlineTable, Item, Key, Table
 
 from aolink.errors import RigError
+from aolink.keys import did_you_mean
 from aolink.optics.sensor import KERNEL_WIDTHS
-from aolink.rig.toml_table import did_you_mean
 
 
 def with_value(text: str, key: str, value: Any, *, may_be_new: bool = False, comment: str = "") -> str:

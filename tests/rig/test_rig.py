@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import ast
 import re
 import subprocess
 from collections.abc import Callable
 from pathlib import Path
-from typing import get_args
 
 import numpy as np
 import pytest
@@ -15,10 +13,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from aolink.errors import RigError
-from aolink.optics.sensor import KERNEL_WIDTHS
-from aolink.rig import CalibrationTable, Faults, Wanders, builtin_rigs, load_rig, parse_rig, tables
+from aolink.rig import CalibrationTable, builtin_rigs, load_rig, parse_rig
 from aolink.rig.edit import with_value
-from aolink.rig.toml_table import KEYS, Table
 
 TEXT = load_rig("section-vi").toml
 A = "[[1.0000, 0.0010], [-0.0197, 0.9704]]"
@@ -335,18 +331,6 @@ def test_numbers_and_nesting_beyond_what_can_be_read_are_refused(value: str) -> 
     for key in ("sigma = 0.05", "process_noise = 0.1 "):
         with pytest.raises(RigError):
             parse_rig(changed(key, f"{key.split()[0]} = {value} "))
-
-
-def test_the_list_of_keys_is_that_of_the_keys_that_the_readers_ask_for() -> None:
-    in_loops = {*Faults.__dataclass_fields__, *CalibrationTable.__dataclass_fields__, *get_args(Wanders)}
-    in_loops |= {"camera", "mirror", *KERNEL_WIDTHS}
-    asked = in_loops
-    readers = {name for name in vars(Table) if not name.startswith("_")} - {"key", "missing", "finish"}
-    for path in Path(tables.__file__).parent.glob("*.py"):
-        for call in ast.walk(ast.parse(path.read_text())):
-            if isinstance(call, ast.Call) and isinstance(call.func, ast.Attribute) and call.func.attr in readers:
-                asked |= {str(each.value) for each in call.args[:1] if isinstance(each, ast.Constant)}
-    assert asked == KEYS
 
 
 MODELS = {
