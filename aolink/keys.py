@@ -1,4 +1,4 @@
-"""Tables of a file whose keys are declared once, as fields of dataclasses; what is wrong is one error that names the key.
+"""Tables of a file whose keys are declared once, as fields of dataclasses; an error names the key.
 
 A field's annotation says what its key takes, its docstring what that means and in which unit; a field with a default
 may be left out. Beside ``int``, ``float``, ``bool``, ``str``, ``dict``, tuples of one kind, dataclasses and literals
@@ -12,7 +12,7 @@ import sys
 from collections.abc import Iterable, Sequence
 from dataclasses import MISSING, dataclass, fields, is_dataclass
 from difflib import get_close_matches
-from functools import lru_cache
+from functools import cache
 from types import UnionType
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
@@ -71,7 +71,7 @@ def read(cls: type[_Read], values: Any, key: str, sizes: dict[str, int] | None =
     checked(dict, values, key)
     sizes = {} if sizes is None else sizes
     begin = f"{key}." if key else ""
-    known = {name: each for name, each in _declared(cls).items() if name not in given}
+    known = {name: each for name, each in _declared(cls).items() if name not in given}  # type: ignore[arg-type]
     strange = [name for name in values if name not in known]
     for name, (kind, default) in known.items():
         value = values.get(name, default)
@@ -87,7 +87,7 @@ def read(cls: type[_Read], values: Any, key: str, sizes: dict[str, int] | None =
     return cls(**given)
 
 
-@lru_cache
+@cache
 def _declared(cls: Any) -> dict[str, tuple[Any, Any]]:
     """Kind of each key, and what stands for one that is left out: MISSING if it must be there, None for the field's own
     default."""
@@ -111,7 +111,7 @@ def checked(kind: Any, value: Any, key: str, sizes: dict[str, int] | None = None
     if callable(note):
         return note(value, key)
     if is_dataclass(kind):
-        return read(kind, value, key, sizes)  # type: ignore[type-var] # a class, not one of its values
+        return read(kind, value, key, sizes)  # type: ignore[arg-type] # a class, not one of its values
     if origin is Literal and value not in inner:
         raise RigError(f"{key} = {shown(value)} is not known: use one of {', '.join(inner)}")
     if origin is tuple:

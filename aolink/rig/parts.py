@@ -320,7 +320,7 @@ def parse_light(text: Any, name: str) -> tuple[Light, ...]:
             density = math.nan
         if density is not None and not 0 < density < math.inf:
             raise RigError(f"{name}: the density of {word.strip()!r} must be a number above 0")
-        lights.append(Light(kind=kind, level=density))  # type: ignore[arg-type] # one of the four, as checked
+        lights.append(Light(kind=kind, level=density))
     return tuple(lights)
 
 

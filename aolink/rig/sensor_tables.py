@@ -30,7 +30,7 @@ class CalibrationTable:
     """Kind, name and SHA-256 of each recording that was used."""
 
 
-_READ_NOISE = ("read_noise_counts", "read_noise_electrons")
+READ_NOISE = ("read_noise_counts", "read_noise_electrons")
 """Keys in place of ``noise_density``: standard deviation of a pixel by read-out noise, counts or electrons."""
 
 
@@ -46,9 +46,9 @@ def read_sensor(
     if field and "field" in values:
         raise RigError("sensor.field follows from [lenslets]: leave it out")
     given: dict[str, Any] = {"field": field} if field else {}
-    noises = {name: checked(NotNegative, values[name], f"sensor.{name}") for name in _READ_NOISE if name in values}
+    noises = {name: checked(NotNegative, values[name], f"sensor.{name}") for name in READ_NOISE if name in values}
     if len(noises) + ("noise_density" in values and bool(noises)) > 1:
-        raise RigError(f"sensor has more than one of noise_density, {', '.join(_READ_NOISE)}: give one")
+        raise RigError(f"sensor has more than one of noise_density, {', '.join(READ_NOISE)}: give one")
     if noises:
         values = {name: value for name, value in values.items() if name not in noises} | {"noise_density": 0.0}
     if kind == "line":

@@ -70,7 +70,8 @@ def _plant_by_matrices(values: dict[str, Any]) -> Plant:
     if not plant.C.any():
         raise RigError("plant.C is zero: the camera sees nothing of the plant, nothing is observable")
     _check_covariance(plant.process_noise, "plant.process_noise")
-    if isinstance(plant.initial_covariance, str) and plant.initial_covariance == "stationary":
+    initial: Any = plant.initial_covariance
+    if isinstance(initial, str) and initial == "stationary":
         if radius > 1 - 1e-9:
             raise RigError(
                 f"plant.initial_covariance is missing: plant.A has an eigenvalue of modulus {radius:.6g}, so there is"
@@ -79,7 +80,7 @@ def _plant_by_matrices(values: dict[str, Any]) -> Plant:
         covariance = stationary_covariance(plant.A, plant.B_w @ plant.process_noise @ plant.B_w.T)
     else:
         key = "plant.initial_covariance"
-        covariance = array(plant.initial_covariance, key, ("states", "states"), sizes)
+        covariance = array(initial, key, ("states", "states"), sizes)
         _check_covariance(covariance, key)
     return replace(plant, initial_covariance=covariance)
 
