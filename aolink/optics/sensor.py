@@ -100,7 +100,8 @@ class BaseSensor(ABC):
     field: Annotated[tuple[float, float], pair]
     """Outer edges of the first and the last pixel that see a spot, slope units; the same in both directions."""
     noise_density: NotNegative
-    """V: a pixel of size D that holds the mean density has noise variance V/D (Mishra & Wen, section V)."""
+    """V: a pixel of size D that holds the mean density has noise variance V/D (Mishra & Wen, section V). In its place
+    ``read_noise_counts`` or, beside ``photoelectrons``, ``read_noise_electrons``: a pixel's standard deviation."""
     kernel: Annotated[Kernel, read_kernel]
     bit_depth: BitDepth = 16
     black_level: NotNegative = 0.0

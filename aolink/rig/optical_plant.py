@@ -99,7 +99,9 @@ class _Mirror:
     """Variance of the noise that adds to each input in a fast step, units of the input squared; with ``drift_s`` of
     the noise that drives each drift."""
     resonance_hz: Positive
+    """Of each actuator, Hz."""
     damping: Positive
+    """Share of critical damping."""
     drift_s: Positive | None = None
     """Time in which the inputs' drift falls to 1/e, s."""
     unmodelled: Any = None

@@ -65,6 +65,7 @@ class Wandering:
 @dataclass(frozen=True, kw_only=True)
 class _Drifts:
     rate_per_minute: Positive
+    """Standard deviation of the relative change in a minute; of the others one, the largest relative change."""
     frequency: Annotated[float, Within(above=0.0, high=0.2)] | None = None
     gain: Annotated[float, Within(above=0.0, high=0.5)] | None = None
     process_noise: Annotated[float, Within(above=0.0, high=3.0)] | None = None
@@ -106,7 +107,7 @@ class Plant:
     axes: Annotated[int, Within(1, 10_000)] = 1
     """Number of independent copies."""
     unmodelled: Annotated[UnmodelledSlopes | None, as_it_is] = None
-    """The estimators' model of slopes beside C x(k); None for no such slopes."""
+    """The estimators' model of slopes beside C x(k), as a fitting error and turbulence; None for no such slopes."""
     wandering: Annotated[Wandering | None, read_wandering] = None
     """The drift that estimators follow; None for none."""
     disturbance_states: int = 0
@@ -192,6 +193,7 @@ class Drive:
     amplitude: Annotated[FloatArray, Shape("inputs")]
     """(axes * n_inputs,)"""
     period_s: Positive
+    """Period of the sine, s."""
     offset: Annotated[FloatArray, Shape("inputs", default=0.0)]
     """(axes * n_inputs,)"""
 

@@ -154,7 +154,7 @@ def scene_text(**changes: object) -> str:
     ("changes", "message"),
     [
         ({"pixel_scale": 0}, r"scene\.pixel_scale = 0 must be above 0"),
-        ({"picture_pixels": 0}, r"scene\.picture_pixels: expected a whole number from 1 to 64"),
+        ({"picture_pixels": 0}, r"scene\.picture_pixels = 0 must be at least 1"),
         ({"noise_sd": -1}, r"scene\.noise_sd = -1 must be at least 0"),
         ({"counts_per_intensity": "3500\nspeed = 3"}, r"scene\.speed is not a key that aolink knows"),
         ({"picture": 3}, r"scene\.picture: expected text, found 3"),
