@@ -113,13 +113,14 @@ def checked(kind: Any, value: Any, key: str, sizes: dict[str, int] | None = None
     if is_dataclass(kind):
         return read(kind, value, key, sizes)  # type: ignore[arg-type] # a class, not one of its values
     if origin is Literal and value not in inner:
-        raise RigError(f"{key} = {shown(value)} is not known: use one of {', '.join(inner)}")
+        what = "is missing" if value is None else f"= {shown(value)} is not known"
+        raise RigError(f"{key} {what}: use one of {', '.join(inner)}")
     if origin is tuple:
         size = "" if inner[-1] is Ellipsis else f" of {len(inner)}"
         if not isinstance(value, list) or (size and len(value) != len(inner)):
             raise RigError(f"{key}: expected a list{size}, found {shown(value)}")
         return tuple(checked(inner[0], each, f"{key}[{k}]", sizes) for k, each in enumerate(value))
-    if kind in _KINDS:
+    if (kind := dict if origin is dict else kind) in _KINDS:
         is_number = kind in (int, float)
         allowed = (int, float) if kind is float else (kind,)
         if type(value) not in allowed or (is_number and not abs(value) <= sys.float_info.max):

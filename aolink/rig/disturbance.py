@@ -182,7 +182,7 @@ _MODELS: dict[str, Any] = {
 def _model(values: dict[str, Any], key: str, n_outputs: int, fast_step_s: float) -> DisturbanceModel:
     """One part of ``disturbance.model``: a system given by its kind, for each of its mode shapes, or by its
     matrices."""
-    kind = checked(Literal[*_MODELS], values.get("kind", ""), f"{key}.kind")
+    kind = checked(Literal[*_MODELS], values.get("kind"), f"{key}.kind")
     sizes = {"outputs": n_outputs} | ({} if "modes" in values else {"modes": n_outputs})
     table = read(_MODELS[kind], {name: each for name, each in values.items() if name != "kind"}, key, sizes)
     if kind == "matrices":

@@ -42,7 +42,7 @@ def read_sensor(
 
     ``field`` and ``light`` follow from the lenslets where the rig file describes them.
     """
-    kind = checked(Literal["line", "spots"], values.get("kind", ""), "sensor.kind")
+    kind = checked(Literal["line", "spots"], values.get("kind"), "sensor.kind")
     if field and "field" in values:
         raise RigError("sensor.field follows from [lenslets]: leave it out")
     given: dict[str, Any] = {"field": field} if field else {}
