@@ -120,12 +120,13 @@ def checked(kind: Any, value: Any, key: str, sizes: dict[str, int] | None = None
         if not isinstance(value, list) or (size and len(value) != len(inner)):
             raise RigError(f"{key}: expected a list{size}, found {shown(value)}")
         return tuple(checked(inner[0], each, f"{key}[{k}]", sizes) for k, each in enumerate(value))
-    if (kind := dict if origin is dict else kind) in _KINDS:
-        is_number = kind in (int, float)
-        allowed = (int, float) if kind is float else (kind,)
+    plain: Any = origin or kind
+    if plain in _KINDS:
+        is_number = plain in (int, float)
+        allowed = (int, float) if plain is float else (plain,)
         if type(value) not in allowed or (is_number and not abs(value) <= sys.float_info.max):
-            raise RigError(f"{key}: expected {_KINDS[kind]}, found {shown(value)}")
-        return _within(kind(value), note or Within(), key) if is_number else value
+            raise RigError(f"{key}: expected {_KINDS[plain]}, found {shown(value)}")
+        return _within(plain(value), note or Within(), key) if is_number else value
     return value
 
 
