@@ -1,8 +1,11 @@
 """The command `estimate`: one recording, or many."""
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import Executor
+from contextlib import AbstractContextManager
 from enum import StrEnum
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -100,6 +103,7 @@ def estimate(
     from aolink.estimation.registry import DEFAULT_ESTIMATOR
     from aolink.jobs import batch
     from aolink.jobs.tables import parquet as load_parquet
+    from aolink.recording.remote import Url, location
 
     if table is not None:
         if table.suffix.lower() == ".parquet":  # any other name is refused, and needs no folder
@@ -108,7 +112,8 @@ def estimate(
         load_parquet()
     sources = batch.shard(files, shard) if shard else files
     if scheduler:  # the workers run in other folders
-        sources, output = [batch.absolute(each) for each in sources], output.absolute()
+        sources = [each if isinstance(location(each), Url) else str(Path(each).absolute()) for each in sources]
+        output = output.absolute()
     todo = batch.jobs(
         sources, models, estimator or [DEFAULT_ESTIMATOR], output, engine.value,
         table=table is not None, overwrite=overwrite,
@@ -153,16 +158,17 @@ def _estimate_many(
 
     _make_folder(folder)
     # The table's file is locked from the start, so that the same part, if begun twice, is refused.
-    with writing(table, overwrite=True) as partial:
+    with writing(table, overwrite=True) as unfinished:
         with StopRequest().installed() as stop, progress("estimate", len(todo)) as tell:
+            at_once = min(workers, len(todo))
+            executor: Callable[[], AbstractContextManager[Executor]] = partial(batch.here, at_once)
             if scheduler:
-                from aolink.jobs.cluster import run_on
+                from aolink.jobs.cluster import AT_ONCE, workers_of
 
-                done = _printed(run_on(scheduler, todo, stop=stop, progress=tell))
-            else:
-                done = _printed(batch.run_here(todo, workers, stop=stop, progress=tell))
+                executor, at_once = partial(workers_of, scheduler), AT_ONCE
+            done = _printed(batch.run(todo, executor, at_once, stop=stop, progress=tell))
         rows = batch.table_rows(done)
-        fill_table(partial, rows, table.suffix)
+        fill_table(unfinished, rows, table.suffix)
         if of_exposures is not None:
             parts = [table_beside(each.job.output) for each in done if not each.error]
             join_tables(sorted(parts), of_exposures)

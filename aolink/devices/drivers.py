@@ -12,9 +12,9 @@ from typing import Any, Literal, get_args, get_origin
 from aolink.devices.simple import FREE_RUNNING, Trigger
 from aolink.errors import AolinkError, DeviceError, RigError
 from aolink.extensions import installed, loaded
+from aolink.keys import shown
 from aolink.rig import Rig
 from aolink.rig.device_tables import DeviceTable
-from aolink.rig.toml_table import shown
 from aolink.wire.packet import NO_SIGNING
 from aolink.wire.port import check_address
 

@@ -6,10 +6,10 @@ import itertools
 import json
 import re
 import tomllib
-from collections import Counter, deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, wait
-from concurrent.futures.process import BrokenProcessPool
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Executor, Future, wait
+from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -19,9 +19,13 @@ from aolink.estimation import Engine
 from aolink.exporting.common import Progress, no_progress
 from aolink.files import remove_unfinished
 from aolink.jobs.tables import COLUMNS
-from aolink.jobs.unit import Model, Settings, estimated
+from aolink.jobs.unit import Model, Settings, aolink_version, estimated
 from aolink.numerics.workers import processes
-from aolink.recording.remote import Url, location
+from aolink.recording.remote import location
+
+_POLL_S = 0.2
+"""Time between two checks whether the user wants to stop, s."""
+_LOST = "its process was ended from outside: too little memory, or a signal"
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,11 +36,6 @@ class Job:
     """A file or a URL."""
     output: Path
     settings: Settings
-
-    @property
-    def model(self) -> Model:
-        """The model that the recording is estimated with."""
-        return self.settings.model
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,17 +74,21 @@ def models(rig_text: str | None, settings: Sequence[str], rig_name: str = "") ->
     """
     axes: dict[str, list[Any]] = {}
     for setting in settings:
-        key, equals, values = setting.partition("=")
-        if not equals or not key.strip() or not values.strip():
+        key, equals, values = map(str.strip, setting.partition("="))
+        if not (key and equals and values):
             raise RigError(f"--set {setting}: KEY=VALUE or KEY=VALUE,VALUE is needed, as plant.process_noise=0.2,0.4")
-        known = axes.setdefault(key.strip(), [])
-        for value in _values(values, setting):
-            if value not in known:
-                known.append(value)
+        try:
+            found = tomllib.loads(f"values = [{values}]")["values"]
+        except tomllib.TOMLDecodeError:
+            raise RigError(
+                f"--set {setting}: {values} is no number, nor a text in quotation marks, as TOML has them"
+            ) from None
+        known = axes.setdefault(key, [])
+        known += (value for value in found if value not in known)
     made = []
     for values_of_one in itertools.product(*axes.values()):
         changes = tuple(zip(axes, values_of_one, strict=True))
-        name = " ".join([rig_name, *(f"{key}={_short(value)}" for key, value in changes)]).strip()
+        name = " ".join([rig_name, *(f"{key}={value}".replace(" ", "") for key, value in changes)]).strip()
         made.append(Model(name=name, rig_text=rig_text, changes=changes))
     return made
 
@@ -108,23 +111,15 @@ def jobs(
             f"{folder} has copies of recordings from a batch of an earlier aolink: give another folder, and the same"
             " command estimates them again, into side files"
         )
-    made = []
+    made = {}
     for source, model, name in itertools.product(dict.fromkeys(sources), each, dict.fromkeys(estimators)):
-        settings = Settings(estimator=name, model=model, engine=engine, table=table, overwrite=overwrite)
-        made.append(Job(source, folder / f"{_name(location(source).stem, model)}.{name}.mcap", settings))
-    _check_all_differ(job.output for job in made)
-    return made
-
-
-def _name(stem: str, model: Model) -> str:
-    suffix = "".join(c if c.isalnum() or c in "=.-_" else "-" for c in model.name.replace("plant.", ""))
-    return f"{stem}-{suffix}" if suffix else stem
-
-
-def _check_all_differ(outputs: Iterable[Path]) -> None:
-    for output, count in Counter(outputs).items():
-        if count > 1:
+        suffix = re.sub(r"[^\w=.-]", "-", model.name.replace("plant.", ""))
+        output = folder / f"{'-'.join(filter(None, [location(source).stem, suffix]))}.{name}.mcap"
+        if output in made:
             raise RigError(f"two recordings would be written as {output.name}: give them different names")
+        settings = Settings(estimator=name, model=model, engine=engine, table=table, overwrite=overwrite)
+        made[output] = Job(source, output, settings)
+    return list(made.values())
 
 
 def shard(sources: Sequence[str], part: str) -> list[str]:
@@ -137,62 +132,79 @@ def shard(sources: Sequence[str], part: str) -> list[str]:
     AolinkError
         ``part`` is not of that form.
     """
-    found = re.fullmatch(r"([0-9]{1,9})/([0-9]{1,9})", part)
-    number, count = (int(found[1]), int(found[2])) if found else (0, 0)
-    if not 1 <= number <= count:
+    if not (found := re.fullmatch(r"([0-9]{1,9})/([0-9]{1,9})", part)) or not 1 <= int(found[1]) <= int(found[2]):
         raise AolinkError(f"--shard {part}: I/N is needed, with I from 1 to N, as 1/100 to 100/100")
-    return sorted(set(sources))[number - 1 :: count]
+    return sorted(set(sources))[int(found[1]) - 1 :: int(found[2])]
 
 
-def absolute(source: str) -> str:
-    """A path as a process in another folder needs it; a URL as it is."""
-    return source if isinstance(location(source), Url) else str(Path(source).absolute())
+def here(workers: int) -> AbstractContextManager[Executor]:
+    """Processes of this machine that do jobs; for one worker this process itself does them."""
+    return processes(workers) if workers > 1 else _Here()
 
 
-def run_here(
-    todo: Sequence[Job], workers: int, *, stop: Callable[[], bool] = lambda: False,
-    progress: Progress = no_progress,
+class _Here(Executor):
+    def submit(self, function: Callable[..., Any], /, *arguments: Any, **options: Any) -> Future[Any]:
+        """Call the function at once."""
+        future: Future[Any] = Future()
+        future.set_result(function(*arguments, **options))
+        return future
+
+
+def run(
+    todo: Sequence[Job], executor: Callable[[], AbstractContextManager[Executor]], at_once: int, *,
+    stop: Callable[[], bool] = lambda: False, progress: Progress = no_progress,
 ) -> Iterator[Done]:  # fmt: skip
-    """Do the jobs on ``workers`` processes; gives each when it is done, in no order. A failed one stops no other.
+    """Do jobs with an executor, each as a call of its own; gives each when it is done, in no order.
 
-    When ``stop()`` gives True no other job is begun, and those under way are ended in good order.
+    A failed job stops no other. When ``stop()`` gives True no other job is begun, those that wait in the executor are
+    taken back, and those under way are waited for, except on Dask, which does not say which those are.
+
+    Parameters
+    ----------
+    executor:
+        Opens the executor, and does so again where one has broken because a process of it was lost.
+    at_once:
+        How many jobs to give to the executor at once. A local pool is given no more than it has processes: a job that
+        waits in a pool cannot be taken back.
+
+    Raises
+    ------
+    CancelledError
+        The executor has given up a job.
     """
+    queue, count = deque(todo), itertools.count(1)
     progress(0)
-    each = map(do, itertools.takewhile(lambda job: not stop(), todo))
-    for count, done in enumerate(each if workers == 1 or len(todo) < 2 else _in_parallel(todo, workers, stop), 1):
-        yield done
-        progress(count)
-
-
-def _in_parallel(todo: Sequence[Job], workers: int, stop: Callable[[], bool]) -> Iterator[Done]:
-    queue = deque(todo)
-    while queue and not stop():  # again, if a process was lost and its pool with it
+    while queue and not stop():
         running: dict[Future[Done], Job] = {}
-        lost, broken = False, list[Job]()
         try:
-            with processes(workers) as pool:
-                while running or (queue and not lost and not stop()):
-                    # No more than can run: a job that waits in a pool cannot be taken back.
-                    while queue and not lost and len(running) < workers and not stop():
-                        try:
-                            running[pool.submit(do, queue[0])] = queue[0]
-                        except BrokenProcessPool:
-                            lost = True
-                        else:
-                            queue.popleft()
-                    finished, _ = wait(running, timeout=0.2, return_when=FIRST_COMPLETED)
-                    for future in finished:
-                        job = running.pop(future)
-                        try:
-                            done = future.result()
-                        except BrokenProcessPool:
-                            lost = True
-                            broken.append(job)
-                            done = Done(job, error="its process was ended from outside: too little memory, or a signal")
+            with executor() as pool, suppress(BrokenExecutor):
+                while running or (queue and not stop()):
+                    while queue and len(running) < at_once and not stop():
+                        running[pool.submit(do, queue[0], aolink_version())] = queue[0]
+                        queue.popleft()
+                    if stop():
+                        running = {future: job for future, job in running.items() if not future.cancel()}
+                    for future in wait(running, _POLL_S, FIRST_COMPLETED).done:
+                        done = _result(future, running[future])
+                        del running[future]
                         yield done
+                        progress(next(count))
         finally:
-            for job in [*running.values(), *broken]:
+            for job in running.values():
                 remove_unfinished(job.output)
+        for future, job in running.items():  # those that the executor had when it broke
+            yield Done(job, error=_LOST) if future.exception() else future.result()
+            progress(next(count))
+
+
+def _result(future: Future[Done], job: Job) -> Done:
+    try:
+        return future.result()
+    except (BrokenExecutor, CancelledError):
+        raise
+    except Exception as error:
+        lost = type(error).__name__ == "KilledWorker"  # Dask's: every worker that began the job was lost
+        return Done(job, error=_LOST if lost else f"its worker cannot do it: {error!r}")
 
 
 def table_rows(done: Sequence[Done]) -> list[dict[str, Any]]:
@@ -222,8 +234,15 @@ def _is_record_of_a_copy(path: Path) -> bool:
         return False
 
 
-def do(job: Job) -> Done:
-    """Do a job; any error becomes its result."""
+def do(job: Job, version: str) -> Done:
+    """Do a job; any error becomes its result.
+
+    ``version`` is that of the aolink which asks: a worker of another machine may have another one.
+    """
+    if aolink_version() != version:
+        return Done(
+            job, error=f"a worker has aolink {aolink_version()}, this is {version}: install the same everywhere"
+        )
     try:
         row, before = estimated(job.source, job.output, job.settings)
     except (AolinkError, OSError) as error:
@@ -231,17 +250,3 @@ def do(job: Job) -> Done:
     except Exception as error:  # an unforeseen error stops no other job
         return Done(job, error=f"it cannot be estimated with this model: {error!r}")
     return Done(job, row, skipped=before)
-
-
-def _values(text: str, setting: str) -> list[Any]:
-    """Values divided by commas that are not inside brackets, as TOML reads them."""
-    try:
-        return list(tomllib.loads(f"values = [{text}]")["values"])
-    except tomllib.TOMLDecodeError:
-        raise RigError(
-            f"--set {setting}: {text} is no number, nor a text in quotation marks, as TOML has them"
-        ) from None
-
-
-def _short(value: Any) -> str:
-    return str(value).replace(" ", "")

@@ -14,6 +14,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from aolink.keys import Positive
 from aolink.numerics.arrays import FloatArray
 
 
@@ -74,10 +75,10 @@ def square_pads(rows: int, columns: int, pitch_m: float) -> FloatArray:
 class VoltageLaw:
     """An electrostatic actuator pulls with gamma V^2, Mishra & Wen, section II; inputs are relative to the bias."""
 
-    gamma: float
+    gamma: Positive
     """Input units per V^2."""
-    bias_v: float
-    max_v: float
+    bias_v: Positive
+    max_v: Positive
 
     @property
     def input_range(self) -> tuple[float, float]:

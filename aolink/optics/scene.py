@@ -6,34 +6,41 @@ An intensity of one is the brightest that a picture file of whole numbers can ho
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 
+from aolink.keys import NotNegative, Positive, Within
 from aolink.numerics.arrays import BoolArray, FloatArray
-from aolink.optics.sensor import Kernel
+from aolink.optics.sensor import BitDepth, Kernel, read_kernel
 
 
 @dataclass(frozen=True, kw_only=True)
 class SceneSensor:
     """The picture sensor."""
 
-    shape: tuple[int, int]
+    pixels: tuple[Annotated[int, Within(2, 8192)], Annotated[int, Within(2, 8192)]]
     """Rows and columns of pixels."""
-    pixel_scale: float
+    pixel_scale: Positive
     """Slope units of the spot that move the scene by one pixel."""
-    kernel: Kernel
+    kernel: Annotated[Kernel, read_kernel]
     """Image kernel of the picture's optics; its width is in slope units, as the spot's."""
-    noise_sd: float
+    noise_sd: NotNegative
     """Standard deviation of a pixel's intensity by read-out noise."""
-    bit_depth: int
-    black_level: float
+    bit_depth: BitDepth = 16
+    black_level: NotNegative = 0.0
     """Counts of a dark pixel."""
-    counts_per_intensity: float
-    picture: str
+    counts_per_intensity: Positive
+    picture: str = ""
     """Picture that a simulated rig shows: a file beside the rig file, or one that comes with aolink; may be empty."""
-    picture_pixels: int
+    picture_pixels: Annotated[int, Within(1, 64)] = 1
     """Rows and columns of the picture's own pixels in one of the sensor's."""
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns of pixels."""
+        return self.pixels
 
     @property
     def full_scale(self) -> int:
@@ -74,4 +81,4 @@ def framed_rows(sensor: SceneSensor, picture: FloatArray) -> FloatArray:
 
 def framed_columns(sensor: SceneSensor, picture: FloatArray) -> FloatArray:
     """The picture as by `framed`, for the columns alone, (the picture's rows, columns)."""
-    return framed_rows(replace(sensor, shape=sensor.shape[::-1]), picture.T).T
+    return framed_rows(replace(sensor, pixels=sensor.shape[::-1]), picture.T).T

@@ -10,10 +10,12 @@ import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 
+from aolink.errors import RigError
+from aolink.keys import Count, NotNegative, Positive, Within, array, checked, pair, read
 from aolink.numerics.arrays import BoolArray, FloatArray, Indices
 
 KERNEL_WIDTHS = {"sigma": 1.0, "sd": math.sqrt(2.0), "fwhm": 1 / (2 * math.sqrt(math.log(2.0)))}
@@ -46,6 +48,44 @@ class Kernel:
 
 
 @dataclass(frozen=True, kw_only=True)
+class _Width:
+    shape: Literal["gaussian"]
+    sigma: Any = None
+    """As `Kernel.sigma`, or as `Kernel.matrix`."""
+    sd: Positive | None = None
+    """Standard deviation, slope units, in place of ``sigma``."""
+    fwhm: Positive | None = None
+    """Full width at half maximum, slope units, in place of ``sigma``."""
+
+
+def read_kernel(values: Any, key: str) -> Kernel:
+    """Read a table ``kernel``. Raises `RigError`."""
+    shape = read(_Width, values, key).shape
+    given = [name for name in KERNEL_WIDTHS if name in values]
+    if len(given) != 1:
+        both = f"{key}.{given[0]} and {key}.{given[1]} both say how wide the kernel is" if given else ""
+        raise RigError(f"{both or f'{key}.sigma is missing'}: give one of {', '.join(KERNEL_WIDTHS)}")
+    (name,) = given
+    if not isinstance(values[name], list):
+        return Kernel(shape=shape, sigma=KERNEL_WIDTHS[name] * checked(Positive, values[name], f"{key}.{name}"))
+    width = array(values[name], f"{key}.{name}", ("x, y", "x, y"), {"x, y": 2})
+    if width[0, 1] != width[1, 0] or float(np.linalg.eigvalsh(width).min()) <= 0:
+        raise RigError(f"{key}.sigma = {width.tolist()} must be symmetric and positive definite")
+    (xx, xy), (_, yy) = width.tolist()
+    mean = math.sqrt((xx * xx + yy * yy) / 2 + xy * xy)  # of Sigma^2's diagonal
+    return Kernel(shape=shape, sigma=mean, matrix=((xx, xy), (xy, yy)))
+
+
+def _places(value: Any, key: str) -> tuple[tuple[int, int], ...]:
+    return tuple(sorted({*checked(tuple[tuple[Count, Count], ...], value, key)}))
+
+
+BitDepth = Annotated[int, Within(1, 16)]
+Windows = Annotated[int, Within(1, 256)]
+Side = Annotated[int, Within(2, 256)]
+
+
+@dataclass(frozen=True, kw_only=True)
 class BaseSensor(ABC):
     """The common part of all sensors: equal pixels, each spot seen on ``field``, an integer read-out.
 
@@ -57,19 +97,20 @@ class BaseSensor(ABC):
     """Directions in which a spot is seen: along a line, or in x and y."""
     grid = (1, 1)
     """Rows and columns of windows."""
-    field: tuple[float, float]
+    field: Annotated[tuple[float, float], pair]
     """Outer edges of the first and the last pixel that see a spot, slope units; the same in both directions."""
-    noise_density: float
-    """V: a pixel of size D that holds the mean density has noise variance V/D (Mishra & Wen, section V)."""
-    kernel: Kernel
-    bit_depth: int
-    black_level: float
+    noise_density: NotNegative
+    """V: a pixel of size D that holds the mean density has noise variance V/D (Mishra & Wen, section V). In its place
+    ``read_noise_counts`` or, beside ``photoelectrons``, ``read_noise_electrons``: a pixel's standard deviation."""
+    kernel: Annotated[Kernel, read_kernel]
+    bit_depth: BitDepth = 16
+    black_level: NotNegative = 0.0
     """Counts of a pixel that sees nothing."""
-    counts_per_density: float
+    counts_per_density: Positive
     """Counts for a density of one."""
-    photoelectrons: float = 0.0
+    photoelectrons: NotNegative = 0.0
     """Photo-electrons of a whole spot in one exposure; 0 means that shot noise is negligible."""
-    defects: tuple[tuple[int, int], ...] = ()
+    defects: Annotated[tuple[tuple[int, int], ...], _places] = ()
     """Row and column of each pixel that is hot, dead or otherwise wrong."""
     pedestal: Literal["known", "free"] = "known"
     """Whether ``black_level`` is what a pixel in the dark gives, or that is found in each window of each frame."""
@@ -144,7 +185,7 @@ class Sensor(BaseSensor):
     """A line sensor: one spot on a row of pixels."""
 
     kind: Literal["line"]
-    pixels: int
+    pixels: Annotated[int, Within(2, 65_536)]
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -189,8 +230,8 @@ class SpotSensor(BaseSensor):
 
     kind: Literal["spots"]
     directions = 2
-    grid: tuple[int, int] = field()  # one that has to be given, unlike a line's
-    window: tuple[int, int]
+    grid: tuple[Windows, Windows] = field()  # one that has to be given, unlike a line's
+    window: tuple[Side, Side]
     """Rows and columns of pixels in a window; a square."""
     light: tuple[float, ...] | None = None
     """Share of each window's lenslet that is lit, along the rows of the grid; 0 without a spot; None where all are

@@ -11,11 +11,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from aolink.keys import Positive, pair
 from aolink.numerics.arrays import FloatArray
 from aolink.optics.lenslets import Lenslets
 
@@ -30,12 +32,12 @@ _POINTS = 32
 class Layer:
     """One layer of turbulence."""
 
-    r0_m: float
+    r0_m: Positive
     """Fried's parameter at ``wavelength_m``, m."""
-    wind_m_s: tuple[float, float]
+    wind_m_s: Annotated[tuple[float, float], pair]
     """Wind along x and y, m/s."""
-    outer_scale_m: float = 25.0
-    wavelength_m: float = 500e-9
+    outer_scale_m: Positive = 25.0
+    wavelength_m: Positive = 500e-9
 
 
 class FrozenFlow:

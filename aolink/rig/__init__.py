@@ -2,9 +2,21 @@
 
 from aolink.optics.sensor import Kernel, Sensor, SpotSensor
 from aolink.rig.file import Rig, builtin_rigs, load_rig, parse_rig
-from aolink.rig.parts import Control, Drive, Faults, Light, MirrorDriver, Plant, Simulation, Timing, Wandering, Wanders
+from aolink.rig.parts import (
+    Control,
+    Drive,
+    Faults,
+    Light,
+    MirrorDriver,
+    Plant,
+    Simulation,
+    Timing,
+    Wandering,
+    Wanders,
+    parse_light,
+)  # fmt: skip
 from aolink.rig.sensor_tables import CalibrationTable
-from aolink.rig.tables import parse_light, with_faults
+from aolink.rig.tables import with_faults
 
 __all__ = [
     "CalibrationTable", "Control", "Drive", "Faults", "Kernel", "Light", "MirrorDriver", "Plant", "Rig", "Sensor",

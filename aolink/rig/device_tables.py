@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from aolink.rig.toml_table import Table
+from aolink.keys import NotNegative, read
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,17 +33,26 @@ class DeviceTable:
     """The other keys of the table; the driver checks them."""
 
 
-def read_devices(table: Table) -> dict[str, DeviceTable]:
+@dataclass(frozen=True, kw_only=True)
+class _Devices:
+    camera: dict[str, Any] | None = None
+    mirror: dict[str, Any] | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Device:
+    driver: str
+    delay_s: float | None = None
+    delay_sd_s: NotNegative | None = None
+
+
+def read_devices(values: Any, key: str) -> dict[str, DeviceTable]:
     """Read the table ``[devices]``; its devices are given by the names ``camera`` and ``mirror``. Raises `RigError`."""
     devices = {}
-    for kind in ("camera", "mirror"):
-        if table.has(kind):
-            device = table.table(kind)
-            devices[kind] = DeviceTable(driver=device.text("driver"), delay=_delay(device), options=device.others())
+    for kind in vars(read(_Devices, values, key)).keys() & values.keys():
+        options = dict(values[kind])
+        own = {name: options.pop(name) for name in _Device.__dataclass_fields__ if name in options}
+        table = read(_Device, own, f"{key}.{kind}")
+        delay = Delay(mean_s=table.delay_s or 0.0, sd_s=table.delay_sd_s or 0.0) if len(own) > 1 else None
+        devices[kind] = DeviceTable(driver=table.driver, delay=delay, options=options)
     return devices
-
-
-def _delay(device: Table) -> Delay | None:
-    if not (device.has("delay_s") or device.has("delay_sd_s")):
-        return None
-    return Delay(mean_s=device.number("delay_s", 0.0), sd_s=device.number("delay_sd_s", 0.0, low=0.0))

@@ -5,24 +5,26 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import scipy
 
 from aolink.errors import RigError
+from aolink.keys import Positive, Shape, checked, pair, read
 from aolink.numerics.arrays import FloatArray
 from aolink.numerics.block_diagonal import stationary_covariance
 from aolink.optics.mirror import second_order
 from aolink.optics.turbulence import Layer
-from aolink.rig.toml_table import Table
+from aolink.rig.optical_plant import check_frequency, variances
 
 
 @dataclass(frozen=True, kw_only=True)
 class Vibration:
     """A sinusoidal vibration of all spots' slopes; its phase depends on the seed."""
 
-    frequency_hz: float
-    amplitude: tuple[float, float]
+    frequency_hz: Positive
+    amplitude: Annotated[tuple[float, float], pair]
     """Amplitude along x and y, slope units; a line sensor sees x."""
 
 
@@ -66,21 +68,55 @@ class Disturbance:
     model."""
 
 
-def read_disturbance(table: Table, n_outputs: int, fast_step_s: float) -> Disturbance:
+@dataclass(frozen=True, kw_only=True)
+class _Turbulence:
+    pupil_m: Positive
+    """Width that all columns of lenslets cover together, m."""
+    layers: tuple[dict[str, Any], ...]
+    outer_scale_m: Positive = 25.0
+    wavelength_m: Positive = 500e-9
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Table:
+    plant_noise: bool = True
+    """Whether the simulated plant and ``model`` make their own noise as well."""
+    turbulence: _Turbulence | None = None
+    vibration: tuple[Vibration, ...] = ()
+    zernike_m: Annotated[FloatArray, Shape("terms", "Noll's index and metres")] | None = None
+    """Static aberration: Noll's index and metres rms over the circle about the lenslets, (terms, 2)."""
+    recorded: str = ""
+    """A file with slopes at each fast step, slope units, (steps, outputs), played in a loop."""
+    model: tuple[dict[str, Any], ...] = ()
+
+
+def read_disturbance(values: dict[str, Any], n_outputs: int, fast_step_s: float) -> Disturbance:
     """Read the table ``[disturbance]`` of a rig whose plant has ``n_outputs`` outputs a copy. Raises `RigError`."""
-    pupil, layers = table.read_any("turbulence", _turbulence) or (0.0, ())
-    zernike = table.matrix("zernike_m", (None, 2), "Noll's index and metres") if table.has("zernike_m") else None
+    table = read(_Table, values, "disturbance", {"Noll's index and metres": 2})
+    zernike, air = table.zernike_m, table.turbulence
     if zernike is not None and not all(index >= 2 and index == round(index) for index in zernike[:, 0]):
-        raise RigError(f"{table.key('zernike_m')}: each row begins with one of Noll's indices, a whole number from 2")
-    return Disturbance(
-        plant_noise=table.flag("plant_noise", True),
-        layers=layers,
-        pupil_m=pupil,
-        vibrations=table.read_all("vibration", _vibration),
-        zernike_m=np.zeros((0, 2)) if zernike is None else zernike,
-        recorded=table.text("recorded", ""),
-        model=_sum(table.read_all("model", _model, n_outputs, fast_step_s)),
+        raise RigError("disturbance.zernike_m: each row begins with one of Noll's indices, a whole number from 2")
+    if air and not air.layers:
+        raise RigError("disturbance.turbulence.layers is empty: give each layer's r0_m and wind_m_s")
+    layers = (
+        tuple(
+            read(
+                Layer,
+                each,
+                f"disturbance.turbulence.layers[{k}]",
+                outer_scale_m=air.outer_scale_m,
+                wavelength_m=air.wavelength_m,
+            )
+            for k, each in enumerate(air.layers if air else ())
+        )
+        if air
+        else ()
     )
+    models = [_model(each, f"disturbance.model[{k}]", n_outputs, fast_step_s) for k, each in enumerate(table.model)]
+    return Disturbance(
+        plant_noise=table.plant_noise, layers=layers, pupil_m=air.pupil_m if air else 0.0, vibrations=table.vibration,
+        zernike_m=np.zeros((0, 2)) if zernike is None else zernike, recorded=table.recorded, model=_sum(models),
+    )  # fmt: skip
 
 
 def _sum(parts: Sequence[DisturbanceModel]) -> DisturbanceModel | None:
@@ -95,29 +131,88 @@ def _sum(parts: Sequence[DisturbanceModel]) -> DisturbanceModel | None:
     return DisturbanceModel(A=A, B_w=B_w, C=C, process_noise=W, initial_covariance=initial)
 
 
-def _model(table: Table, n_outputs: int, fast_step_s: float) -> DisturbanceModel:
+@dataclass(frozen=True, kw_only=True)
+class _Modes:
+    modes: Annotated[FloatArray, Shape("outputs", "modes")] | None = None
+    """Mode shapes, (outputs, modes); by default one for each output."""
+    sd: Annotated[FloatArray, Shape("modes")]
+    """Standard deviation of each mode, slope units."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Resonance(_Modes):
+    frequency_hz: Positive
+    damping: Positive
+
+
+@dataclass(frozen=True, kw_only=True)
+class _OrnsteinUhlenbeck(_Modes):
+    correlation_s: Positive
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Autoregressive(_Modes):
+    coefficients: Annotated[FloatArray, Shape("1 to 4 numbers")]
+    """a_1 to a_p of x(k) = a_1 x(k-1) + ... + a_p x(k-p) + w(k), at the fast rate."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _RandomWalk:
+    modes: Annotated[FloatArray, Shape("outputs", "modes")] | None = None
+    """As above."""
+    step_sd: Annotated[FloatArray, Shape("modes")]
+    """Standard deviation of each mode's step in a fast step, slope units."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Matrices:
+    A: Annotated[FloatArray, Shape("states", "states")]
+    B_w: Annotated[FloatArray, Shape("states", "noises")]
+    C: Annotated[FloatArray, Shape("outputs", "states")]
+    process_noise: Any
+    """Variance of each noise in a fast step."""
+
+
+_MODELS: dict[str, Any] = {
+    "resonance": _Resonance, "ornstein-uhlenbeck": _OrnsteinUhlenbeck, "random-walk": _RandomWalk,
+    "ar": _Autoregressive, "matrices": _Matrices,
+}  # fmt: skip
+
+
+def _model(values: dict[str, Any], key: str, n_outputs: int, fast_step_s: float) -> DisturbanceModel:
     """One part of ``disturbance.model``: a system given by its kind, for each of its mode shapes, or by its
     matrices."""
-    kind = table.choice("kind", ("resonance", "ornstein-uhlenbeck", "random-walk", "ar", "matrices"))
+    kind = checked(Literal[*_MODELS], values.get("kind"), f"{key}.kind")
+    sizes = {"outputs": n_outputs} | ({} if "modes" in values else {"modes": n_outputs})
+    table = read(_MODELS[kind], {name: each for name, each in values.items() if name != "kind"}, key, sizes)
     if kind == "matrices":
-        return _model_by_matrices(table, n_outputs)
-    modes = table.matrix("modes", (n_outputs, None), "outputs x modes") if table.has("modes") else np.eye(n_outputs)
+        _check_dies_out(f"{key}.A", table.A)
+        W = variances(table.process_noise, f"{key}.process_noise", sizes)
+        return DisturbanceModel(
+            A=table.A, B_w=table.B_w, C=table.C, process_noise=W,
+            initial_covariance=stationary_covariance(table.A, table.B_w @ W @ table.B_w.T),
+        )  # fmt: skip
+    modes = np.eye(n_outputs) if table.modes is None else table.modes
+    A = B_w = np.eye(1)
     if kind == "resonance":
-        frequency = table.frequency("frequency_hz", fast_step_s)
-        A, B_w = second_order(frequency, table.number("damping", above=0.0), fast_step_s)
+        check_frequency(table.frequency_hz, f"{key}.frequency_hz", fast_step_s)
+        A, B_w = second_order(table.frequency_hz, table.damping, fast_step_s)
     elif kind == "ornstein-uhlenbeck":
-        A, B_w = np.array([[math.exp(-fast_step_s / table.number("correlation_s", above=0.0))]]), np.eye(1)
-    elif kind == "random-walk":
-        A, B_w = np.eye(1), np.eye(1)
-    else:
-        A, B_w = _autoregressive(table)
+        A = np.array([[math.exp(-fast_step_s / table.correlation_s)]])
+    elif kind == "ar":
+        # Its state is the last p values, the newest first.
+        order = len(table.coefficients)
+        if order > 4:
+            raise RigError(f"{key}.coefficients has shape {order}, expected 1 to 4 numbers (a_1 to a_p)")
+        A, B_w = np.vstack([table.coefficients, np.eye(order - 1, order)]), np.eye(order, 1)
+        _check_dies_out(f"{key}.coefficients", A)
     if kind == "random-walk":
-        noise = table.vector("step_sd", modes.shape[1], "modes") ** 2
+        noise = table.step_sd**2
         # The random walk may have lasted for a second before the first exposure.
         one = np.eye(1) / fast_step_s
     else:
         one = stationary_covariance(A, B_w @ B_w.T)
-        noise = table.vector("sd", modes.shape[1], "modes") ** 2 / one[0, 0]
+        noise = table.sd**2 / one[0, 0]
     each = np.eye(len(noise))
     return DisturbanceModel(
         A=np.asarray(np.kron(each, A)), B_w=np.asarray(np.kron(each, B_w)),
@@ -126,57 +221,10 @@ def _model(table: Table, n_outputs: int, fast_step_s: float) -> DisturbanceModel
     )  # fmt: skip
 
 
-def _autoregressive(table: Table) -> tuple[FloatArray, FloatArray]:
-    """The process x(k) = a_1 x(k-1) + ... + a_p x(k-p) + w(k), whose state is the last p values, the newest first."""
-    coefficients = table.numbers("coefficients", "a_1 to a_p", most=4)
-    A = np.vstack([coefficients, np.eye(len(coefficients) - 1, len(coefficients))])
-    _check_dies_out(table, "coefficients", A)
-    return A, np.eye(len(A), 1)
-
-
-def _model_by_matrices(table: Table, n_outputs: int) -> DisturbanceModel:
-    A = table.square("A", "states x states")
-    n = len(A)
-    _check_dies_out(table, "A", A)
-    B_w = table.matrix("B_w", (n, None), "states x process noises")
-    W = table.variances("process_noise", B_w.shape[1], "noises: the variance of each")
-    return DisturbanceModel(
-        A=A, B_w=B_w, C=table.matrix("C", (n_outputs, n), "outputs x states"), process_noise=W,
-        initial_covariance=stationary_covariance(A, B_w @ W @ B_w.T),
-    )  # fmt: skip
-
-
-def _check_dies_out(table: Table, name: str, A: FloatArray) -> None:
+def _check_dies_out(key: str, A: FloatArray) -> None:
     radius = float(np.abs(np.linalg.eigvals(A)).max())
     if radius > 1 - 1e-9:
         raise RigError(
-            f"{table.key(name)} makes a disturbance that does not decay (an eigenvalue has modulus {radius:.6g}, it"
+            f"{key} makes a disturbance that does not decay (an eigenvalue has modulus {radius:.6g}, it"
             " must be below 1): for one that wanders off use kind = 'random-walk'"
         )
-
-
-def _turbulence(table: Table) -> tuple[float, tuple[Layer, ...]]:
-    """Width that the lenslets cover, m, and the layers."""
-    pupil = table.number("pupil_m", above=0.0)
-    outer, wavelength = table.number("outer_scale_m", 25.0, above=0.0), table.number("wavelength_m", 500e-9, above=0.0)
-    layers = table.read_all("layers", _layer, outer, wavelength)
-    if not layers:
-        raise RigError(f"{table.key('layers')} is empty: give each layer's r0_m and wind_m_s")
-    return pupil, layers
-
-
-def _layer(table: Table, outer_scale_m: float, wavelength_m: float) -> Layer:
-    wind = table.vector("wind_m_s", 2, "along x and y")
-    return Layer(
-        r0_m=table.number("r0_m", above=0.0),
-        wind_m_s=(float(wind[0]), float(wind[1])),
-        outer_scale_m=outer_scale_m,
-        wavelength_m=wavelength_m,
-    )
-
-
-def _vibration(table: Table) -> Vibration:
-    amplitude = table.vector("amplitude", 2, "along x and y")
-    return Vibration(
-        frequency_hz=table.number("frequency_hz", above=0.0), amplitude=(float(amplitude[0]), float(amplitude[1]))
-    )

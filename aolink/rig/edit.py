@@ -11,8 +11,9 @@ from tomlkit.exceptions import TOMLKitError
 from tomlkit.items import InlineTable, Item, Key, Table
 
 from aolink.errors import RigError
+from aolink.keys import did_you_mean
 from aolink.optics.sensor import KERNEL_WIDTHS
-from aolink.rig.toml_table import did_you_mean
+from aolink.rig.sensor_tables import READ_NOISE
 
 
 def with_value(text: str, key: str, value: Any, *, may_be_new: bool = False, comment: str = "") -> str:
@@ -39,7 +40,12 @@ def with_value(text: str, key: str, value: Any, *, may_be_new: bool = False, com
         for part in path:
             table = _entry(table, part, key)
         name, given = _as_given(table, key, value)
-        new = may_be_new and isinstance(table, Mapping) and name not in table
+        instead = [
+            each for each in READ_NOISE if name == "noise_density" and isinstance(table, Mapping) and each in table
+        ]
+        for each in instead:
+            del table[each]
+        new = (may_be_new or instead) and isinstance(table, Mapping) and name not in table
         if new and (last := _last_value(table)) is not None:
             # tomlkit would put it behind comments that belong to the next table.
             end = "" if last.trivia.trail.endswith("\n") else "\n"

@@ -8,31 +8,27 @@ plant's output and of the kernel's width.
 from __future__ import annotations
 
 import hashlib
+import math
 import re
 import tomllib
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from difflib import get_close_matches
 from importlib import resources
 from pathlib import Path
+from typing import Annotated, Any
 
 from aolink.errors import RigError
+from aolink.keys import checked, read
 from aolink.optics.scene import SceneSensor
-from aolink.optics.sensor import BaseSensor
-from aolink.rig import tables
+from aolink.optics.sensor import BaseSensor, Windows
 from aolink.rig.device_tables import DeviceTable, read_devices
 from aolink.rig.disturbance import Disturbance, read_disturbance
 from aolink.rig.optical_plant import Optics, read_optics
 from aolink.rig.parts import Control, Drive, MirrorDriver, Plant, Simulation, Timing
-from aolink.rig.scene_table import read_scene
-from aolink.rig.sensor_tables import CalibrationTable, read_calibration, read_grid, read_sensor
-from aolink.rig.tables import read_control, read_drive, read_mirror, read_plant, read_simulation, read_timing
-from aolink.rig.toml_table import Table, named_file
+from aolink.rig.scene_table import named_file, read_scene
+from aolink.rig.sensor_tables import CalibrationTable, read_sensor
+from aolink.rig.tables import read_control, read_drive, read_mirror, read_plant, read_timing, with_disturbance
 
-_TABLES = (
-    "name", "summary", "plant", "timing", "sensor", "mirror", "drive", "simulation",
-    "lenslets", "disturbance", "scene", "calibration", "devices", "control",
-)  # fmt: skip
-"""The top-level keys of a rig file."""
 _LONGEST = 16 << 20
 _DEEPEST = 200
 _MOST_KEYS = 20_000
@@ -152,7 +148,7 @@ def parse_rig(text: str, folder: Path | None = None) -> Rig:
             f" or a key of more than {_DEEPEST} parts"
         )
     try:
-        root = Table(tomllib.loads(text), "")
+        root = tomllib.loads(text)
     except (ValueError, RecursionError) as error:  # a TOMLDecodeError, or a number or nesting beyond what Python reads
         raise RigError(f"not valid TOML: {error}") from None
     try:
@@ -161,31 +157,49 @@ def parse_rig(text: str, folder: Path | None = None) -> Rig:
         raise RigError(f"it has numbers that are too large or too small to compute with ({error})") from error
 
 
-def _read(root: Table, text: str, folder: Path | None) -> Rig:
-    root.finish(*_TABLES)
-    name, summary = root.text("name"), root.text("summary", "")
-    timing = root.read("timing", read_timing)
-    optics = root.read("lenslets", read_optics, read_grid(root.table("sensor"))) if root.has("lenslets") else None
-    plant = root.read("plant", read_plant, root, optics, timing)
+@dataclass(frozen=True, kw_only=True)
+class _File:
+    name: str
+    summary: str = ""
+    plant: dict[str, Any]
+    timing: Annotated[Timing, read_timing]
+    sensor: dict[str, Any]
+    lenslets: dict[str, Any] | None = None
+    mirror: dict[str, Any] | None = None
+    drive: dict[str, Any] = field(default_factory=dict)
+    control: dict[str, Any] = field(default_factory=dict)
+    disturbance: dict[str, Any] | None = None
+    scene: Annotated[SceneSensor | None, read_scene] = None
+    simulation: Simulation = field(default_factory=Simulation)
+    calibration: CalibrationTable | None = None
+    devices: Annotated[dict[str, DeviceTable], read_devices] = field(default_factory=dict)
+
+
+def _read(values: dict[str, Any], text: str, folder: Path | None) -> Rig:
+    file = read(_File, values, "")
+    timing, grid = file.timing, (1, 1)
+    if file.lenslets is not None or file.plant.get("kind") == "tip-tilt":
+        if "grid" not in file.sensor:
+            raise RigError("sensor.grid is missing: the rig file must give it")
+        grid = checked(tuple[Windows, Windows], file.sensor["grid"], "sensor.grid")
+    optics = None if file.lenslets is None else read_optics(file.lenslets, grid)
+    plant = read_plant(file.plant, int(optics.lit.sum()) if optics else math.prod(grid), optics, timing)
     seen = (optics.field, optics.light) if optics else (None, None)
-    sensor = root.read("sensor", read_sensor, plant.axes, plant.n_outputs, *seen)
+    sensor = read_sensor(file.sensor, plant.axes, plant.n_outputs, *seen)
     n_inputs = plant.axes * plant.n_inputs
-    mirror = root.read("mirror", read_mirror, n_inputs, root.has("mirror"), optional=True)
-    drive = root.read("drive", read_drive, n_inputs, mirror, optional=True)
-    control = root.read("control", read_control, timing, optional=True)
-    disturbance = root.read_any("disturbance", read_disturbance, plant.n_outputs, timing.fast_step_s)
-    if disturbance and optics is None and (disturbance.layers or len(disturbance.zernike_m)):
-        raise RigError("disturbance: turbulence and aberrations need [lenslets], to know the slopes that they make")
-    if disturbance and disturbance.model:
-        plant = tables.with_disturbance(plant, disturbance.model)
-    scene = root.read_any("scene", read_scene)
-    simulation = root.read("simulation", read_simulation, optional=True)
-    calibration = root.read_any("calibration", read_calibration)
-    devices = root.read("devices", read_devices, optional=True)
+    mirror = read_mirror(file.mirror, n_inputs)
+    drive = read_drive(file.drive, n_inputs, mirror)
+    disturbance = None
+    if file.disturbance is not None:
+        disturbance = read_disturbance(file.disturbance, plant.n_outputs, timing.fast_step_s)
+        if optics is None and (disturbance.layers or len(disturbance.zernike_m)):
+            raise RigError("disturbance: turbulence and aberrations need [lenslets], to know the slopes that they make")
+        if disturbance.model:
+            plant = with_disturbance(plant, disturbance.model)
     return Rig(
-        name=name, summary=summary, plant=plant, timing=timing, sensor=sensor,
-        mirror=mirror, drive=drive, control=control, simulation=simulation, calibration=calibration,
-        optics=optics, disturbance=disturbance, scene=scene, devices=devices, folder=folder, toml=text,
+        name=file.name, summary=file.summary, plant=plant, timing=timing, sensor=sensor, mirror=mirror, drive=drive,
+        control=read_control(file.control, timing), simulation=file.simulation, calibration=file.calibration,
+        optics=optics, disturbance=disturbance, scene=file.scene, devices=file.devices, folder=folder, toml=text,
     )  # fmt: skip
 
 

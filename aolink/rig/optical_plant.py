@@ -5,17 +5,18 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from aolink.errors import RigError
+from aolink.keys import Positive, Shape, Within, array, read
 from aolink.numerics.arrays import FloatArray
+from aolink.numerics.block_diagonal import stationary_covariance
 from aolink.optics.lenslets import Lenslets
-from aolink.optics.mirror import Membrane, MirrorPlant, VoltageLaw, mirror_plant, second_order, square_pads
-from aolink.rig.toml_table import Table
-
-_LEAST_LIGHT = 0.5
+from aolink.optics.mirror import Membrane, mirror_plant, second_order, square_pads
+from aolink.rig.parts import Plant, Wandering, read_wandering
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,97 +60,129 @@ class Optics:
         return surface_slopes * (shrink / self.slope_unit_rad)
 
 
-def read_optics(table: Table, grid: tuple[int, ...]) -> Optics:
+@dataclass(frozen=True, kw_only=True)
+class _Lenslets:
+    pitch_m: Positive
+    focal_length_m: Positive
+    slope_unit_rad: Positive = 1e-3
+    pupil_m: Positive | None = None
+    """Diameter of the round pupil, m."""
+    obstruction: Annotated[float, Within(0.0, below=1.0)] = 0.0
+    """Diameter of its central obstruction, as a share of the pupil's."""
+    least_light: Annotated[float, Within(above=0.0, high=1.0)] = 0.5
+    """Least lit share of a lenslet whose spot is used."""
+
+
+def read_optics(values: dict[str, Any], grid: tuple[int, int]) -> Optics:
     """Read the table ``[lenslets]``. Raises `RigError`."""
-    rows, columns = grid
+    table = read(_Lenslets, values, "lenslets")
+    if table.pupil_m is None and (alone := sorted({"obstruction", "least_light"} & values.keys())):
+        raise RigError(f"lenslets.{alone[0]} needs lenslets.pupil_m")
     lenslets = Lenslets(
-        grid=(rows, columns),
-        pitch_m=table.number("pitch_m", above=0.0),
-        focal_length_m=table.number("focal_length_m", above=0.0),
-        pupil_diameter_m=table.number("pupil_m", above=0.0) if table.has("pupil_m") else None,
-        obstruction=_obstruction(table) if table.has("pupil_m") else 0.0,
-    )
-    optics = Optics(
-        lenslets=lenslets,
-        slope_unit_rad=table.number("slope_unit_rad", 1e-3, above=0.0),
-        least_light=_LEAST_LIGHT if lenslets.pupil_diameter_m is None else _least_light(table),
-    )
+        grid=grid, pitch_m=table.pitch_m, focal_length_m=table.focal_length_m, pupil_diameter_m=table.pupil_m,
+        obstruction=table.obstruction,
+    )  # fmt: skip
+    optics = Optics(lenslets=lenslets, slope_unit_rad=table.slope_unit_rad, least_light=table.least_light)
     if not optics.lit.any():
         raise RigError(
-            f"{table.key('least_light')} = {optics.least_light:g}: no lenslet has that share of light,"
+            f"lenslets.least_light = {optics.least_light:g}: no lenslet has that share of light,"
             f" the brightest has {lenslets.light.max():.2g} of its area in the pupil"
         )
     return optics
 
 
-def _obstruction(table: Table) -> float:
-    share = table.number("obstruction", 0.0, low=0.0)
-    if share >= 1:
-        raise RigError(f"{table.key('obstruction')} = {share:g} is a share of the pupil's diameter: it must be below 1")
-    return share
+@dataclass(frozen=True, kw_only=True)
+class _Mirror:
+    """A mirror whose actuators have one resonance."""
+
+    process_noise: Any
+    """Variance of the noise that adds to each input in a fast step, units of the input squared; with ``drift_s`` of
+    the noise that drives each drift."""
+    resonance_hz: Positive
+    """Of each actuator, Hz."""
+    damping: Positive
+    """Share of critical damping."""
+    drift_s: Positive | None = None
+    """Time in which the inputs' drift falls to 1/e, s."""
+    unmodelled: Any = None
+    wandering: Annotated[Wandering | None, read_wandering] = None
+
+    def plant(self, slopes: FloatArray, fast_step_s: float) -> Plant:
+        """The plant, from slopes for each input at rest, (outputs, inputs)."""
+        check_frequency(self.resonance_hz, "plant.resonance_hz", fast_step_s)
+        dynamics = second_order(self.resonance_hz, self.damping, fast_step_s)
+        model = mirror_plant(slopes, dynamics, self.drift_s and math.exp(-fast_step_s / self.drift_s))
+        W = variances(self.process_noise, "plant.process_noise", {"noises": model.B_w.shape[1]})
+        return Plant(
+            A=model.A, B=model.B, B_w=model.B_w, C=model.C, process_noise=W, initial_mean=np.zeros(len(model.A)),
+            initial_covariance=stationary_covariance(model.A, model.B_w @ W @ model.B_w.T),
+            unmodelled=self.unmodelled, wandering=self.wandering,
+        )  # fmt: skip
 
 
-def _least_light(table: Table) -> float:
-    share = table.number("least_light", _LEAST_LIGHT, above=0.0)
-    if share > 1:
-        raise RigError(f"{table.key('least_light')} = {share:g} is a share of a lenslet: it must not be above 1")
-    return share
+def check_frequency(frequency_hz: float, key: str, fast_step_s: float) -> None:
+    """Raise RigError for a frequency that fast steps cannot follow."""
+    if frequency_hz >= 0.5 / fast_step_s:
+        most = f"steps of {fast_step_s:g} s can follow, {0.5 / fast_step_s:g} Hz"
+        raise RigError(f"{key} = {frequency_hz:g} is beyond what {most}")
 
 
-def read_tip_tilt(table: Table, n_spots: int, fast_step_s: float) -> MirrorPlant:
-    """Read a plant of kind ``tip-tilt``: two inputs that turn a flat mirror, and with it all spots alike."""
-    gain = np.diag(table.vector("gain", 2, "slope units per input, along x and y"))
-    coupling = table.number("coupling", 0.0)
-    if abs(coupling) >= 1:
-        raise RigError(f"{table.key('coupling')} = {coupling:g}: an axis must move its own slope more than the other's")
-    gain = np.array([[1.0, coupling], [coupling, 1.0]]) @ gain
-    return mirror_plant(np.tile(gain, (n_spots, 1)), *_dynamics(table, fast_step_s))
+def variances(value: Any, key: str, sizes: dict[str, int]) -> FloatArray:
+    """A diagonal matrix of variances; a number is that of each noise."""
+    matrix = np.diag(array(value, key, ("noises",), sizes))
+    if (matrix < 0).any():
+        raise RigError(f"{key} has a variance below zero")
+    return matrix
 
 
-def read_membrane(table: Table, optics: Optics, fast_step_s: float) -> MirrorPlant:
-    """Read a plant of kind ``membrane``: its inputs are in Pa, its states the pressures as the membrane follows
-    them."""
-    rows, columns = table.integers("actuators", 2, "rows and columns", low=1, high=32)
+@dataclass(frozen=True, kw_only=True)
+class _TipTilt(_Mirror):
+    gain: Annotated[FloatArray, Shape("x, y")]
+    """Slope units per unit of an input, along x and y."""
+    coupling: Annotated[float, Within(above=-1.0, below=1.0)] = 0.0
+    """Share of its slope that an axis moves of the other's."""
+
+
+def plant_of_tip_tilt(values: dict[str, Any], n_spots: int, fast_step_s: float) -> Plant:
+    """A plant of kind ``tip-tilt``: two inputs that turn a flat mirror, and with it all spots alike."""
+    table = read(_TipTilt, values, "plant", {"x, y": 2})
+    gain = np.array([[1.0, table.coupling], [table.coupling, 1.0]]) @ np.diag(table.gain)
+    return table.plant(np.tile(gain, (n_spots, 1)), fast_step_s)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Membrane(_Mirror):
+    actuators: tuple[Annotated[int, Within(1, 32)], Annotated[int, Within(1, 32)]]
+    """Rows and columns."""
+    pitch_m: Positive
+    pad_radius_m: Positive
+    radius_m: Positive
+    tension_n_per_m: Positive
+    footprint_m: Positive
+    """Width that all columns of lenslets see of the membrane, m."""
+
+
+def plant_of_membrane(values: dict[str, Any], optics: Optics, fast_step_s: float) -> Plant:
+    """A plant of kind ``membrane``: its inputs are in Pa, its states the pressures as the membrane follows them."""
+    table = read(_Membrane, values, "plant")
+    rows, columns = table.actuators
     try:
         membrane = Membrane(
-            radius_m=table.number("radius_m", above=0.0),
-            tension_n_per_m=table.number("tension_n_per_m", above=0.0),
-            pads_m=square_pads(rows, columns, table.number("pitch_m", above=0.0)),
-            pad_radius_m=table.number("pad_radius_m", above=0.0),
-        )
+            radius_m=table.radius_m, tension_n_per_m=table.tension_n_per_m,
+            pads_m=square_pads(rows, columns, table.pitch_m), pad_radius_m=table.pad_radius_m,
+        )  # fmt: skip
     except ValueError as error:
-        raise RigError(f"{table.key('radius_m')}: {error}") from None
-    footprint = table.number("footprint_m", above=0.0)
+        raise RigError(f"plant.radius_m: {error}") from None
+    footprint = table.footprint_m
     grid = optics.lenslets.grid
     corner = footprint / 2 * math.hypot(1.0, grid[0] / grid[1])
     if optics.lenslets.pupil_diameter_m:
         corner = min(corner, optics.lenslets.pupil_diameter_m / (optics.lenslets.pitch_m * grid[1]) * footprint / 2)
     if corner >= membrane.radius_m:
         raise RigError(
-            f"{table.key('footprint_m')} = {footprint:g}: the lenslets' corners see {corner:.3g} m from the middle,"
+            f"plant.footprint_m = {footprint:g}: the lenslets' corners see {corner:.3g} m from the middle,"
             f" the membrane ends at {membrane.radius_m:g} m"
         )
     # The light goes to the mirror and back: the path is twice the deflection.
     gradients = 2 * optics.seen(footprint).mean_slopes(membrane.influence_gradient)[optics.lit]
-    per_pascal = optics.slopes(gradients, footprint).reshape(-1, rows * columns)
-    return mirror_plant(per_pascal, *_dynamics(table, fast_step_s))
-
-
-def _dynamics(table: Table, fast_step_s: float) -> tuple[tuple[FloatArray, FloatArray], float | None]:
-    """Resonance of an actuator, and the share of a drift that is left after a fast step."""
-    frequency = table.frequency("resonance_hz", fast_step_s)
-    dynamics = second_order(frequency, table.number("damping", above=0.0), fast_step_s)
-    drift_s = table.number("drift_s", above=0.0) if table.has("drift_s") else None
-    return dynamics, None if drift_s is None else math.exp(-fast_step_s / drift_s)
-
-
-def read_voltage(table: Table) -> VoltageLaw:
-    """Read the table ``[mirror.voltage]``. Raises `RigError`."""
-    law = VoltageLaw(
-        gamma=table.number("gamma", above=0.0),
-        bias_v=table.number("bias_v", above=0.0),
-        max_v=table.number("max_v", above=0.0),
-    )
-    if law.max_v <= law.bias_v:
-        raise RigError(f"{table.key('bias_v')} = {law.bias_v:g} must be below max_v = {law.max_v:g}")
-    return law
+    return table.plant(optics.slopes(gradients, footprint).reshape(-1, rows * columns), fast_step_s)

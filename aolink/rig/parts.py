@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Literal
+from typing import Annotated, Any, Literal, get_args
 
 import numpy as np
 
+from aolink.errors import RigError
+from aolink.keys import Count, NotNegative, Positive, Shape, Share, Within, as_it_is, checked, read
 from aolink.numerics.arrays import FloatArray
 from aolink.optics.mirror import VoltageLaw
+
+Seconds = Annotated[float, Within(0.0, 60.0)]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,6 +61,28 @@ class Wandering:
     """Standard deviation of the relative change in a minute; the drift is a random walk."""
 
 
+# The largest changes that estimators follow: a plant that differs more from its matrices should be identified.
+@dataclass(frozen=True, kw_only=True)
+class _Drifts:
+    rate_per_minute: Positive
+    """Standard deviation of the relative change in a minute; of the others one, the largest relative change."""
+    frequency: Annotated[float, Within(above=0.0, high=0.2)] | None = None
+    gain: Annotated[float, Within(above=0.0, high=0.5)] | None = None
+    process_noise: Annotated[float, Within(above=0.0, high=3.0)] | None = None
+    kernel_width: Annotated[float, Within(above=0.0, high=0.5)] | None = None
+    sensor_noise: Annotated[float, Within(above=0.0, high=3.0)] | None = None
+
+
+def read_wandering(values: Any, key: str) -> Wandering:
+    """Read the table ``[plant.wandering]``. Raises `RigError`."""
+    rate = read(_Drifts, values, key).rate_per_minute
+    given = [name for name in get_args(Wanders) if name in values]
+    if len(given) != 1:
+        found = " and ".join(given) or "nothing that drifts"
+        raise RigError(f"{key} has {found}: give one of {', '.join(get_args(Wanders))}")
+    return Wandering(parameter=given[0], largest=float(values[given[0]]), rate_per_minute=rate)
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Plant:
     """The fast-rate plant, x(k+1) = A x(k) + B u(k) + B_w w(k), theta(k) = C x(k)  (Mishra & Wen (1)).
@@ -63,25 +90,25 @@ class Plant:
     ``axes`` independent copies of it make the rig; each has its own state, output and inputs.
     """
 
-    A: FloatArray
+    A: Annotated[FloatArray, Shape("states", "states")]
     """State transition over one fast step, (n_states, n_states)."""
-    B: FloatArray
+    B: Annotated[FloatArray, Shape("states", "inputs")]
     """Input matrix, (n_states, n_inputs)."""
-    B_w: FloatArray
+    B_w: Annotated[FloatArray, Shape("states", "noises")]
     """Process-noise input matrix, (n_states, n_noises)."""
-    C: FloatArray
+    C: Annotated[FloatArray, Shape("outputs", "states")]
     """Output matrix, (n_outputs, n_states); the outputs are spot positions in slope units."""
-    process_noise: FloatArray
+    process_noise: Annotated[FloatArray, Shape("noises", "noises")]
     """W_f, covariance of w(k) per fast step, (n_noises, n_noises)."""
-    initial_mean: FloatArray
+    initial_mean: Annotated[FloatArray, Shape("states", default=0.0)]
     """Mean of x(0), (n_states,)."""
-    initial_covariance: FloatArray
+    initial_covariance: Annotated[FloatArray, as_it_is]
     """Covariance of x(0), (n_states, n_states)."""
-    axes: int
+    axes: Annotated[int, Within(1, 10_000)] = 1
     """Number of independent copies."""
-    unmodelled: UnmodelledSlopes | None = None
-    """The estimators' model of slopes beside C x(k); None for no such slopes."""
-    wandering: Wandering | None = None
+    unmodelled: Annotated[UnmodelledSlopes | None, as_it_is] = None
+    """The estimators' model of slopes beside C x(k), as a fitting error and turbulence; None for no such slopes."""
+    wandering: Annotated[Wandering | None, read_wandering] = None
     """The drift that estimators follow; None for none."""
     disturbance_states: int = 0
     """Number of the last states, which are those of the disturbance's model and which no input reaches."""
@@ -106,13 +133,13 @@ class Timing:
     """The timing of fast steps and exposures. Exposure j covers ``exposure_steps`` steps from j *
     ``frame_period_steps`` on."""
 
-    fast_step_s: float
+    fast_step_s: Annotated[float, Within(above=0.0, high=1e4)]
     """T_f, s."""
-    exposure_steps: int
+    exposure_steps: Annotated[int, Within(1, 1_000_000)]
     """N, fast steps in one exposure."""
-    frame_period_steps: int
-    """Fast steps from the start of one exposure to the start of the next; at least N."""
-    exposure_offset: float = 0.0
+    frame_period_steps: Annotated[int, Within(1, 10_000_000)]
+    """Fast steps from the start of one exposure to the start of the next; at least N, which it is if left out."""
+    exposure_offset: Annotated[float, Within(0.0, below=1.0)] = 0.0
     """Part of its first fast step that passes before an exposure starts, below one; it ends equally far into a step."""
 
     @cached_property
@@ -136,22 +163,21 @@ class Timing:
 class MirrorDriver:
     """The mirror driver: limits, resolution, queue."""
 
-    input_min: FloatArray
+    input_min: Annotated[FloatArray, Shape("inputs")]
     """Least inputs, (axes * n_inputs,)."""
-
-    input_max: FloatArray
+    input_max: Annotated[FloatArray, Shape("inputs")]
     """Largest inputs, (axes * n_inputs,)."""
-    park: FloatArray
+    park: Annotated[FloatArray, Shape("inputs", default=0.0)]
     """Declared safe input, (axes * n_inputs,)."""
-    dac_bits: int
+    dac_bits: Annotated[int, Within(0, 32)] = 16
     """Commands are rounded to 2^dac_bits levels between the limits; 0 means not rounded."""
-    block_steps: int
-    """Fast steps in one command block."""
-    queue_steps: int
-    """Fast steps that the device can hold."""
-    watchdog_s: float
+    block_steps: Annotated[int, Within(1)]
+    """Fast steps in one command block; if left out 50, or as many as fit into a packet."""
+    queue_steps: Annotated[int, Within(1)]
+    """Fast steps that the device can hold; if left out eight blocks."""
+    watchdog_s: Positive = 1.0
     """The mirror parks itself when no valid packet has come for this time, s."""
-    slew_max_per_s: float = 0.0
+    slew_max_per_s: NotNegative = 0.0
     """Most that an input may change in a second; the host refuses commands that change faster. 0 for no limit."""
     voltage: VoltageLaw | None = None
     """The law of electrostatic actuators: the converter's equal steps are then those of the voltage, not the input."""
@@ -171,11 +197,12 @@ class MirrorDriver:
 class Drive:
     """The known input that a session plays when nothing closes the loop."""
 
-    kind: Literal["none", "sine"]
-    amplitude: FloatArray
+    kind: Literal["none", "sine"] = "none"
+    amplitude: Annotated[FloatArray, Shape("inputs")]
     """(axes * n_inputs,)"""
-    period_s: float
-    offset: FloatArray
+    period_s: Positive
+    """Period of the sine, s."""
+    offset: Annotated[FloatArray, Shape("inputs", default=0.0)]
     """(axes * n_inputs,)"""
 
     def inputs(self, first_step: int, n_steps: int, fast_step_s: float) -> FloatArray:
@@ -191,19 +218,19 @@ class Drive:
 class Control:
     """How the loop is closed, where a session closes it."""
 
-    delay_s: float = 0.01
+    delay_s: NotNegative = 0.01
     """Least time from the end of an exposure to the beginning of the first fast step that its estimate can change, s:
     read-out, link and estimator. On virtual time it is exactly this, rounded up to whole fast steps."""
     when_lost: Literal["hold", "park"] = "hold"
     """The mirror's action while the spot's position is not known reliably: it holds its input, or goes to the safe
     one."""
-    gain: float = 0.5
+    gain: Positive = 0.5
     """Gain of the integrator."""
-    leak: float = 0.01
+    leak: Share = 0.01
     """Share of itself that the integrator loses with each exposure."""
-    least_singular_value: float = 0.03
+    least_singular_value: Share = 0.03
     """Mirror modes that move the slopes by less than this share of the strongest one are left out by the integrator."""
-    effort: float = 1e-3
+    effort: Positive = 1e-3
     """Weight of the inputs in the cost of ``lqg``, relative to the slopes that they make at rest."""
     fall_back: bool = True
     """Whether the integrator, or a mirror that holds still, acts in place of ``lqg`` while ``lqg`` is worse."""
@@ -217,49 +244,49 @@ class Faults:
     delimiters included. The host sees a fault as on a real line: nothing is marked.
     """
 
-    bit_error_rate: float = 0.0
+    bit_error_rate: Share = 0.0
     """A bit is flipped."""
-    byte_loss_rate: float = 0.0
+    byte_loss_rate: Share = 0.0
     """A byte is lost."""
-    byte_repeat_rate: float = 0.0
+    byte_repeat_rate: Share = 0.0
     """A byte comes twice."""
-    byte_insert_rate: float = 0.0
+    byte_insert_rate: Share = 0.0
     """A random byte comes before a byte."""
-    burst_rate: float = 0.0
+    burst_rate: Share = 0.0
     """A burst of noise begins at a byte: 1 to 64 bytes are replaced by random ones, as far as the packet goes."""
-    bit_flip_rate: float = 0.0
+    bit_flip_rate: Share = 0.0
     """A packet from the device has one bit flipped."""
-    packet_loss_rate: float = 0.0
+    packet_loss_rate: Share = 0.0
     """A packet from the device is lost."""
-    command_loss_rate: float = 0.0
+    command_loss_rate: Share = 0.0
     """A packet to the device is lost."""
-    duplicate_rate: float = 0.0
+    duplicate_rate: Share = 0.0
     """A packet from the device is sent twice."""
-    stall_rate: float = 0.0
+    stall_rate: Share = 0.0
     """The line stands still for ``stall_s`` before a packet; those behind it wait as well."""
-    stall_s: float = 0.1
+    stall_s: Seconds = 0.1
     """How long it stands still, s."""
-    jitter_s: float = 0.0
+    jitter_s: Seconds = 0.0
     """Mean of a random, exponentially distributed delay of each packet, s; packets keep their order."""
-    delay_to_device_s: float = 0.0
+    delay_to_device_s: Seconds = 0.0
     """Constant delay of the host's packets, s."""
-    delay_to_host_s: float = 0.0
+    delay_to_host_s: Seconds = 0.0
     """Constant delay of the device's packets, s."""
-    clock_step_s: float = 0.0
+    clock_step_s: Annotated[float, Within(-60.0, 60.0)] = 0.0
     """Step by which the device's clock is set forward, s; negative: back. Its fast steps go on."""
-    clock_step_at_s: float = 1.0
+    clock_step_at_s: Seconds = 1.0
     """Time of that step, s after the rig has begun."""
-    vanish_rate: float = 0.0
+    vanish_rate: Share = 0.0
     """The port vanishes with a packet, one way or the other, and returns after ``vanish_s``; in real time only."""
-    vanish_s: float = 1.0
+    vanish_s: Seconds = 1.0
     """How long it is gone, s."""
-    late_rate: float = 0.0
+    late_rate: Share = 0.0
     """A command block is taken only when half of its steps have gone by."""
-    chunk_loss_rate: float = 0.0
+    chunk_loss_rate: Share = 0.0
     """The camera does not send a chunk of a frame."""
-    saturation_rate: float = 0.0
+    saturation_rate: Share = 0.0
     """A pixel is at full scale."""
-    dark_rate: float = 0.0
+    dark_rate: Share = 0.0
     """A frame has no light: it has black level and read-out noise alone."""
 
 
@@ -290,17 +317,34 @@ class Light:
     """Density of a flat, one over slope units; None: halfway from the black level to the full scale."""
 
 
+def parse_light(text: Any, name: str) -> tuple[Light, ...]:
+    """A sequence of lights from a text such as ``dark,flat:4,still``; errors call it ``name``. Raises RigError."""
+    lights = []
+    for word in checked(str, text, name).split(","):
+        kind, colon, level = word.strip().partition(":")
+        if kind not in ("dark", "flat", "still", "moving") or (colon and kind != "flat"):
+            raise RigError(f"{name}: {word.strip()!r} is not known: use dark, flat, flat:DENSITY, still, moving")
+        try:
+            density = float(level) if colon else None
+        except ValueError:
+            density = math.nan
+        if density is not None and not 0 < density < math.inf:
+            raise RigError(f"{name}: the density of {word.strip()!r} must be a number above 0")
+        lights.append(Light(kind=kind, level=density))
+    return tuple(lights)
+
+
 @dataclass(frozen=True, kw_only=True)
 class Simulation:
     """The parameters of the simulated rig alone."""
 
-    seed: int = 1
-    light: tuple[Light, ...] = (Light(kind="moving"),)
+    seed: Count = 1
+    light: Annotated[tuple[Light, ...], parse_light] = (Light(kind="moving"),)
     """The lights: each start of the camera takes the next one; the last one stays."""
-    clock_offset_s: float = 0.0
+    clock_offset_s: Annotated[float, Within(-1e9, 1e9)] = 0.0
     """Device clock minus host clock at the start, s."""
-    clock_drift_ppm: float = 0.0
+    clock_drift_ppm: Annotated[float, Within(-1e5, 1e5)] = 0.0
     """How much faster the device clock runs than the host's, parts per million."""
-    latency_s: float = 100e-6
+    latency_s: Seconds = 100e-6
     """Median one-way latency of the link on virtual time, s."""
     faults: Faults = Faults()

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from aolink.errors import RestorationError, RigError
+from aolink.keys import read
 from aolink.numerics.arrays import FloatArray
 from aolink.optics.scene import SceneSensor
-from aolink.rig.sensor_tables import read_kernel
-from aolink.rig.toml_table import Table, named_file
 
 _SHIPPED = Path(__file__).parent.parent / "rigs"
 
@@ -18,20 +18,25 @@ _SHIPPED = Path(__file__).parent.parent / "rigs"
 _LUMINANCE = (0.2126, 0.7152, 0.0722)
 
 
-def read_scene(table: Table) -> SceneSensor:
+def named_file(folder: Path | None, name: str | Path, key: str) -> Path:
+    """The path of a file that a rig file in ``folder`` names under ``key``.
+
+    Raises
+    ------
+    RigError
+        There is no folder: the rig file comes out of a recording.
+    """
+    if folder is None:
+        raise RigError(
+            f"{key}: the rig file comes out of a recording, and may not name files then ({name}): save it as a file of"
+            " your own, check it, and give that"
+        )
+    return folder / name
+
+
+def read_scene(values: Any, key: str) -> SceneSensor:
     """Read the table ``[scene]``; the picture itself is not opened. Raises `RigError`."""
-    rows, columns = table.integers("pixels", 2, "rows and columns", low=2, high=8192)
-    sensor = SceneSensor(
-        shape=(rows, columns),
-        pixel_scale=table.number("pixel_scale", above=0.0),
-        kernel=table.read("kernel", read_kernel),
-        noise_sd=table.number("noise_sd", low=0.0),
-        bit_depth=table.integer("bit_depth", 16, low=1, high=16),
-        black_level=table.number("black_level", 0.0, low=0.0),
-        counts_per_intensity=table.number("counts_per_intensity", above=0.0),
-        picture=table.text("picture", ""),
-        picture_pixels=table.integer("picture_pixels", 1, low=1, high=64),
-    )
+    sensor = read(SceneSensor, values, key)
     if sensor.black_level >= sensor.full_scale:
         raise RigError(f"scene.black_level = {sensor.black_level:g} is not below the full scale, {sensor.full_scale}")
     return sensor

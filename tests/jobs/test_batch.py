@@ -8,8 +8,10 @@ import multiprocessing
 import re
 import shutil
 import subprocess
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -23,6 +25,10 @@ from aolink.rig import load_rig
 from tests.conftest import EXPOSURES, Session
 
 Run = Callable[..., subprocess.CompletedProcess[str]]
+
+
+def run_here(todo: Sequence[batch.Job], workers: int = 1, **options: Any) -> Iterator[batch.Done]:
+    return batch.run(todo, lambda: batch.here(workers), workers, **options)
 
 
 def test_every_combination_of_the_values_is_a_model() -> None:
@@ -56,7 +62,7 @@ def test_a_setting_that_makes_no_sense(setting: str, message: str) -> None:
 
 def test_a_job_is_what_one_estimate_would_be(recorded: Session, tmp_path: Path) -> None:
     model = batch.models(None, ["plant.process_noise=3.0"])
-    (done,) = batch.run_here(batch.jobs([str(recorded.path)], model, ["o3"], tmp_path), 1)
+    (done,) = run_here(batch.jobs([str(recorded.path)], model, ["o3"], tmp_path))
     assert not done.error
     changed = Recording(recorded.path, side=[done.job.output])
     assert changed.rig.plant.process_noise == pytest.approx(3.0)
@@ -71,11 +77,11 @@ def test_a_job_is_what_one_estimate_would_be(recorded: Session, tmp_path: Path) 
 def test_what_was_done_is_not_done_again_until_something_changes(recorded: Session, tmp_path: Path) -> None:
     (tmp_path / "out").mkdir()
     todo = batch.jobs([str(recorded.path)], batch.models(None, []), ["o1"], tmp_path / "out")
-    first, second = next(batch.run_here(todo, 1)), next(batch.run_here(todo, 1))
+    first, second = next(run_here(todo, 1)), next(run_here(todo, 1))
     assert (first.skipped, second.skipped) == (False, True)
     assert first.row == second.row
     todo[0].output.unlink()
-    assert not next(batch.run_here(todo, 1)).skipped
+    assert not next(run_here(todo, 1)).skipped
 
 
 def test_copies_of_an_earlier_batch_are_refused_with_how_to_do_it_again(recorded: Session, tmp_path: Path) -> None:
@@ -111,7 +117,7 @@ def test_damage_of_a_recording_is_in_its_row(aolink: Run, recorded: Session, tmp
 
 def test_an_absurd_value_fails_alone(recorded: Session, tmp_path: Path) -> None:
     models = batch.models(None, ["sensor.counts_per_density=1e-300,300"])
-    bad, good = batch.run_here(batch.jobs([str(recorded.path)], models, ["moments"], tmp_path), 1)
+    bad, good = run_here(batch.jobs([str(recorded.path)], models, ["moments"], tmp_path), 1)
     assert bad.error
     assert not good.error
     assert [*tmp_path.iterdir()] == [good.job.output]
@@ -126,7 +132,7 @@ def several(recorded: Session, folder: Path) -> list[batch.Job]:
 @pytest.mark.parametrize("workers", [1, 2])
 def test_stopped_no_job_is_begun_and_those_on_the_way_count(recorded: Session, tmp_path: Path, workers: int) -> None:
     todo, done = several(recorded, tmp_path), list[batch.Done]()
-    for each in batch.run_here(todo, workers, stop=lambda: bool(done)):
+    for each in run_here(todo, workers, stop=lambda: bool(done)):
         done.append(each)
     assert 1 <= len(done) <= workers + 1
     assert not any(each.error for each in done)
@@ -151,9 +157,24 @@ def test_stopped_twice_the_processes_end_at_once_and_leave_nothing_half(recorded
         return False
 
     with pytest.raises(KeyboardInterrupt):
-        list(batch.run_here(several(recorded, tmp_path), 2, stop=stop))
+        list(run_here(several(recorded, tmp_path), 2, stop=stop))
     assert not [each for each in multiprocessing.active_children() if each.pid and runs(each.pid)]
     assert not [*tmp_path.glob("*.partial"), *tmp_path.glob(".*")]
+
+
+@pytest.mark.parametrize("at_once", [1, 6])
+def test_any_executor_does_the_jobs_and_those_that_wait_in_it_are_taken_back(
+    recorded: Session, tmp_path: Path, at_once: int
+) -> None:
+    """A pool of one thread; the first job that is done ends the batch."""
+    todo, done, told = several(recorded, tmp_path), list[batch.Done](), list[int]()
+    for each in batch.run(
+        todo, lambda: ThreadPoolExecutor(1), at_once, stop=lambda: bool(done), progress=told.append
+    ):  # fmt: skip
+        done.append(each)
+    assert 1 <= len(done) <= 3
+    assert told == [*range(len(done) + 1)]
+    assert {each.job.output for each in done} == {*tmp_path.glob("*.mcap")}
 
 
 @pytest.mark.slow
@@ -168,7 +189,7 @@ def test_a_process_that_is_killed_costs_its_own_jobs(recorded: Session, tmp_path
             break
         return False
 
-    done = list(batch.run_here(several(recorded, tmp_path), 2, stop=stop))
+    done = list(run_here(several(recorded, tmp_path), 2, stop=stop))
     assert len(done) == 6
     failed = [each.error for each in done if each.error]
     assert killed

@@ -17,7 +17,8 @@ from distributed import Client
 
 from aolink.errors import AolinkError
 from aolink.jobs import batch
-from aolink.jobs.cluster import run_on
+from aolink.jobs.cluster import workers_of
+from aolink.jobs.unit import Model, aolink_version
 from aolink.recording.reader import Recording
 from tests.recording.small import write_small
 
@@ -30,6 +31,7 @@ class Cluster:
     """A scheduler without workers."""
 
     address: str
+    scheduler: subprocess.Popen[bytes]
 
     @contextmanager
     def worker(self, name: str, path: str = "") -> Iterator[subprocess.Popen[bytes]]:
@@ -69,16 +71,18 @@ def _process(*arguments: str, environment: dict[str, str] | None = None) -> Iter
 
 
 @pytest.fixture
-def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
+def cluster(tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureRequest) -> Iterator[Cluster]:
+    """Its parameter, if it has one, is how many workers a job may cost before it counts as failed."""
     file = tmp_path_factory.mktemp("cluster") / "scheduler.json"
     options = ["--host", "127.0.0.1", "--port", "0", "--no-dashboard", "--scheduler-file", str(file)]
-    with _process("scheduler", *options) as process:
+    may_cost = os.environ | {"DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": str(getattr(request, "param", 3))}
+    with _process("scheduler", *options, environment=may_cost) as process:
         deadline = time.monotonic() + _PATIENCE_S
         while True:
             assert process.poll() is None
             assert time.monotonic() < deadline
             try:
-                yield Cluster(json.loads(file.read_text())["address"])
+                yield Cluster(json.loads(file.read_text())["address"], process)
                 return
             except (OSError, ValueError):
                 os.sched_yield()
@@ -96,7 +100,7 @@ def test_a_worker_is_killed_and_nothing_is_lost_or_doubled(cluster: Cluster, tmp
     with ExitStack() as stack:
         workers = [stack.enter_context(cluster.worker(name)) for name in ("one", "two")]
         cluster.wait_for(2)
-        for each in run_on(cluster.address, todo):
+        for each in batch.run(todo, lambda: workers_of(cluster.address), len(todo)):
             if not done:
                 workers[0].kill()
             done.append(each)
@@ -108,9 +112,59 @@ def test_a_worker_is_killed_and_nothing_is_lost_or_doubled(cluster: Cluster, tmp
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [f"{k}.o3.mcap" for k in range(10)]
     (alone := tmp_path / "alone").mkdir()
     for job in batch.jobs(sources[:2], batch.models(None, []), ["o3"], alone):
-        assert not batch.do(job).error
+        assert not batch.do(job, aolink_version()).error
         there = Recording(tmp_path / "out" / job.output.name)
         assert [m.data for m in there.raw_messages()] == [m.data for m in Recording(job.output).raw_messages()]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("cluster", [0], indirect=True)
+def test_a_job_that_costs_its_workers_is_one_line(cluster: Cluster, tmp_path: Path) -> None:
+    todo = batch.jobs([str(write_small(tmp_path / f"{k}.mcap", 100)) for k in range(10)], [Model()], ["o3"], tmp_path)
+    done: list[batch.Done] = []
+    with cluster.worker("one") as first, cluster.worker("two"):
+        cluster.wait_for(2)
+        for each in batch.run(todo, lambda: workers_of(cluster.address), len(todo)):
+            if not done:
+                first.kill()
+            done.append(each)
+    errors = [each.error for each in done if each.error]
+    assert len(done) == len(todo)
+    assert 1 <= len(errors) <= 3, "those that the worker had"
+    assert {*errors} == {"its process was ended from outside: too little memory, or a signal"}
+
+
+@pytest.mark.slow
+def test_stopped_the_cluster_keeps_nothing_of_the_batch(
+    cluster: Cluster, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    todo = batch.jobs([str(write_small(tmp_path / f"{k}.mcap", 100)) for k in range(30)], [Model()], ["o3"], tmp_path)
+    done: list[batch.Done] = []
+    with cluster.worker("one"), Client(cluster.address, set_as_default=False) as client:
+        client.wait_for_workers(1, timeout=_PATIENCE_S)
+        for each in batch.run(todo, lambda: workers_of(cluster.address), len(todo), stop=lambda: bool(done)):
+            done.append(each)
+        while client.run_on_scheduler(lambda dask_scheduler: len(dask_scheduler.tasks)) or [*tmp_path.glob(".*")]:
+            os.sched_yield()
+    assert 1 <= len(done) <= len([*tmp_path.glob("*.o3.mcap")]) <= len(done) + 2 < len(todo)
+    assert capfd.readouterr().err == ""
+
+
+@pytest.mark.slow
+def test_without_its_scheduler_a_batch_ends_with_one_line(cluster: Cluster, tmp_path: Path) -> None:
+    todo = batch.jobs([str(write_small(tmp_path / "s.mcap", 3))], batch.models(None, []), ["o3"], tmp_path)
+    with cluster.worker("one"):
+        cluster.wait_for(1)
+        address = cluster.address
+        stopped = iter([False])
+
+        def stop() -> bool:  # asked once before the job is given away, and then while it is waited for
+            if next(stopped, None) is None:
+                cluster.scheduler.kill()
+            return False
+
+        with pytest.raises(AolinkError, match=f"the scheduler at {address} is gone; what was done stays"):
+            list(batch.run(todo * 20, lambda: workers_of(address), 20, stop=stop))
 
 
 @pytest.mark.slow
@@ -151,4 +205,4 @@ def test_the_command_on_a_cluster(cluster: Cluster, aolink: Run, tmp_path: Path)
 @pytest.mark.parametrize("address", ["127.0.0.1:1", "nonsense"])
 def test_no_scheduler_is_one_clear_line(address: str) -> None:
     with pytest.raises(AolinkError, match="no Dask scheduler answers at"):
-        list(run_on(address, []))
+        workers_of(address).__enter__()

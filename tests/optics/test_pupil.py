@@ -195,10 +195,10 @@ def test_a_window_in_the_dark_may_be_missing_or_bright():
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("obstruction = 0.25", "obstruction = 1.0", "lenslets.obstruction = 1 is a share of the pupil's diameter"),
-        ("least_light = 0.4", "least_light = 1.5", "lenslets.least_light = 1.5 is a share of a lenslet"),
+        ("obstruction = 0.25", "obstruction = 1.0", "lenslets.obstruction = 1 must be below 1"),
+        ("least_light = 0.4", "least_light = 1.5", "lenslets.least_light = 1.5 must be at most 1"),
         ("pupil_m = 2.4e-3      # d", "pupil_m = 0.01e-3 # d", "lenslets.least_light = 0.4: no lenslet has that share"),
-        ("pupil_m = 2.4e-3      # d", "# d", "lenslets.obstruction is not a key"),
+        ("pupil_m = 2.4e-3      # d", "# d", "lenslets.least_light needs lenslets.pupil_m"),
     ],
 )  # fmt: skip
 def test_a_pupil_that_cannot_be_is_refused(old, new, message):

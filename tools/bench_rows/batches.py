@@ -14,7 +14,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -173,7 +173,7 @@ def cluster_workers(effort: Effort) -> Row:
     """
     from distributed import Client
 
-    from aolink.jobs.cluster import run_on
+    from aolink.jobs.cluster import workers_of
 
     with tempfile.TemporaryDirectory() as name, ExitStack() as stack:
         folder = Path(name)
@@ -199,12 +199,12 @@ def cluster_workers(effort: Effort) -> Row:
 
         def work(address: str, some: Sequence[Any] = todo) -> float:
             """Time that the workers were busy, s."""
-            done = list(run_on(address, some))
+            done = list(batch.run(some, lambda: workers_of(address), len(some)))
             assert not any(each.error for each in done)
             return math.fsum(each.row["seconds"] for each in done)
 
         def plain(pool: ProcessPoolExecutor, some: Sequence[Any] = todo) -> None:
-            assert not any(each.error for each in pool.map(batch.do, some))
+            assert not any(each.error for each in batch.run(some, lambda: nullcontext(pool), len(some)))
 
         small, large = cluster(1), cluster(2)
         alone, pair = (stack.enter_context(pool_of(count)) for count in (1, 2))
