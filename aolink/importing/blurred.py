@@ -51,9 +51,11 @@ _FINE = 3
 _NARROWER, _WORSE, _SURE = 8, 1.0, 2.5
 """A kernel is too wide where the squares of a profile's residuals exceed those with one so many steps narrower by so
 many squares of the noise, and by so many standard deviations of chance."""
-_BRIGHT, _TAKEN, _SHOT = 0.3, 1.5, 0.3
-"""Shot noise is looked for in pixels of profiles with this share of the brightest one's light; by how much residuals
-are smaller than the noise there; and the share of the dark noise's variance that shows."""
+_BRIGHT, _SHOT, _FEWEST_PIXELS = 0.3, 0.3, 100
+"""Shot noise is looked for in pixels of profiles with this share of the brightest one's light; the share of the dark
+noise's variance that shows; and how many such pixels are enough."""
+_TURNS, _SETTLED = 4, 0.1
+"""Turns in which kernel and shot noise are found, and the change of the latter that ends them."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -113,10 +115,9 @@ def find_spots(
     windows /= usual[:, None, None]
     noise /= float(usual.mean())
     profiles = [np.nansum(windows, axis=axis) for axis in (2, 3)]  # along x, along y
-    sd = _kernel(profiles)
+    sd, electrons = _kernel_and_electrons(profiles, noise * math.sqrt(side))
     rows, columns = film.shape
     ends = corners + side
-    electrons = _electrons(profiles, sd, noise * math.sqrt(side))
     return Spots(
         light=windows, corners=corners, sd=sd, noise=noise,
         electrons=electrons, mean=mean, saturated=float(bad.mean()), left_out=left_out,
@@ -226,36 +227,56 @@ def _ground(windows: FloatArray) -> FloatArray:
     return out
 
 
-def _densities(profile: FloatArray, sd: float) -> tuple[FloatArray, FloatArray]:
+def _densities(profile: FloatArray, sd: float, noise: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Densities of places, nowhere negative, that explain profiles (..., pixels) best with a kernel, (..., places), and
-    the residuals."""
+    the residuals; ``noise`` is the standard deviation of each pixel's."""
     pixels = profile.shape[-1]
     places = (np.arange(_FINE * pixels) + 0.5) / _FINE - 0.5
     kernel = pixel_masses(sd**2, np.arange(pixels + 1) - 0.5, places, 0)[0].T
-    flat = profile.reshape(-1, pixels)
-    density = np.array([optimize.nnls(kernel, each, maxiter=60 * pixels)[0] for each in flat])
+    flat, by = profile.reshape(-1, pixels), noise.reshape(-1, pixels)
+    each = zip(flat, by, strict=True)
+    density = np.array([optimize.nnls(kernel / s[:, None], y / s, maxiter=60 * pixels)[0] for y, s in each])
     return density.reshape(*profile.shape[:-1], -1), (flat - density @ kernel.T).reshape(profile.shape)
 
 
-def _kernel(profiles: list[FloatArray]) -> float:
+def _kernel_and_electrons(profiles: list[FloatArray], dark: float) -> tuple[float, float]:
+    """The widest kernel that explains profiles along x and along y, whose noise in the dark is given, and a spot's
+    photoelectrons. Shot noise is known once the kernel is, so both are found in turns."""
+    gain = 0.0
+    sd = math.inf
+    for _ in range(_TURNS):
+        noises = [_noise(profile, dark, gain) for profile in profiles]
+        sd = _kernel(profiles, noises)
+        found = _gain(profiles, sd if math.isfinite(sd) else _SHARPEST, noises, dark)
+        if abs(found - gain) < _SETTLED * gain:
+            break
+        gain = found
+    return sd, 1 / gain if gain else 0.0
+
+
+def _noise(profile: FloatArray, dark: float, gain: float) -> FloatArray:
+    """Standard deviation of each pixel of profiles by read-out and by shot noise of its light."""
+    light = np.maximum(ndimage.gaussian_filter1d(profile, 1.0, axis=-1), 0.0)
+    return np.asarray(np.sqrt(dark**2 + gain * light))
+
+
+def _kernel(profiles: list[FloatArray], noises: list[FloatArray]) -> float:
     """The widest kernel that explains the profiles along x and along y, (frames, n, pixels) each."""
     some = np.unique(np.linspace(0, len(profiles[0]) - 1, _KERNEL_FRAMES).round().astype(int))
     widest = math.inf
-    for profile in profiles:
+    for profile, noise in zip(profiles, noises, strict=True):
 
         @cache
-        def misfit(k: int, profile: FloatArray = profile[some]) -> tuple[FloatArray, FloatArray]:
-            """Squares of the residuals of each frame, and how many densities are not zero."""
-            density, left = _densities(profile, float(_WIDTHS[k]))
-            return (left**2).sum(axis=(1, 2)), np.count_nonzero(density > 0, axis=(1, 2))
+        def misfit(k: int, profile: FloatArray = profile[some], noise: FloatArray = noise[some]) -> FloatArray:
+            """Squares of the residuals of each frame, over their noise: each density that is not zero takes one away."""
+            density, left = _densities(profile, float(_WIDTHS[k]), noise)
+            taken = np.count_nonzero(density > 0, axis=2)
+            return np.asarray((((left / noise) ** 2).sum(axis=2) + taken).mean(axis=1))
 
         coarse = range(0, len(_WIDTHS), _NARROWER)
-        noise = min(float(square.mean() / (profile[0].size - taken.mean())) for square, taken in map(misfit, coarse))
 
-        def too_wide(k: int, noise: float = noise) -> float:
-            # A density that is not zero takes a square of the noise from the residuals.
-            (square, taken), (narrower, by_it) = misfit(k), misfit(k - _NARROWER)
-            more = (square - narrower) / noise + taken - by_it
+        def too_wide(k: int) -> float:
+            more = misfit(k) - misfit(k - _NARROWER)
             return float(more.mean() - max(_WORSE, _SURE * more.std() / math.sqrt(len(more))))
 
         right = [k for k in coarse[1:] if too_wide(k) <= 0]
@@ -267,12 +288,20 @@ def _kernel(profiles: list[FloatArray]) -> float:
     return widest
 
 
-def _electrons(profiles: list[FloatArray], sd: float, noise: float) -> float:
-    """Photoelectrons of a spot, from the residuals of the profiles, whose noise in the dark is given."""
-    left = [_densities(profile, sd)[1] for profile in profiles]
-    light = np.concatenate([(profile - each).ravel() for profile, each in zip(profiles, left, strict=True)])
-    square = np.concatenate([each.ravel() for each in left]) ** 2
-    bright = light > _BRIGHT * light.max()
-    # A density that is not zero takes a square of the noise from the residuals, and there are most where it is bright.
-    more, shine = _TAKEN * float(square[bright].mean()) - noise**2, float(light[bright].mean())
-    return shine / more if more > _SHOT * noise**2 else 0.0
+def _gain(profiles: list[FloatArray], sd: float, noises: list[FloatArray], dark: float) -> float:
+    """The variance of shot noise over the light, from what a kernel leaves of the profiles; zero where it is hidden."""
+    square = shine = 0.0
+    free = count = 0
+    for profile, noise in zip(profiles, noises, strict=True):
+        density, left = _densities(profile, sd, noise)
+        bright = profile - left > _BRIGHT * profile.max()
+        # A density that is not zero takes the noise of one pixel from the residuals.
+        taken = np.count_nonzero(density.reshape(*profile.shape, _FINE).max(axis=-1)[bright] > 0)
+        square += float((left[bright] ** 2).sum())
+        shine += float((profile - left)[bright].sum())
+        count += int(bright.sum())
+        free += int(bright.sum()) - taken
+    if free < _FEWEST_PIXELS:
+        return 0.0
+    more = square / free - dark**2
+    return more / (shine / count) if more > _SHOT * dark**2 else 0.0
