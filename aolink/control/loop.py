@@ -14,6 +14,7 @@ from aolink.control.controller import ControllerRow, Seen
 from aolink.control.drift import Fit, FitMonitor
 from aolink.control.fall_back import FallBack
 from aolink.control.registry import find_controller
+from aolink.errors import ControlError
 from aolink.estimation import Estimate, Needs, Status
 from aolink.estimation.frames.measure import measure
 from aolink.exposure import Exposure
@@ -94,6 +95,11 @@ class ControlLoop:
 
     def __init__(self, rig: Rig, controller: str | ControllerRow) -> None:
         row = find_controller(controller, rig) if isinstance(controller, str) else controller
+        if rig.readout_steps:
+            raise ControlError(
+                "a controller takes the whole frame to be exposed at once, and sensor.row_time_s (or scene.row_time_s)"
+                " says that its rows are not: close the loop with a global shutter"
+            )
         self.name, self.needs_state = row.name, row.needs_state
         self.delay_steps = delay_steps(rig)
         self.state, self.reason = State.CLOSED, ""

@@ -6,12 +6,13 @@ An intensity of one is the brightest that a picture file of whole numbers can ho
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from aolink.numerics.arrays import BoolArray, FloatArray
-from aolink.optics.sensor import Kernel
+from aolink.optics.sensor import Kernel, row_starts_s
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,6 +35,13 @@ class SceneSensor:
     """Picture that a simulated rig shows: a file beside the rig file, or one that comes with aolink; may be empty."""
     picture_pixels: int
     """Rows and columns of the picture's own pixels in one of the sensor's."""
+    row_time_s: float | None = None
+    """As `BaseSensor.row_time_s`, for the rows of the picture."""
+
+    @cached_property
+    def row_starts_s(self) -> FloatArray:
+        """When each row's exposure starts, after that of the row that starts first, s, (rows,)."""
+        return row_starts_s(self.row_time_s, self.shape[0])
 
     @property
     def full_scale(self) -> int:

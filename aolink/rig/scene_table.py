@@ -31,6 +31,7 @@ def read_scene(table: Table) -> SceneSensor:
         counts_per_intensity=table.number("counts_per_intensity", above=0.0),
         picture=table.text("picture", ""),
         picture_pixels=table.integer("picture_pixels", 1, low=1, high=64),
+        row_time_s=table.optional_number("row_time_s", low=-1.0, high=1.0),
     )
     if sensor.black_level >= sensor.full_scale:
         raise RigError(f"scene.black_level = {sensor.black_level:g} is not below the full scale, {sensor.full_scale}")

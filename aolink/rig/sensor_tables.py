@@ -112,6 +112,7 @@ def _read_out(table: Table, known_field: tuple[float, float] | None) -> dict[str
         "photoelectrons": table.number("photoelectrons", 0.0, low=0.0),
         "defects": _defects(table),
         "pedestal": table.choice("pedestal", ("known", "free")) if table.has("pedestal") else "known",
+        "row_time_s": table.optional_number("row_time_s", low=-1.0, high=1.0),
     }
 
 

@@ -25,9 +25,10 @@ fwhm frame_period_steps frequency frequency_hz gain gamma grid initial_covarianc
 kernel kernel_sigma_sd kernel_width kind latency_s layers leak least_light least_singular_value lenslets light max_v
 mirror model modes name noise_density noise_density_sd noise_sd obstruction offset outer_scale_m pad_radius_m park
 pedestal period_s photoelectrons photoelectrons_sd picture picture_pixels pitch_m pixel_scale pixels plant plant_noise
-process_noise pupil_m queue_steps r0_m radius_m rate_per_minute recorded resonance_hz scene sd seed sensor sensor_noise
-shape sigma simulation slew_max_per_s slope_unit_rad sources step_sd still_frames summary tension_n_per_m timing
-turbulence unmodelled vibration voltage wandering watchdog_s wavelength_m when_lost wind_m_s window zernike_m
+process_noise pupil_m queue_steps r0_m radius_m rate_per_minute recorded resonance_hz row_time_s scene sd seed sensor
+sensor_noise shape sigma simulation slew_max_per_s slope_unit_rad sources step_sd still_frames summary
+tension_n_per_m timing turbulence unmodelled vibration voltage wandering watchdog_s wavelength_m when_lost wind_m_s
+window zernike_m
 """
 _FAULTS = """
 bit_error_rate bit_flip_rate burst_rate byte_insert_rate byte_loss_rate byte_repeat_rate chunk_loss_rate
@@ -165,8 +166,8 @@ class Table:
             )
         return value
 
-    def optional_number(self, name: str, *, low: float) -> float | None:
-        return self.number(name, low=low) if self.has(name) else None
+    def optional_number(self, name: str, *, low: float, high: float = _LARGEST) -> float | None:
+        return self.number(name, low=low, high=high) if self.has(name) else None
 
     def texts(self, name: str) -> tuple[str, ...]:
         values = self.get(name, [])
