@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from aolink.exposure import Exposure
 from aolink.rig import MirrorDriver, Rig
-from aolink.rig.rows import inputs_by_axis
+from aolink.rig.rows import inputs_by_axis, possible_skew_ns
 from aolink.wire import messages_pb2 as pb
 from aolink.wire.runs_pb2 import Run
 
@@ -47,6 +47,8 @@ class Frame:
     alignment_sigma_ns: float = 0.0
     exposure_offset_ns: int = 0
     """From the beginning of the first fast step to the start of the exposure; less than a fast step."""
+    rows_unknown: bool = False
+    """Whether it is not known when in the exposure each row was exposed."""
     plane: int = 0
     """Number of the camera's picture of the exposure: 0 for the spots, 1 for the scene."""
     slopes: NDArray[np.float64] | None = None
@@ -345,6 +347,7 @@ class Assembler:
             chunks_lost=frame.chunks_lost, device_start_ns=frame.device_start_ns, device_end_ns=frame.device_end_ns,
             host_start_ns=frame.host_start_ns, host_receive_ns=frame.host_receive_ns,
             clock_sigma_ns=frame.clock_sigma_ns, alignment_sigma_ns=frame.alignment_sigma_ns, slopes=frame.slopes,
+            row_sigma_ns=possible_skew_ns(self._rig) if frame.rows_unknown else None,
         )  # fmt: skip
 
     def _at_once(self, frame: Frame, lead_start: int) -> tuple[NDArray[np.float64], NDArray[np.float64], int]:

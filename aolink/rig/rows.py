@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -21,6 +22,9 @@ from aolink.errors import RigError
 from aolink.numerics.arrays import FloatArray, Indices
 from aolink.optics.sensor import BaseSensor
 from aolink.rig.parts import Plant, Timing
+
+if TYPE_CHECKING:
+    from aolink.rig.file import Rig
 
 _MOST_NUMBERS = 20_000_000
 """Outputs times states times steps of a plant whose outputs have intervals of their own; 160 MB."""
@@ -92,3 +96,17 @@ def inputs_by_axis(plant: Plant, delays: Indices, inputs: FloatArray, first: int
         before = min(max(0, -start), n_steps)
         out[before:, axis] = each[start + before : start + n_steps, axis]
     return out.reshape(n_steps, inputs.shape[1])
+
+
+def possible_skew_ns(rig: Rig) -> FloatArray:
+    """Standard deviation of the start of each axis's own interval where the row time is not known, ns, (axes,).
+
+    A camera reads a frame out in a frame period at most, from the top or from the bottom: the start of the middle row
+    of a spot's window is uniformly distributed over as much of the period, before or after, as the window is down.
+    """
+    sensor, timing = rig.sensor, rig.timing
+    rows = [sensor.window_of(spot)[0] for spot in range(sensor.spots)]
+    middle = np.array([(each.start + each.stop - 1) / 2 for each in rows]) / sensor.shape[0]
+    of_output = np.repeat(middle, sensor.directions).reshape(rig.plant.axes, -1)
+    period_ns = timing.frame_period_steps * timing.fast_step_ns
+    return np.asarray(of_output.max(axis=1) * period_ns / math.sqrt(3))

@@ -43,7 +43,7 @@ class OpenCVCamera(ThreadCamera):
         OpenCV is not installed or cannot open the source, or size or rate of its pictures are not the rig file's.
     """
 
-    lacks: ClassVar[tuple[Lacks, ...]] = (Lacks.TIME, Lacks.COUNT, Lacks.TRIGGER)
+    lacks: ClassVar[tuple[Lacks, ...]] = (Lacks.TIME, Lacks.COUNT, Lacks.TRIGGER, Lacks.ROWS)
 
     def __init__(self, rig: Rig, *, source: int | str = 0, corner: Sequence[int] | None = None) -> None:
         with needs_extra("opencv", DeviceError):
