@@ -9,6 +9,7 @@ from aolink.rig import parse_rig
 from aolink.session import record
 from aolink.simulation.model import simulate
 from tests.commands import simulated_rig
+from tests.kinds import truth_of
 from tests.simulation.rolling import COUPLED, rolling
 
 OVERLAPPING = rolling("sh-4x4", 2e-3)
@@ -28,9 +29,9 @@ def test_the_wire_gives_what_the_model_gives_in_memory(rig, tmp_path):
         assert (ours.first_step, ours.n_steps) == (theirs.first_step, theirs.n_steps)
         for name in ("pixels", "inputs"):
             assert np.array_equal(getattr(ours, name), getattr(theirs, name))
-        assert np.array_equal(ours.truth.path, theirs.truth.path)
-        assert np.array_equal(ours.truth.end_state, theirs.truth.end_state)
+        assert np.array_equal(truth_of(ours).path, truth_of(theirs).path)
+        assert np.array_equal(truth_of(ours).end_state, truth_of(theirs).end_state)
     again = [estimate for _, (estimate,) in reestimated(recording, ["o3"])]
     assert first_difference(recording.estimates("o3"), again) is None
     estimates = list(recording.estimates("o3"))
-    assert all(each.path.shape == made[0].truth.path.shape for each in estimates)
+    assert all(each.path.shape == truth_of(made[0]).path.shape for each in estimates)

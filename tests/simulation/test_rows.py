@@ -15,6 +15,7 @@ from aolink.optics.frame import frame_density
 from aolink.rig import Rig, load_rig, parse_rig
 from aolink.simulation.model import RigPhysics, simulate
 from aolink.wire import messages_pb2 as pb
+from tests.kinds import truth_of
 from tests.simulation.rolling import COUPLED, rolling
 
 GLOBAL = {"section-vi": 2332453243, "sh-4x4": 1744170891, "moving-scene": 2062152063}
@@ -47,7 +48,7 @@ def test_each_row_is_the_mean_over_its_own_interval(row_time_s):
     long = plain.timing.exposure_steps * 2
     (exposure,) = simulate(rig, 1, 5)
     # The same motion, seen at once: its truth has the path step by step.
-    steps = np.concatenate([each.truth.path for each in simulate(plain, 2, 5)], axis=1)
+    steps = np.concatenate([truth_of(each).path for each in simulate(plain, 2, 5)], axis=1)
     assert steps.shape[1] == long
     rows, step_s = rig.sensor.shape[0], rig.timing.fast_step_s
     for row in (0, 13, 40, rows - 1):
@@ -60,7 +61,7 @@ def test_each_row_is_the_mean_over_its_own_interval(row_time_s):
         )
     spot = 3
     late = int(np.rint(rig.sensor.spot_starts_s[spot] / step_s))
-    assert (exposure.truth.path[2 * spot] == steps[2 * spot, late : late + rig.timing.exposure_steps]).all()
+    assert (truth_of(exposure).path[2 * spot] == steps[2 * spot, late : late + rig.timing.exposure_steps]).all()
 
 
 def test_frames_with_rows_do_not_depend_on_how_the_steps_are_cut():
@@ -78,7 +79,7 @@ def test_frames_with_rows_do_not_depend_on_how_the_steps_are_cut():
 
 
 @pytest.mark.parametrize("rig", [rolling("sh-4x4", 2e-3), parse_rig(COUPLED)], ids=["copies", "one plant"])
-def test_assembled_exposures_are_those_of_the_simulation(rig: Rig):
+def test_assembled_exposures_are_those_of_the_simulation(rig: Rig) -> None:
     timing, inputs = rig.timing, np.random.default_rng(3).uniform(-0.01, 0.01, (1000, rig.n_inputs))
     made = simulate(rig, 3, 4, inputs=inputs)
     assembler, assembled = Assembler(rig), []
