@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -177,6 +178,10 @@ def draw_intensity(
     if not np.isfinite(seen).any():
         axes.text(0.5, 0.5, "no pixel\narrived", ha="center", va="center", transform=axes.transAxes)
     for name, (path,) in paths_of(exposure, estimates, [output]).items():
+        plant = series.rig.plant
+        if plant.delays:  # of the output's own interval
+            late = plant.delays[output % plant.n_outputs]
+            path = path[late : late + exposure.n_steps - plant.last_delay]
         predicted = sensor.light_of(output) * exposure_density(line.kernel, line.edges, path)
         width = 1.8 if name == "truth" else 1.3
         axes.stairs(predicted, line.edges, orientation=orientation, color=colour(name), linewidth=width, label=name)
@@ -215,6 +220,11 @@ def _draw_path(axes: Axes, times: FloatArray, path: FloatArray, sd: FloatArray |
         axes.fill_between(times, path - BAND * sd, path + BAND * sd, color=colour(name), alpha=0.2, linewidth=0)
 
 
+def _on_line(value: float, slope: float, at: float, place: FloatArray) -> FloatArray:
+    """A straight line that has this value at a place."""
+    return np.asarray(value + slope * (np.asarray(place) - at))
+
+
 def draw_spot(axes: Axes, sensor: BaseSensor, exposure: Exposure, estimates: dict[str, Estimate], spot: int) -> None:
     """Draw the picture of one spot with the paths over it."""
     window = sensor.window_of(spot)
@@ -227,6 +237,11 @@ def draw_spot(axes: Axes, sensor: BaseSensor, exposure: Exposure, estimates: dic
     for name, path in paths.items():
         axes.plot(*path, color=colour(name), linewidth=1.6 if name == "truth" else 1.0)
     axes.set(xlabel="x (slope units)", ylabel="y (slope units)", xlim=(low, high), ylim=(high, low))
+    if sensor.row_time_s:  # beside the rows, when the exposure of each starts
+        first, per_unit = 1e3 * sensor.row_starts_s[window[0]][0], 1e3 * sensor.row_time_s / sensor.pixel_width
+        row = low + sensor.pixel_width / 2
+        start, back = partial(_on_line, first, per_unit, row), partial(_on_line, row, 1 / per_unit, first)
+        axes.secondary_yaxis("right", functions=(start, back)).set_ylabel("start of a row's exposure (ms)")
     if paths:  # the part of the window that they are in, as a square
         ends = np.array([limits_of(sensor.profile, [path[k] for path in paths.values()]) for k in (0, 1)])
         half, (middle_x, middle_y) = float(np.ptp(ends, axis=1).max()) / 2, ends.mean(axis=1)
