@@ -19,7 +19,7 @@ EXPOSURES, FIRST = 16, 4
 
 
 def calm(rig: Rig) -> Rig:
-    """The rig with a hundredth of its process noise, so that the mirror moves the spots more than they do themselves."""
+    """The rig with a hundredth of its process noise: the mirror moves the spots more than they do themselves."""
     return replace(rig, plant=replace(rig.plant, process_noise=0.01 * rig.plant.process_noise))
 
 
