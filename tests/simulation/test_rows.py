@@ -101,6 +101,25 @@ def test_assembled_exposures_are_those_of_the_simulation(rig: Rig) -> None:
             assert np.array_equal(*map(attrgetter(name), (a, b)))
 
 
+def test_the_lead_after_a_lost_frame_is_that_of_each_axis() -> None:
+    rig = rolling("sh-4x4", 2e-3)
+    n, inputs = rig.timing.exposure_steps, np.random.default_rng(3).uniform(-0.01, 0.01, (1000, rig.n_inputs))
+    made = simulate(rig, 4, 4, inputs=inputs)
+    assembler, assembled = Assembler(rig), []
+    assembler.add_applied(pb.Applied(first_step=0, n_steps=1000, u=inputs.ravel(), source=pb.Applied.COMMAND))
+    for k in (0, 3):
+        frame = Frame(
+            frame_id=k + 1, first_step=k * n, last_step=k * n + n - 1, pixels=made[k].pixels, mask=made[k].mask,
+            chunks_lost=0, frames_lost_before=0, device_start_ns=0, device_end_ns=0, host_first_byte_ns=0,
+            host_receive_ns=0,
+        )  # fmt: skip
+        assembled += assembler.add_frame(frame)
+    last = assembled[1]
+    for axis, late in enumerate(rig.axis_delays):
+        assert np.array_equal(last.lead_inputs[:, axis], inputs[n + late : 3 * n + late, axis])
+        assert np.array_equal(last.inputs[:, axis], inputs[3 * n + late : 4 * n + late, axis])
+
+
 def test_the_model_of_one_plant_takes_each_output_in_its_own_interval():
     rig = parse_rig(COUPLED)
     plant, n = rig.plant, rig.timing.exposure_steps
