@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from aolink.exposure import Exposure
 from aolink.rig import MirrorDriver, Rig
+from aolink.rig.rows import inputs_by_axis, possible_skew_ns
 from aolink.wire import messages_pb2 as pb
 from aolink.wire.runs_pb2 import Run
 
@@ -46,6 +47,8 @@ class Frame:
     alignment_sigma_ns: float = 0.0
     exposure_offset_ns: int = 0
     """From the beginning of the first fast step to the start of the exposure; less than a fast step."""
+    rows_unknown: bool = False
+    """Whether it is not known when in the exposure each row was exposed."""
     plane: int = 0
     """Number of the camera's picture of the exposure: 0 for the spots, 1 for the scene."""
     slopes: NDArray[np.float64] | None = None
@@ -296,7 +299,10 @@ class Assembler:
 
     def __init__(self, rig: Rig) -> None:
         self._history = InputHistory(rig.mirror)
-        self._no_lead = np.empty((0, rig.n_inputs))
+        self._rig, self._no_lead = rig, np.empty((0, rig.n_inputs))
+        self._delay = rig.input_delay
+        self._kept, self._kept_until = self._no_lead, 0
+        """Inputs up to a fast step, of which axes that are exposed later still need some."""
         self._fast_step_ns = rig.timing.fast_step_ns
         self._frames: deque[Frame] = deque()
         self._end: int | None = None
@@ -313,7 +319,7 @@ class Assembler:
     def add_frame(self, frame: Frame) -> list[Exposure]:
         """Take a frame; gives the exposures that are complete with it."""
         self._frames.append(frame)
-        self._history.know(frame.last_step + 1)
+        self._history.know(frame.last_step + 1 + self._delay)
         return self._ready()
 
     def flush(self) -> list[Exposure]:
@@ -324,7 +330,7 @@ class Assembler:
 
     def _ready(self) -> list[Exposure]:
         exposures = []
-        while self._frames and self._history.is_known_until(self._frames[0].last_step + 1):
+        while self._frames and self._history.is_known_until(self._frames[0].last_step + 1 + self._delay):
             exposures.append(self._expose(self._frames.popleft()))
         return exposures
 
@@ -333,16 +339,40 @@ class Assembler:
         begin = self._history.first_commanded if self._end is None else self._end
         lead_start = frame.first_step if begin is None else min(begin, frame.first_step)
         lead_start = max(lead_start, frame.first_step - _MOST_LEAD_STEPS)
+        lead, inputs, assumed = (self._delayed if self._delay else self._at_once)(frame, lead_start)
+        return Exposure(
+            n_steps=len(inputs), inputs=inputs, lead_inputs=lead,
+            start_offset=frame.exposure_offset_ns / self._fast_step_ns, inputs_assumed=assumed,
+            frame_id=frame.frame_id, first_step=frame.first_step, pixels=frame.pixels, mask=frame.mask,
+            chunks_lost=frame.chunks_lost, device_start_ns=frame.device_start_ns, device_end_ns=frame.device_end_ns,
+            host_start_ns=frame.host_start_ns, host_receive_ns=frame.host_receive_ns,
+            clock_sigma_ns=frame.clock_sigma_ns, alignment_sigma_ns=frame.alignment_sigma_ns, slopes=frame.slopes,
+            row_sigma_ns=possible_skew_ns(self._rig) if frame.rows_unknown else None,
+        )  # fmt: skip
+
+    def _at_once(self, frame: Frame, lead_start: int) -> tuple[NDArray[np.float64], NDArray[np.float64], int]:
+        """Inputs of the lead and of the exposure, and how many of their steps are assumed."""
         lead, lead_assumed = self._no_lead, 0
         if lead_start < frame.first_step:
             lead, lead_assumed = self._history.take(lead_start, frame.first_step)
         inputs, assumed = self._history.take(frame.first_step, frame.last_step + 1)
         self._end = frame.last_step + 1
-        return Exposure(
-            n_steps=frame.last_step + 1 - frame.first_step, inputs=inputs, lead_inputs=lead,
-            start_offset=frame.exposure_offset_ns / self._fast_step_ns, inputs_assumed=assumed + lead_assumed,
-            frame_id=frame.frame_id, first_step=frame.first_step, pixels=frame.pixels, mask=frame.mask,
-            chunks_lost=frame.chunks_lost, device_start_ns=frame.device_start_ns, device_end_ns=frame.device_end_ns,
-            host_start_ns=frame.host_start_ns, host_receive_ns=frame.host_receive_ns,
-            clock_sigma_ns=frame.clock_sigma_ns, alignment_sigma_ns=frame.alignment_sigma_ns, slopes=frame.slopes,
-        )  # fmt: skip
+        return lead, inputs, assumed + lead_assumed
+
+    def _delayed(self, frame: Frame, lead_start: int) -> tuple[NDArray[np.float64], NDArray[np.float64], int]:
+        """The same, of each axis in its own interval, where the camera exposes its rows one after the other."""
+        rig, last = self._rig, frame.last_step + 1 + self._delay
+        begin = max(self._kept_until, lead_start)
+        new, assumed = self._history.take(begin, last)
+        rows = np.concatenate([self._kept if begin == self._kept_until else self._no_lead, new])
+        from_step = last - len(rows)
+        if self._end is None:
+            # Before the mirror's first command it is at rest; every axis begins as early as the latest one.
+            lead_start -= int(rig.axis_delays.max())
+        n_steps = frame.last_step + 1 - frame.first_step + rig.plant.last_delay
+        lead = inputs_by_axis(rig.plant, rig.axis_delays, rows, lead_start - from_step, frame.first_step - lead_start)
+        inputs = inputs_by_axis(rig.plant, rig.axis_delays, rows, frame.first_step - from_step, n_steps)
+        self._end = frame.first_step + n_steps
+        # The next exposure begins one step before this one's end at the earliest.
+        self._kept, self._kept_until = rows[max(self._end - 1 - from_step, 0) :], last
+        return lead, inputs, assumed

@@ -29,7 +29,8 @@ class Truth:
     end_state: NDArray[np.float64]
     """State one fast step after the exposure's last one, (axes, n_states)."""
     path: NDArray[np.float64]
-    """Output at each fast step of the exposure, slope units, (n_outputs, n_steps)."""
+    """Output at each fast step of the exposure, slope units, (n_outputs, n_steps); of its own interval, see
+    `Exposure`."""
     path_sd: float = 0.0
     """Standard deviation of an error in ``path``, slope units: zero for a simulated rig, larger where the path was
     measured."""
@@ -52,14 +53,21 @@ class Picture:
 
 @plain_data
 class Exposure:
-    """One camera integration. Its arrays must not be changed; those of a recording cannot be."""
+    """One camera integration. Its arrays must not be changed; those of a recording cannot be.
+
+    Where the camera exposes its rows one after the other (``sensor.row_time_s``), each spot has an interval of its own,
+    that of the middle row of its window. The steps of an axis, its inputs, states and path are those of its own
+    interval, which starts ``Rig.axis_delays`` steps after the exposure; where one plant moves several spots, they go
+    from the first spot's interval to the end of the last one's.
+    """
 
     frame_id: int
     """The camera's own count of its frames; a gap is a lost frame."""
     first_step: int
     """Fast step at which the exposure starts."""
     n_steps: int
-    """N, the exposure's length in fast steps."""
+    """N, the exposure's length in fast steps; longer where one plant moves spots that are exposed one after the
+    other."""
     pixels: NDArray[np.uint16]
     """Counts, (rows, columns)."""
     mask: NDArray[np.bool_]
@@ -102,6 +110,9 @@ class Exposure:
     Zero where the camera counts the steps together with its mirror. With two clocks it is the error of their
     comparison, which neighbouring exposures have in common: it does not average out.
     """
+    row_sigma_ns: NDArray[np.float64] | None = None
+    """Standard deviation of the start of each axis's own interval relative to the exposure's, ns, (axes,), where the
+    camera or the film may expose row by row and nobody has said how fast; None where it is known."""
     slopes: NDArray[np.float64] | None = None
     """Slopes that other software measured, slope units, (all outputs of all axes,), NaN where it measured none.
 

@@ -84,7 +84,8 @@ class Blur:
     measured: FloatArray
     """Intensity density, one over slope units, (pixels,); NaN where a pixel never came."""
     paths: Mapping[str, FloatArray]
-    """Name (``truth``, first, or an estimator's) -> position at each fast step, slope units, (n_steps,)."""
+    """Name (``truth``, first, or an estimator's) -> position at each fast step of the output's own interval, slope
+    units."""
 
     @classmethod
     def of(cls, rig: Rig, step: Step, output: int) -> Blur:
@@ -92,7 +93,10 @@ class Blur:
         exposure, line = step.exposure, rig.sensor.profile
         found = profiles_of(rig.sensor, exposure.pixels, exposure.mask)
         measured = np.where(found.mask[output], to_density(line, found.counts[output]), np.nan)
-        paths = {name: path for name, (path,) in paths_of(step, [output]).items()}
+        plant = rig.plant
+        late = plant.delays[output % plant.n_outputs] if plant.delays else 0  # the output's own interval
+        own = slice(late, late + exposure.n_steps - plant.last_delay)
+        paths = {name: path[own] for name, (path,) in paths_of(step, [output]).items()}
         return cls(sensor=rig.sensor, output=output, exposure=exposure, measured=measured, paths=paths)
 
     @property

@@ -64,6 +64,14 @@ def calibrate(
             help="How long each poke rests before it is measured, s; one frame period at least.",
         ),
     ] = 0.0,
+    row_time: Annotated[
+        float | None,
+        typer.Option(
+            "--row-time",
+            metavar="HZ",
+            help="Measure the time between the camera's rows instead, from a film of even light that blinks at HZ.",
+        ),
+    ] = None,
     keep: Annotated[Path | None, typer.Option(metavar="DIR", help="Keep the recordings in this folder.")] = None,
     overwrite: OverwriteOption = False,
     as_json: JsonOption = False,
@@ -71,7 +79,8 @@ def calibrate(
     """Measure black level, noise, gain, scale and kernel width, and write them into a copy of the rig file.
 
     It takes recordings of dark, flat and still light, or records from the devices, asking for each in turn. With
-    --interaction it pushes and pulls each of the mirror's inputs, and writes where the spots went.
+    --interaction it pushes and pulls each of the mirror's inputs, and writes where the spots went. With --row-time it
+    takes one film.
     """
     from shutil import rmtree
     from tempfile import mkdtemp
@@ -80,6 +89,12 @@ def calibrate(
     from aolink.rig import load_rig
 
     loaded = load_rig(rig)
+    if row_time is not None:
+        if not files or len(files) != 1 or camera or mirror or interaction:
+            raise typer.BadParameter("--row-time takes one film of blinking light, and no devices")
+        check_target(output, overwrite=overwrite, sources=files, error=AolinkError)
+        _write_row_time(loaded, rig, files[0], row_time, output, overwrite=overwrite, as_json=as_json)
+        return
     if (files and (camera or mirror)) or not (files or camera or "camera" in loaded.devices):
         raise typer.BadParameter("give recordings, or --camera, or [devices.camera] in the rig file")
     suffix, kind = (".npz", CalibrationError) if interaction else ("", AolinkError)
@@ -133,6 +148,25 @@ def _write_calibrated(
     stdout.print(tables.calibration(result))
     for note in result.calibration.notes:
         stdout.print(f"note: {escape(note)}")
+
+
+def _write_row_time(
+    loaded: "Rig", rig: str, film: Path, blink_hz: float, output: Path, *, overwrite: bool, as_json: bool
+) -> None:
+    from aolink.jobs.calibrate import film_row_time, rig_text, with_row_time
+
+    found = film_row_time(loaded, film, blink_hz)
+    text = with_row_time(rig_text(rig, loaded), found, film.name)
+    with writing(output, overwrite=overwrite, sources=[film]) as unfinished:
+        unfinished.write_text(text, newline="")
+    if as_json:
+        print(json.dumps(vars(found)))
+        return
+    stdout.print(
+        f"sensor.row_time_s = {found.row_time_s:.6g} +- {found.sd_s:.2g} s, from {found.frames} frames with"
+        f" {found.bands:.2g} bands each\nwritten: {output}",
+        markup=False,
+    )
 
 
 def _write_interaction(

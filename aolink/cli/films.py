@@ -101,6 +101,12 @@ def import_(
     exposure: Annotated[
         float | None, typer.Option(metavar="S", help="Exposure time of a frame, s, where the film lacks it.")
     ] = None,
+    row_time: Annotated[
+        float | None,
+        typer.Option(
+            metavar="S", help="Time from the start of a row's exposure to the next row's, s; 0: all at once (global)."
+        ),
+    ] = None,
     start: Annotated[
         str | None, typer.Option(metavar="DATE", help="Start of the film, such as 2026-11-22T09:30, in UTC.")
     ] = None,
@@ -145,7 +151,7 @@ def import_(
         raise ImportingError(f"--scale {scale:g} must be a finite number other than 0")
     settings = film_settings(
         rate, frames, track, at, invert, gamma, exposure_s=exposure, start_ns=start_ns,
-        subtract_median=background, scale=scale,
+        subtract_median=background, scale=scale, row_time_s=row_time,
     )  # fmt: skip
     loaded = load_rig(rig)
     film = open_film(source, topic)

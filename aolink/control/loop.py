@@ -14,6 +14,7 @@ from aolink.control.controller import ControllerRow, Seen
 from aolink.control.drift import Fit, FitMonitor
 from aolink.control.fall_back import FallBack
 from aolink.control.registry import find_controller
+from aolink.errors import ControlError
 from aolink.estimation import Estimate, Needs, Status
 from aolink.estimation.frames.measure import measure
 from aolink.exposure import Exposure
@@ -94,6 +95,7 @@ class ControlLoop:
 
     def __init__(self, rig: Rig, controller: str | ControllerRow) -> None:
         row = find_controller(controller, rig) if isinstance(controller, str) else controller
+        check_exposed_at_once(rig)
         self.name, self.needs_state = row.name, row.needs_state
         self.delay_steps = delay_steps(rig)
         self.state, self.reason = State.CLOSED, ""
@@ -276,3 +278,12 @@ def delay_steps(rig: Rig) -> int:
     """``control.delay_s`` in whole fast steps, at least one: the step after an exposure's last has begun at the
     exposure's end."""
     return max(1, math.ceil(rig.control.delay_s / rig.timing.fast_step_s - 1e-9))
+
+
+def check_exposed_at_once(rig: Rig) -> None:
+    """Raise `ControlError` where the rig's camera exposes its rows one after the other."""
+    if rig.readout_steps:
+        raise ControlError(
+            "a controller takes the whole frame to be exposed at once, and sensor.row_time_s (or scene.row_time_s)"
+            " says that its rows are not: close the loop with a global shutter"
+        )

@@ -15,7 +15,7 @@ from aolink.devices.arrival import Arrivals
 from aolink.devices.cameras.pictures import check_timing
 from aolink.devices.clock import ClockExchange
 from aolink.devices.drivers import calling
-from aolink.devices.interfaces import ClockSampled, Event, Mirror
+from aolink.devices.interfaces import ClockSampled, Event, Lacks, Mirror
 from aolink.devices.simple import ClockAnswer, SimpleCamera, SimpleFrame
 from aolink.errors import AolinkError, DeviceError
 from aolink.rig import Rig
@@ -57,6 +57,9 @@ class AdaptedCamera(Adapted):
             raise DeviceError("the rig file has a [scene], and the camera's driver no second picture: take it out")
         self._rig, self._driver, self._mirror, self._monotonic_ns = rig, driver, mirror, monotonic_ns
         self._step_ns = rig.timing.fast_step_ns
+        if rig.sensor.row_time_s is not None:
+            self.lacks = [each for each in self.lacks if each != Lacks.ROWS]
+        self._rows_unknown = Lacks.ROWS in self.lacks and mirror.commanded  # only inputs have times of their own
         self._period_ns = rig.timing.frame_period_ns
         self._arrivals = Arrivals(self._period_ns)
         self._running = self._tells_time = False
@@ -178,6 +181,7 @@ class AdaptedCamera(Adapted):
             frames_lost_before=lost, device_start_ns=start_ns, device_end_ns=start_ns + raw.exposure_ns,
             host_first_byte_ns=now_ns, host_receive_ns=now_ns, alignment_sigma_ns=sigma_ns,
             exposure_offset_ns=part * self._step_ns // _OFFSETS,
+            rows_unknown=self._rows_unknown,
         )  # fmt: skip
         if raw.truth is None or n_steps < self._rig.timing.exposure_steps:  # the truth covers all steps
             return [frame]

@@ -115,7 +115,7 @@ class Gate:
         self._planes = planes
         states = 2 * rig.plant.axes * rig.plant.n_states
         # Twice as much as needed: numbers may be sent with a tag each, and a simulated plant may have other states.
-        self._most_truth = 16 * (4 * states + rig.n_outputs * rig.timing.exposure_steps) + 1024
+        self._most_truth = 16 * (4 * states + rig.n_outputs * rig.window_steps) + 1024
         self._frame_head: tuple[object, ...] = ()
         self._frame_id = -1
         self._frame_step = 0
@@ -173,7 +173,7 @@ class Gate:
             ("frame_id", truth.frame_id, frame_id),
             ("axes", truth.axes, axes),
             ("n_outputs", truth.n_outputs, outputs),
-            ("path: numbers", len(path), outputs * rig.timing.exposure_steps),
+            ("path: numbers", len(path), outputs * rig.window_steps),
             ("end_state: numbers", len(truth.end_state), len(truth.start_state)),
             ("start_state: numbers beyond whole axes", len(truth.start_state) % axes, 0),
         ]

@@ -77,6 +77,7 @@ class Lacks(StrEnum):
 
     TIME = "reports no time: the arrival times of its frames are used"
     COUNT = "does not count its frames: lost ones show by their time only"
+    ROWS = "may expose its rows one after the other: sensor.row_time_s says how, 0 for all at once"
     TRIGGER = "has no trigger: its exposures begin anywhere in a fast step"
     QUEUE = "queues no inputs: the host sends each when its fast step begins"
     ANSWER = "acknowledges nothing: what was sent counts as taken"

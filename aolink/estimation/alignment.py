@@ -34,9 +34,16 @@ _ROUNDED = 0.5
 """A shift of more than this part of a fast step is rounded to whole steps."""
 
 
+def sigma_ns(exposure: Exposure) -> float:
+    """The standard deviation of an exposure's alignment, ns; of its worst axis where the row time is not known."""
+    if exposure.row_sigma_ns is None:
+        return exposure.alignment_sigma_ns
+    return math.hypot(exposure.alignment_sigma_ns, float(exposure.row_sigma_ns.max()))
+
+
 def matters(exposure: Exposure, fast_step_ns: int) -> bool:
     """Whether an exposure's alignment is so uncertain that its error has to be considered."""
-    return exposure.alignment_sigma_ns > _NEGLIGIBLE * fast_step_ns
+    return sigma_ns(exposure) > _NEGLIGIBLE * fast_step_ns
 
 
 def share_of_shift(exposure: Exposure, fast_step_ns: int) -> float:
@@ -44,7 +51,7 @@ def share_of_shift(exposure: Exposure, fast_step_ns: int) -> float:
 
     It is rounded so that the shift of this exposure, and of all that are aligned as well, is a number of whole steps.
     """
-    sigma = exposure.alignment_sigma_ns / fast_step_ns
+    sigma = sigma_ns(exposure) / fast_step_ns
     shift = math.sqrt(3) * sigma
     return sigma / (round(shift) if shift > _ROUNDED else shift)
 
@@ -55,6 +62,8 @@ class Shifted:
     Each one's shift is the standard deviation of its alignment over ``share``. They must be given in order. Between two
     fast steps inputs are interpolated. Inputs that have not come yet are taken to be those of the last step that has;
     of those before the exposure's lead, as many are known as the longest shift or the exposure before has had.
+
+    Where the row time is not known, the inputs of each axis are shifted by the axis's own standard deviation.
     """
 
     def __init__(self, share: float, fast_step_ns: int) -> None:
@@ -62,20 +71,36 @@ class Shifted:
         self._before: FloatArray | None = None
 
     def __call__(self, exposure: Exposure) -> Exposure:
-        # Whole steps where the share was made so, in spite of the division.
-        shift = round(exposure.alignment_sigma_ns / self._fast_step_ns / self._share, 6)
         known = np.concatenate([exposure.lead_inputs, exposure.inputs])
-        reach, whole = math.ceil(abs(shift)), math.floor(shift)
         before = known[:0] if self._before is None else self._before
+        if exposure.row_sigma_ns is None:
+            shifted, reach = self._shifted(before, known, exposure.alignment_sigma_ns)
+        else:
+            sigmas = np.hypot(exposure.alignment_sigma_ns, exposure.row_sigma_ns)
+            of_axis, reach = np.repeat(sigmas, known.shape[1] // len(sigmas)), 0
+            shifted = np.empty_like(known)
+            for sigma in np.unique(of_axis):
+                some = of_axis == sigma
+                shifted[:, some], far = self._shifted(before[:, some], known[:, some], float(sigma))
+                reach = max(reach, far)
+        self._before = np.concatenate([before, known])[-max(reach, len(before), len(known)) :]
+        lead = len(exposure.lead_inputs)
+        return replace(
+            exposure, lead_inputs=shifted[:lead], inputs=shifted[lead:], alignment_sigma_ns=0.0, row_sigma_ns=None
+        )  # fmt: skip
+
+    def _shifted(self, before: FloatArray, known: FloatArray, sigma_ns: float) -> tuple[FloatArray, int]:
+        """The known inputs shifted, and how many steps the shift reaches."""
+        # Whole steps where the share was made so, in spite of the division.
+        shift = round(sigma_ns / self._fast_step_ns / self._share, 6)
+        reach, whole = math.ceil(abs(shift)), math.floor(shift)
         held = np.tile((before if len(before) else known)[0], (max(0, reach - len(before)), 1))
         row = np.concatenate([held, before, known, np.tile(known[-1], (reach + 1, 1))])
         start = len(held) + len(before) + whole
         shifted = row[start : start + len(known)]
         if shift != whole:
             shifted = shifted + (shift - whole) * (row[start + 1 : start + 1 + len(known)] - shifted)
-        self._before = np.concatenate([before, known])[-max(reach, len(before), len(known)) :]
-        lead = len(exposure.lead_inputs)
-        return replace(exposure, lead_inputs=shifted[:lead], inputs=shifted[lead:], alignment_sigma_ns=0.0)
+        return shifted, reach
 
 
 def considered(
@@ -86,7 +111,7 @@ def considered(
     scale = share / 2
     for exposure, estimate, late, early in zip(exposures, nominal, later, earlier, strict=True):
         alignment = AlignmentError(
-            steps=exposure.alignment_sigma_ns / fast_step_ns,
+            steps=sigma_ns(exposure) / fast_step_ns,
             coefficients=scale * (late.coefficients - early.coefficients),
             end_state=scale * (late.end_state - early.end_state),
         )

@@ -201,9 +201,7 @@ def as_recorded(covariance: FloatArray) -> FloatArray:
     return from_correlation_steps(*in_correlation_steps(covariance)) if covariance.shape[-1] > LARGE else covariance
 
 
-def motion(
-    estimate: Estimate, mix: FloatArray, roots: FloatArray, *, after: bool = False
-) -> tuple[FloatArray, FloatArray]:
+def motion(estimate: Estimate, mix: FloatArray, roots: FloatArray, *, after: int = 0) -> tuple[FloatArray, FloatArray]:
     """Weighted sums of an estimate's outputs at each fast step, and a root of their covariance.
 
     Parameters
@@ -213,28 +211,39 @@ def motion(
     roots:
         `psd_root` of the estimate's coefficient covariances.
     after:
-        Whether the step after the last is added.
+        How many steps after the last are added: those of the model, with the last input held.
 
     Returns
     -------
     (k, n_steps), and R of the covariance R R', (k n_steps, n), slope units; the covariance without the path's share
-    that the exposure's basis leaves out. With ``after`` n_steps is one more.
+    that the exposure's basis leaves out. With ``after`` n_steps is as many more.
     """
     model, path = estimate.model, estimate.path
     if after:
-        last = (model.plant.C @ estimate.end_state[..., None]).reshape(-1, 1)
-        path = np.concatenate([path, last], axis=1)
+        path = np.concatenate([path, _path_after(estimate, after)], axis=1)
     axes, count = estimate.coefficient_covariance.shape[:2]
     weights = mix.reshape(len(mix), axes, -1)
     each = [np.zeros((len(mix) * path.shape[1], 0))]
     if estimate.alignment is not None:
         change = mix @ estimate.alignment_path()
-        each.append(np.concatenate([change, change[:, -1:]], axis=1)[:, : path.shape[1]].reshape(-1, 1))
+        each.append(np.concatenate([change, np.repeat(change[:, -1:], after, axis=1)], axis=1).reshape(-1, 1))
     for axis in range(axes):
         if weights[:, axis].any():
             rows = model.mixed_rows(weights[:, axis], count)
-            if after:
-                end = weights[:, axis] @ model.plant.C @ model.end_rows[:, :count]
-                rows = np.concatenate([rows, end[:, None]], axis=1)
+            outputs = weights[:, axis] @ model.plant.C
+            for _ in range(after):
+                rows = np.concatenate([rows, (outputs @ model.end_rows[:, :count])[:, None]], axis=1)
+                outputs = outputs @ model.plant.A
             each.append(rows.reshape(-1, count) @ roots[axis])
     return mix @ path, np.concatenate(each, axis=1)
+
+
+def _path_after(estimate: Estimate, steps: int) -> FloatArray:
+    """The outputs in the steps after the last, (axes * n_outputs, steps), with the last input held."""
+    plant, state = estimate.model.plant, estimate.end_state
+    held = estimate.inputs[-1].reshape(plant.axes, plant.n_inputs) @ plant.B.T
+    out = []
+    for _ in range(steps):
+        out.append((plant.C @ state[..., None]).reshape(-1))
+        state = (plant.A @ state[..., None])[..., 0] + held
+    return np.stack(out, axis=1)

@@ -100,6 +100,7 @@ def _expected(rig: Rig) -> ExpectedError:
 
 def _expected_of(rig: Rig, R: FloatArray) -> ExpectedError:
     plant, n = rig.plant, rig.timing.exposure_steps
+    plant = replace(plant, delays=()) if plant.delays else plant
     model = exposure_model(plant, n)
     H, F = model.mean_row, model.transition
     K = steady_gain(model, added_noise(model, "lifted"), R)

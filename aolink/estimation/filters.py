@@ -48,7 +48,7 @@ def paper(rig: Rig, options: Options, *orders: int) -> Filter:
     observation = PathMoments(rig.plant, orders, gain, flux=options.flux, second_order=second_order)
     if PathFilter.suits(rig.plant):
         few = PathFilter(rig.plant, observation, process_noise=options.process_noise, gate=options.gate)
-        few.warm_up(exposure_model(rig.plant, rig.timing.exposure_steps, rig.timing.exposure_offset))
+        few.warm_up(exposure_model(rig.plant, rig.window_steps, rig.timing.exposure_offset))
         return few
     if second_order:
         spots = rig.plant.n_outputs // 2
@@ -59,7 +59,7 @@ def paper(rig: Rig, options: Options, *orders: int) -> Filter:
 @lru_cache(maxsize=4)
 def _steady_gain(rig: Rig, options: Options) -> FloatArray | None:
     """The steady-state gain of o1 by the noise in the rig file, one for all axes or one each; None if there is none."""
-    model = exposure_model(rig.plant, rig.timing.exposure_steps, rig.timing.exposure_offset)
+    model = exposure_model(rig.plant, rig.window_steps, rig.timing.exposure_offset)
     Q = added_noise(model, options.process_noise)
     # Axes whose spots have the same light share a gain.
     noises, of_axis = np.unique(centroid_covariance(rig), axis=0, return_inverse=True)
@@ -99,7 +99,7 @@ def _spots(rig: Rig) -> SpotSensor:
 
 def _warm_up(rig: Rig) -> None:
     """Estimate a dark exposure of many spots, so that what this loads is loaded before the session."""
-    sensor, steps = _spots(rig), rig.timing.exposure_steps
+    sensor, steps = _spots(rig), rig.window_steps
     model = exposure_model(rig.plant, steps, rig.timing.exposure_offset)
     shape = (rig.plant.axes, rig.plant.n_outputs // 2, *sensor.window)
     dark = SpotWindows(density=np.zeros(shape), mask=np.ones(shape, dtype=bool))
@@ -140,5 +140,5 @@ def _of_pixels(rig: Rig, options: Options, updates: Any) -> Filter:
     if (kind := (type(updates), rig.sensor.directions)) not in _WARM:
         pixels.warm_up(updates)
         _WARM.add(kind)
-    updates.reduction(exposure_model(rig.plant, rig.timing.exposure_steps, rig.timing.exposure_offset), rig.sensor)
+    updates.reduction(exposure_model(rig.plant, rig.window_steps, rig.timing.exposure_offset), rig.sensor)
     return pixels

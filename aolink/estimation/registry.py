@@ -127,7 +127,7 @@ def make_estimator(rig: Rig, name: str, **options: Any) -> Estimator:
 
     def made(rig: Rig) -> Estimator:
         # Code that the first exposure would load or compile is ready before the session.
-        steps = rig.timing.exposure_steps
+        steps = rig.window_steps
         try:
             exposure_model(rig.plant, steps, rig.timing.exposure_offset).response(np.ones((steps, rig.n_inputs)))
             return Estimator(rig, name, row.build(rig, chosen))

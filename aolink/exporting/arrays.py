@@ -204,7 +204,7 @@ def _check_alike(series: Series, first: Exposure, other: Exposure) -> None:
 
 def _check_size(series: Series, n_estimators: int) -> None:
     """Refuse arrays that would fill the memory."""
-    rig, steps = series.rig, series.rig.timing.exposure_steps
+    rig, steps = series.rig, series.rig.window_steps
     numbers = (1 + 2 * n_estimators) * rig.n_outputs * steps + rig.n_inputs * steps
     numbers += 4 * n_estimators * rig.plant.axes * rig.plant.n_states
     pixels = int(np.prod(rig.sensor.shape)) + (int(np.prod(rig.scene.shape)) if rig.scene else 0)

@@ -156,6 +156,11 @@ def readings(
         )
     if any(each.slopes is not None for each in exposures):
         raise IdentificationError("the recording holds slopes and no pixels: identification needs the blur")
+    if rig.plant.delays:
+        raise IdentificationError(
+            "one plant moves several spots that the camera exposes row by row (sensor.row_time_s): identify it from a"
+            " recording of a global shutter"
+        )
     n_steps = exposures[0].n_steps
     if any(each.n_steps != n_steps for each in exposures):
         raise IdentificationError("exposures of several lengths: cut the recording where the length changes")

@@ -54,8 +54,9 @@ many squares of the noise, and by so many standard deviations of chance."""
 _BRIGHT, _SHOT, _FEWEST_PIXELS = 0.3, 0.3, 100
 """Shot noise is looked for in pixels of profiles with this share of the brightest one's light; the share of the dark
 noise's variance that shows; and how many such pixels are enough."""
-_TURNS, _SETTLED = 4, 0.1
-"""Turns in which kernel and shot noise are found, and the change of the latter that ends them."""
+_NOISIEST, _TURNS, _SETTLED = 0.05, 6, 0.1
+"""Shot noise of the brightest pixel, over its light, from which turns begin in which kernel and shot noise are found;
+how many there are at most, and the change of the latter that ends them."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -242,15 +243,15 @@ def _densities(profile: FloatArray, sd: float, noise: FloatArray) -> tuple[Float
 def _kernel_and_electrons(profiles: list[FloatArray], dark: float) -> tuple[float, float]:
     """The widest kernel that explains profiles along x and along y, whose noise in the dark is given, and a spot's
     photoelectrons. Shot noise is known once the kernel is, so both are found in turns."""
-    gain = 0.0
-    sd = math.inf
+    # With too much noise the kernel is too wide at first, and what it leaves says so; with too little all that is left
+    # would be taken for a kernel that is too wide.
+    gain = _NOISIEST**2 * max(float(profile.max()) for profile in profiles)
     for _ in range(_TURNS):
         noises = [_noise(profile, dark, gain) for profile in profiles]
         sd = _kernel(profiles, noises)
-        found = _gain(profiles, sd if math.isfinite(sd) else _SHARPEST, noises, dark)
-        if abs(found - gain) < _SETTLED * gain:
+        before, gain = gain, _gain(profiles, sd, noises, dark) if math.isfinite(sd) else 0.0
+        if abs(gain - before) <= _SETTLED * before:
             break
-        gain = found
     return sd, 1 / gain if gain else 0.0
 
 
@@ -268,7 +269,7 @@ def _kernel(profiles: list[FloatArray], noises: list[FloatArray]) -> float:
 
         @cache
         def misfit(k: int, profile: FloatArray = profile[some], noise: FloatArray = noise[some]) -> FloatArray:
-            """Squares of the residuals of each frame, over their noise: each density that is not zero takes one away."""
+            """Squares of each frame's residuals, over their noise: a density that is not zero takes one away."""
             density, left = _densities(profile, float(_WIDTHS[k]), noise)
             taken = np.count_nonzero(density > 0, axis=2)
             return np.asarray((((left / noise) ** 2).sum(axis=2) + taken).mean(axis=1))

@@ -60,6 +60,11 @@ def imported(film: Film, rig: Rig, settings: FilmSettings, account: FilmAccount)
         account.notes += ("when the film was taken is not known: its times count from 1970 unless --start is given",)
     if film.nonlinear and settings.gamma == 1.0:
         account.notes += (nonlinear_note(film),)
+    if rig.sensor.row_time_s is None and film.shape[0] > 1 and not film.slopes:
+        account.notes += (
+            "it is not known whether the film's rows were exposed one after the other: say so with --row-time S,"
+            " or --row-time 0",
+        )
     if film.slopes:
         yield from _of_slopes(film, rig, settings, times, account)
         return
@@ -107,7 +112,8 @@ def imported(film: Film, rig: Rig, settings: FilmSettings, account: FilmAccount)
         pixels, mask = counts_of(counts, ~group.bad, rig, account)
         account.frames += settings.frames_per_exposure
         account.exposures += 1
-        frame = rig_frame(group, times, rig, settings.frames_per_exposure, pixels, mask)
+        unknown = rig.sensor.row_time_s is None and film.inputs is not None  # only inputs have times of their own
+        frame = rig_frame(group, times, rig, settings.frames_per_exposure, pixels, mask, unknown)
         yield ImportedExposure(frame=frame, inputs=inputs.until(frame.last_step + 1))
 
 

@@ -54,6 +54,8 @@ class FilmSettings:
     """Number of frames of a fast film whose mean becomes one exposure."""
     track: int = 0
     """Number of objects that are followed, each in a window of its own; 0: the frames are those of the rig's sensor."""
+    row_time_s: float | None = None
+    """As `BaseSensor.row_time_s`, where the rig file does not have it or is wrong."""
     places: tuple[tuple[float, float], ...] = ()
     """Places of these objects in the first frame, (x, y) in pixels; empty: the brightest ones that are not at an
     edge."""
@@ -315,8 +317,9 @@ def grouped(
 
 
 def rig_frame(
-    group: Group, times: FrameTimes, rig: Rig, frames: int, pixels: NDArray[np.uint16], mask: NDArray[np.bool_]
-) -> Frame:
+    group: Group, times: FrameTimes, rig: Rig, frames: int, pixels: NDArray[np.uint16], mask: NDArray[np.bool_],
+    rows_unknown: bool = False,
+) -> Frame:  # fmt: skip
     """The frame of an exposure of ``frames`` frames of a film: its steps are the rig's, its times the film's."""
     timing, period = rig.timing, group.first_period // frames
     first = period * timing.frame_period_steps
@@ -327,5 +330,5 @@ def rig_frame(
         frame_id=period + 1, first_step=first, last_step=first + timing.exposure_steps - 1, pixels=pixels, mask=mask,
         chunks_lost=0, frames_lost_before=0, device_start_ns=since, device_end_ns=since + end_ns - start_ns,
         host_first_byte_ns=end_ns, host_receive_ns=end_ns, host_start_ns=start_ns, clock_sigma_ns=math.nan,
-        exposure_offset_ns=timing.exposure_offset_ns,
+        exposure_offset_ns=timing.exposure_offset_ns, rows_unknown=rows_unknown,
     )  # fmt: skip

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from google.protobuf.message import Message
 
+from aolink.devices.interfaces import Lacks
 from aolink.errors import ImportingError, RecordingError
 from aolink.files import check_target, open_unfinished, writing
 from aolink.films.film import Film
@@ -18,7 +19,8 @@ from aolink.importing.frames import FilmAccount, FilmSettings, ImportedExposure
 from aolink.recording import convert, topics
 from aolink.recording.mcap_file import AT_LEISURE, McapFile, schema_of
 from aolink.recording.writer import begin_recording
-from aolink.rig import Rig
+from aolink.rig import Rig, parse_rig
+from aolink.rig.edit import with_value
 from aolink.wire.messages_pb2 import Applied
 from aolink.wire.truth import truth_message
 
@@ -36,6 +38,8 @@ def import_film(
     file is left then); `RecordingError` where ``path`` exists and not ``overwrite``, or cannot be written.
     """
     check_target(path, overwrite=overwrite, sources=sources, error=RecordingError)
+    if settings.row_time_s is not None:
+        rig = parse_rig(with_value(rig.toml, "sensor.row_time_s", settings.row_time_s, may_be_new=True), rig.folder)
     account = FilmAccount()
     made = imported(film, rig, settings, account)
     first = next(made, None)  # errors of the whole film show before the file is made
@@ -51,6 +55,8 @@ def import_film(
         "mirror": "none" if film.inputs is None else f"imported from {film.name}",
         "import_settings": str(settings),
     }
+    if rig.sensor.row_time_s is None and not film.slopes:
+        facts["camera_lacks"] = str(Lacks.ROWS)
     with writing(path, overwrite=overwrite, sources=sources, error=RecordingError) as partial:
         file = McapFile(partial, AT_LEISURE, descriptor=open_unfinished(partial))
         try:

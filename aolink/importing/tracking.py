@@ -54,6 +54,11 @@ def tracked(
             f" (aolink rig --from writes one), {rig.name} has {rig.n_outputs} slopes of a {sensor.shape[0]} x"
             f" {sensor.shape[1]} sensor"
         )
+    if rig.sensor.row_starts_s.any():
+        raise ImportingError(
+            "with --track the rows of the rig's sensor are not the film's: leave out --row-time and sensor.row_time_s."
+            " An object's steps are then those of its own interval, later by its row in the film times the row time"
+        )
     known = survey(film, settings, find_objects(film, settings))
     account.notes += tuple(known.notes())
     if settings.scale is not None:

@@ -4,6 +4,7 @@ before."""
 from __future__ import annotations
 
 import hashlib
+import math
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 from aolink.calibration import KINDS, Calibration, Frames, calibrate, calibrated_text
 from aolink.calibration.interaction import Interaction, check_spots, measure_interaction, poke_inputs, rest_exposures
 from aolink.calibration.measure import LEAST_FRAMES, line_sensor
+from aolink.calibration.row_time import RowTime, row_time
 from aolink.devices.opening import open_devices
 from aolink.errors import AolinkError, CalibrationError, RigError
 from aolink.estimation import make_estimator
@@ -23,6 +25,7 @@ from aolink.files import check_target
 from aolink.recording import topics
 from aolink.recording.reader import Recording
 from aolink.rig import Rig
+from aolink.rig.edit import with_value
 from aolink.session import record
 
 _ASKED = (
@@ -233,3 +236,35 @@ def rig_text(path_or_name: str, rig: Rig) -> str:
 def _digest(path: Path) -> str:
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def film_row_time(rig: Rig, path: Path, blink_hz: float) -> RowTime:
+    """The row time from a film of light that blinks at a rate, Hz; the rig's frame rate is that of a film without one.
+
+    Raises
+    ------
+    CalibrationError
+        The film does not show it; the message says what to film.
+    ImportingError
+        The film cannot be read, or its times contradict each other.
+    """
+    from aolink.films.formats import open_film
+    from aolink.importing.frames import FilmSettings, film_times
+
+    if not 0 < blink_hz < math.inf:
+        raise CalibrationError(f"--row-time {blink_hz:g} must be the light's blinks in a second, above 0")
+    film = open_film(path, None)
+    if film.slopes:
+        raise CalibrationError(f"{film.name} has slopes and no pictures")
+    times = film_times(film, FilmSettings())
+    period_s = rig.timing.frame_period_steps * rig.timing.fast_step_s if times.rate_hz is None else 1 / times.rate_hz
+    light = np.array([frame.astype(np.float64).mean(axis=1) for frame in film.frames()])
+    return row_time(light, times.periods, period_s, blink_hz)
+
+
+def with_row_time(text: str, found: RowTime, film: str) -> str:
+    """The text of a rig file with a measured row time, and its standard deviation beside it."""
+    value, digits = found.row_time_s, max(2, 2 - math.floor(math.log10(max(found.sd_s, 1e-15))))
+    comment = f"+- {found.sd_s:.2g}, from {found.frames} frames of {film}"
+    text = with_value(text, "sensor.row_time_s", round(value, digits), may_be_new=True)
+    return with_value(text, "sensor.row_time_s", round(value, digits), comment=comment)

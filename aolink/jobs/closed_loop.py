@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from aolink.control import Act, ControllerRow, ControlLoop, State, find_controller, stability
+from aolink.control.loop import check_exposed_at_once
 from aolink.errors import RecordingError
 from aolink.estimation import Driver, Estimate
 from aolink.exposure import Exposure, residual_rms
@@ -63,6 +64,7 @@ def closed_loop(
     ControlError, EstimatorError
         There is no such controller or estimator, or it cannot work on this rig.
     """
+    check_exposed_at_once(rig)
     timing, model = rig.timing, RigPhysics(rig, seed)
     loop = ControlLoop(rig, controller) if controller else None
     driver = Driver(rig, [estimator] if estimator else [])

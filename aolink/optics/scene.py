@@ -6,6 +6,7 @@ An intensity of one is the brightest that a picture file of whole numbers can ho
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Annotated
 
 import numpy as np
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 
 from aolink.keys import NotNegative, Positive, Within
 from aolink.numerics.arrays import BoolArray, FloatArray
-from aolink.optics.sensor import BitDepth, Kernel, read_kernel
+from aolink.optics.sensor import BitDepth, Kernel, read_kernel, row_starts_s
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,6 +37,13 @@ class SceneSensor:
     """Picture that a simulated rig shows: a file beside the rig file, or one that comes with aolink; may be empty."""
     picture_pixels: Annotated[int, Within(1, 64)] = 1
     """Rows and columns of the picture's own pixels in one of the sensor's."""
+    row_time_s: Annotated[float, Within(-1.0, 1.0)] | None = None
+    """As `BaseSensor.row_time_s`, for the rows of the picture."""
+
+    @cached_property
+    def row_starts_s(self) -> FloatArray:
+        """When each row's exposure starts, after that of the row that starts first, s, (rows,)."""
+        return row_starts_s(self.row_time_s, self.shape[0])
 
     @property
     def shape(self) -> tuple[int, int]:

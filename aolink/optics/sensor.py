@@ -47,6 +47,13 @@ class Kernel:
         return np.asarray(width @ width / 2)
 
 
+def row_starts_s(row_time_s: float | None, rows: int) -> FloatArray:
+    """When the exposure of each row starts, after that of the row that starts first, s, (rows,); all at once where the
+    row time is not known."""
+    starts = (row_time_s or 0.0) * np.arange(rows)
+    return np.asarray(starts - starts.min())
+
+
 @dataclass(frozen=True, kw_only=True)
 class _Width:
     shape: Literal["gaussian"]
@@ -114,6 +121,20 @@ class BaseSensor(ABC):
     """Row and column of each pixel that is hot, dead or otherwise wrong."""
     pedestal: Literal["known", "free"] = "known"
     """Whether ``black_level`` is what a pixel in the dark gives, or that is found in each window of each frame."""
+    row_time_s: Annotated[float, Within(-1.0, 1.0)] | None = None
+    """Time from the start of one row's exposure to that of the next row down, s; negative where the lowest row is the
+    first; 0 for a global shutter; None where the rig file does not say."""
+
+    @cached_property
+    def row_starts_s(self) -> FloatArray:
+        """When each row's exposure starts, after that of the row that starts first, s, (rows,)."""
+        return row_starts_s(self.row_time_s, self.shape[0])
+
+    @cached_property
+    def spot_starts_s(self) -> FloatArray:
+        """The same for the middle row of each spot's window, s, (spots,)."""
+        rows = (self.window_of(spot)[0] for spot in range(self.spots))
+        return np.array([self.row_starts_s[each].mean() for each in rows])
 
     @cached_property
     def defect_mask(self) -> BoolArray | None:

@@ -35,7 +35,8 @@ class AlikeSystems:
 
 @lru_cache(maxsize=16)
 def alike_systems(plant: Plant) -> AlikeSystems | None:
-    """The systems that a large plant consists of; None where it is not large or does not consist of equal systems.
+    """The systems that a large plant consists of; None where it is not large, does not consist of equal systems, or its
+    outputs have delays.
 
     A plant is large with more than `MANY_STATES` states, and also with more outputs than states where each output has
     a coefficient of its own (`UnmodelledSlopes`): for 48 spots `moments` takes 4 s with dense matrices, and a fiftieth
@@ -43,7 +44,7 @@ def alike_systems(plant: Plant) -> AlikeSystems | None:
     """
     W = plant.process_noise
     large = plant.n_states > MANY_STATES or (plant.unmodelled is not None and plant.n_outputs > plant.n_states)
-    if not large or np.count_nonzero(W - np.diag(np.diag(W))):
+    if plant.delays or not large or np.count_nonzero(W - np.diag(np.diag(W))):
         return None
     order = alike(plant.A, plant.B, plant.B_w)
     if order is None:

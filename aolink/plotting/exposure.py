@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -180,6 +181,11 @@ def _length(rig: Rig, unit: TimeUnit) -> float:
     return rig.timing.fast_step_s * 1e3 if unit == "s" else 1.0
 
 
+def _on_line(value: float, slope: float, at: float, place: FloatArray) -> FloatArray:
+    """A straight line that has this value at a place."""
+    return np.asarray(value + slope * (np.asarray(place) - at))
+
+
 def draw_spot(axes: Axes, rig: Rig, step: Step, spot: int) -> None:
     """Draw the picture of one spot with the paths over it."""
     window, (low, high) = rig.sensor.window_of(spot), rig.sensor.field
@@ -190,6 +196,12 @@ def draw_spot(axes: Axes, rig: Rig, step: Step, spot: int) -> None:
     for name, path in paths.items():
         axes.plot(*path, color=colour(name), linewidth=1.6 if name == "truth" else 1.0)
     axes.set(xlabel=f"x ({SLOPES})", ylabel=f"y ({SLOPES})", xlim=(low, high), ylim=(high, low))
+    sensor = rig.sensor
+    if sensor.row_time_s:  # beside the rows, when the exposure of each starts
+        first, per_unit = 1e3 * sensor.row_starts_s[window[0]][0], 1e3 * sensor.row_time_s / sensor.pixel_width
+        row = low + sensor.pixel_width / 2
+        start, back = partial(_on_line, first, per_unit, row), partial(_on_line, row, 1 / per_unit, first)
+        axes.secondary_yaxis("right", functions=(start, back)).set_ylabel("start of a row's exposure (ms)")
     if paths:  # the part of the window that they are in, as a square
         ends = np.array([limits_of(rig.sensor.profile, [path[k] for path in paths.values()]) for k in (0, 1)])
         half, (middle_x, middle_y) = float(np.ptp(ends, axis=1).max()) / 2, ends.mean(axis=1)

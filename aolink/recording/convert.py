@@ -33,7 +33,7 @@ _COUNTS = np.dtype("<u2")
 _OF_FRAME = (
     "frame_id", "first_step", "last_step", "device_start_ns", "device_end_ns", "host_start_ns", "clock_sigma_ns",
     "alignment_sigma_ns", "host_first_byte_ns", "host_receive_ns", "chunks_lost", "frames_lost_before",
-    "exposure_offset_ns",
+    "exposure_offset_ns", "rows_unknown",
 )  # fmt: skip
 _OF_ACT = (
     "frame_id", "first_step", "delay_steps", "late", "reason", "slope_rms", "path_rms", "clipped_steps", "acting",

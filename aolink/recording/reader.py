@@ -127,7 +127,7 @@ class Recording(RecordedMessages, Series):
     @cached_property
     def model(self) -> ExposureModel:
         """The exposure model that expands the recorded coefficients into paths."""
-        return exposure_model(self.rig.plant, self.rig.timing.exposure_steps)
+        return exposure_model(self.rig.plant, self.rig.window_steps)
 
     def messages(self, *wanted: str, start_ns: int = 0, end_ns: int = END_OF_TIME) -> Iterator[RecordedMessage]:
         """The messages of some topics (of all, if none is named) in the order in which they were recorded.

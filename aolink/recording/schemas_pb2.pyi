@@ -8,7 +8,7 @@ from typing import ClassVar as _ClassVar, Optional as _Optional, Union as _Union
 DESCRIPTOR: _descriptor.FileDescriptor
 
 class ExposureInfo(_message.Message):
-    __slots__ = ("frame_id", "first_step", "last_step", "device_start_ns", "device_end_ns", "host_start_ns", "clock_sigma_ns", "host_first_byte_ns", "host_receive_ns", "chunks_lost", "missing_offset", "missing_length", "frames_lost_before", "exposure_offset_ns", "alignment_sigma_ns", "slopes")
+    __slots__ = ("frame_id", "first_step", "last_step", "device_start_ns", "device_end_ns", "host_start_ns", "clock_sigma_ns", "host_first_byte_ns", "host_receive_ns", "chunks_lost", "missing_offset", "missing_length", "frames_lost_before", "exposure_offset_ns", "alignment_sigma_ns", "slopes", "rows_unknown")
     FRAME_ID_FIELD_NUMBER: _ClassVar[int]
     FIRST_STEP_FIELD_NUMBER: _ClassVar[int]
     LAST_STEP_FIELD_NUMBER: _ClassVar[int]
@@ -25,6 +25,7 @@ class ExposureInfo(_message.Message):
     EXPOSURE_OFFSET_NS_FIELD_NUMBER: _ClassVar[int]
     ALIGNMENT_SIGMA_NS_FIELD_NUMBER: _ClassVar[int]
     SLOPES_FIELD_NUMBER: _ClassVar[int]
+    ROWS_UNKNOWN_FIELD_NUMBER: _ClassVar[int]
     frame_id: int
     first_step: int
     last_step: int
@@ -41,7 +42,8 @@ class ExposureInfo(_message.Message):
     exposure_offset_ns: int
     alignment_sigma_ns: float
     slopes: _containers.RepeatedScalarFieldContainer[float]
-    def __init__(self, frame_id: _Optional[int] = ..., first_step: _Optional[int] = ..., last_step: _Optional[int] = ..., device_start_ns: _Optional[int] = ..., device_end_ns: _Optional[int] = ..., host_start_ns: _Optional[int] = ..., clock_sigma_ns: _Optional[float] = ..., host_first_byte_ns: _Optional[int] = ..., host_receive_ns: _Optional[int] = ..., chunks_lost: _Optional[int] = ..., missing_offset: _Optional[_Iterable[int]] = ..., missing_length: _Optional[_Iterable[int]] = ..., frames_lost_before: _Optional[int] = ..., exposure_offset_ns: _Optional[int] = ..., alignment_sigma_ns: _Optional[float] = ..., slopes: _Optional[_Iterable[float]] = ...) -> None: ...
+    rows_unknown: bool
+    def __init__(self, frame_id: _Optional[int] = ..., first_step: _Optional[int] = ..., last_step: _Optional[int] = ..., device_start_ns: _Optional[int] = ..., device_end_ns: _Optional[int] = ..., host_start_ns: _Optional[int] = ..., clock_sigma_ns: _Optional[float] = ..., host_first_byte_ns: _Optional[int] = ..., host_receive_ns: _Optional[int] = ..., chunks_lost: _Optional[int] = ..., missing_offset: _Optional[_Iterable[int]] = ..., missing_length: _Optional[_Iterable[int]] = ..., frames_lost_before: _Optional[int] = ..., exposure_offset_ns: _Optional[int] = ..., alignment_sigma_ns: _Optional[float] = ..., slopes: _Optional[_Iterable[float]] = ..., rows_unknown: _Optional[bool] = ...) -> None: ...
 
 class ClockSample(_message.Message):
     __slots__ = ("device", "host_send_ns", "device_receive_ns", "device_send_ns", "host_receive_ns", "round_trip_ns", "accepted", "offset_ns", "frequency_ppm", "sigma_ns")

@@ -94,7 +94,7 @@ def _of_estimate(message: pb.Estimate, rig: Rig) -> str:
         return "its estimator's name is no text"
     if int(message.status) not in {int(each) for each in Status}:
         return "its status is none that this aolink knows"
-    return "" if 0 < message.n_steps <= rig.timing.exposure_steps else "n_steps is beyond the end of an exposure"
+    return "" if 0 < message.n_steps <= rig.window_steps else "n_steps is beyond the end of an exposure"
 
 
 def _is_whole(message: pb.Estimate, name: str, n: int) -> bool:
@@ -107,11 +107,7 @@ def _is_whole(message: pb.Estimate, name: str, n: int) -> bool:
 def _of_truth(message: wire.Truth, rig: Rig) -> str:
     n_path = len(message.path or message.path_single)
     states = {len(message.start_state), len(message.end_state)} - {0}
-    if (
-        message.n_outputs != rig.n_outputs
-        or n_path % rig.n_outputs
-        or n_path > rig.n_outputs * rig.timing.exposure_steps
-    ):
+    if message.n_outputs != rig.n_outputs or n_path % rig.n_outputs or n_path > rig.n_outputs * rig.window_steps:
         return "its path is not that of an exposure"
     fits = len(states) < 2 and all(each % max(message.axes, 1) == 0 for each in states)
     return "" if fits else "its states do not fit its axes"

@@ -64,7 +64,7 @@ def begin_recording(
     Those of ``attachments``, by name, are added that are not among them.
     """
     file.start()
-    model = exposure_model(rig.plant, rig.timing.exposure_steps)
+    model = exposure_model(rig.plant, rig.window_steps)
     outputs, basis = model.factors
     # A large basis is kept only in the columns of the start state, which are all that o1 to o3 have.
     basis = basis if basis.nbytes <= _LARGEST_BASIS else basis[..., : rig.plant.n_states]

@@ -13,18 +13,23 @@ import re
 import tomllib
 from dataclasses import dataclass, field
 from difflib import get_close_matches
+from functools import cached_property
 from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any
 
+import numpy as np
+
 from aolink.errors import RigError
 from aolink.keys import checked, read
+from aolink.numerics.arrays import Indices
 from aolink.optics.scene import SceneSensor
 from aolink.optics.sensor import BaseSensor, Windows
 from aolink.rig.device_tables import DeviceTable, read_devices
 from aolink.rig.disturbance import Disturbance, read_disturbance
 from aolink.rig.optical_plant import Optics, read_optics
 from aolink.rig.parts import Control, Drive, MirrorDriver, Plant, Simulation, Timing
+from aolink.rig.rows import output_delays, readout_steps, with_delays
 from aolink.rig.scene_table import named_file, read_scene
 from aolink.rig.sensor_tables import CalibrationTable, read_sensor
 from aolink.rig.tables import read_control, read_drive, read_mirror, read_plant, read_timing, with_disturbance
@@ -78,6 +83,31 @@ class Rig:
             The rig file comes out of a recording.
         """
         return named_file(self.folder, name, key)
+
+    @property
+    def window_steps(self) -> int:
+        """Fast steps of the model in one exposure: more than the camera's where one plant moves spots that the camera
+        exposes one after the other."""
+        return self.timing.exposure_steps + self.plant.last_delay
+
+    @cached_property
+    def axis_delays(self) -> Indices:
+        """Fast steps by which each axis is exposed later than the row that is first, (axes,)."""
+        if not self.sensor.row_starts_s.any():
+            return np.zeros(self.plant.axes, dtype=np.intp)
+        delays = output_delays(self.sensor, self.timing)
+        return np.asarray(delays.reshape(self.plant.axes, -1).min(axis=1))
+
+    @property
+    def input_delay(self) -> int:
+        """Fast steps after the end of the first row's exposure up to which inputs belong to an exposure."""
+        return int(self.axis_delays.max()) + self.plant.last_delay
+
+    @cached_property
+    def readout_steps(self) -> int:
+        """Fast steps from the end of the first row's exposure to that of the last row's, the scene's included."""
+        starts = [self.sensor.row_starts_s] + ([] if self.scene is None else [self.scene.row_starts_s])
+        return max(readout_steps(each, self.timing) for each in starts)
 
     @property
     def n_inputs(self) -> int:
@@ -196,6 +226,7 @@ def _read(values: dict[str, Any], text: str, folder: Path | None) -> Rig:
             raise RigError("disturbance: turbulence and aberrations need [lenslets], to know the slopes that they make")
         if disturbance.model:
             plant = with_disturbance(plant, disturbance.model)
+    plant = with_delays(plant, sensor, timing)
     return Rig(
         name=file.name, summary=file.summary, plant=plant, timing=timing, sensor=sensor, mirror=mirror, drive=drive,
         control=read_control(file.control, timing), simulation=file.simulation, calibration=file.calibration,

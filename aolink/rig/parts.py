@@ -112,6 +112,9 @@ class Plant:
     """The drift that estimators follow; None for none."""
     disturbance_states: int = 0
     """Number of the last states, which are those of the disturbance's model and which no input reaches."""
+    delays: tuple[int, ...] = ()
+    """Fast steps by which the camera sees each output later than the first, (n_outputs,), where it exposes row by row
+    and the plant moves several spots; empty where it sees all at once."""
 
     @property
     def n_states(self) -> int:
@@ -126,6 +129,11 @@ class Plant:
     def n_outputs(self) -> int:
         """Outputs of one copy."""
         return int(self.C.shape[0])
+
+    @property
+    def last_delay(self) -> int:
+        """The longest of the delays, fast steps."""
+        return max(self.delays, default=0)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -69,7 +69,7 @@ class Outcome:
     def estimate(self, rig: Rig) -> Estimate:
         """The estimate as plain data. Only for an outcome that has one."""
         assert self.message is not None
-        model = exposure_model(rig.plant, rig.timing.exposure_steps)
+        model = exposure_model(rig.plant, rig.window_steps)
         return convert.estimate_from_message(self.message, model, self.exposure)
 
 

@@ -86,7 +86,7 @@ def _received(stream: Any) -> Any:
 
 
 def _dark(rig: Rig) -> Exposure:
-    steps, shape = rig.timing.exposure_steps, rig.sensor.shape
+    steps, shape = rig.window_steps, rig.sensor.shape
     return Exposure(
         frame_id=0, first_step=0, n_steps=steps, pixels=np.zeros(shape, dtype=np.uint16),
         mask=np.ones(shape, dtype=bool), inputs=np.zeros((steps, rig.n_inputs)),

@@ -113,6 +113,7 @@ class SessionLoop:
             self._controlling.begin(self._first_step)
         if exposures:
             self._end_step = self._first_step + (exposures - 1) * timing.frame_period_steps + timing.exposure_steps
+            self._end_step += self._rig.readout_steps
         self._commanding.begin(self._first_step, self._end_step)
         self._receive(0.0)
         self._last_frame_ns = self._turn_ns = time.now_ns()
@@ -317,7 +318,11 @@ class SessionLoop:
             return first + max(0, -(-(soon - first) // period)) * period
 
         def left(first_step: int) -> int:
-            return 0 if end is None else max(0, (end - timing.exposure_steps - first_step) // period + 1)
+            return (
+                0
+                if end is None
+                else max(0, (end - timing.exposure_steps - self._rig.readout_steps - first_step) // period + 1)
+            )
 
         if end is None or left(begin()):
             step = self._start_camera(begin, left)

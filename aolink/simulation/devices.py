@@ -108,10 +108,10 @@ class SimulatedDevices:
         while end < self.step + self.rig.mirror.block_steps and self._queue.get(end, (0, None))[0] == block_id:
             end += 1
         if self._camera_start is not None:
-            timing = self.rig.timing
+            timing, long = self.rig.timing, self.rig.timing.exposure_steps + self.rig.readout_steps
             # First exposure that ends after this step.
-            number = max(0, (self.step - self._camera_start - timing.exposure_steps) // timing.frame_period_steps + 1)
-            frame_end = self._camera_start + number * timing.frame_period_steps + timing.exposure_steps
+            number = max(0, (self.step - self._camera_start - long) // timing.frame_period_steps + 1)
+            frame_end = self._camera_start + number * timing.frame_period_steps + long
             end = min(end, frame_end) if frame_end > self.step else end
         return end
 
@@ -314,12 +314,12 @@ class SimulatedDevices:
     def _send_frame(self, frame: CameraFrame) -> None:
         """Send the spots' picture, the truth, and last the scene's picture, because the estimators do not wait for
         that."""
-        last_step = frame.first_step + frame.n_steps - 1
+        read_out = frame.first_step + frame.n_steps - 1 + self.rig.readout_steps
         self._send_picture(frame, frame.pixels, plane=0)
         data = truth_message(frame.frame_id, frame.truth).SerializeToString()
         for offset, piece in _chunks(data):
             truth = pb.TruthChunk(frame_id=frame.frame_id, offset=offset, total=len(data), data=piece)
-            self._say("camera", truth, last_step)
+            self._say("camera", truth, read_out)
         if frame.scene is not None:
             self._send_picture(frame, frame.scene, plane=1)
 
@@ -336,7 +336,7 @@ class SimulatedDevices:
                 exposure_end_ns=self._stamp_ns(last_step + 1) + late_ns,
                 exposure_offset_ns=late_ns, data=piece, plane=plane,
             )  # fmt: skip
-            self._say("camera", picture, last_step)
+            self._say("camera", picture, last_step + self.rig.readout_steps)
 
 
 def _chunks(data: bytes) -> list[tuple[int, bytes]]:

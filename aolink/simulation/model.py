@@ -14,6 +14,7 @@ from aolink.numerics.covariance import psd_root
 from aolink.optics.camera import pixel_noise_sd, shot_gain, to_counts
 from aolink.optics.frame import frame_density
 from aolink.rig import Rig, load_rig
+from aolink.rig.rows import inputs_by_axis
 from aolink.simulation.disturbance import DisturbancePlayer
 from aolink.simulation.scene import SceneCamera
 
@@ -63,8 +64,10 @@ class RigPhysics:
         self._frames = 0
         self._exposure: int | None = None  # first step of the exposure that runs, or of the next one
         self._exposures_left = 0
-        self._start_state = self._state
-        self._pieces: list[FloatArray] = []  # outputs of the exposure that runs
+        self._delay, self._readout = rig.axis_delays, rig.readout_steps
+        self._kept_from = 0  # first fast step of what is kept of exposures that run
+        self._outputs: list[FloatArray] = []
+        self._states: list[FloatArray] = []
         self._lights = iter(rig.simulation.light)
         self._light = rig.simulation.light[0]
         self._rest: FloatArray | None = None  # where a still spot is held
@@ -83,23 +86,34 @@ class RigPhysics:
     def advance(self, u: FloatArray) -> list[CameraFrame]:
         """Apply the mirror values ``u``, (k, axes * n_inputs), for k fast steps; gives the frames that end within
         them."""
-        first, states = self.step, self._run(u)
+        first, states, timing = self.step, self._run(u), self.rig.timing
         outputs = (self.rig.plant.C @ states[:-1, ..., None]).reshape(len(u), self.rig.n_outputs)
         if self._disturbance is not None and len(u):
             outputs = outputs + self._disturbance.slopes(first, len(u))
         self.step += len(u)
+        self._keep(first, outputs, states[:-1])
         frames: list[CameraFrame] = []
-        while self._exposure is not None and self._exposure < self.step:
-            start, end = self._exposure, self._exposure + self.rig.timing.exposure_steps
-            if start >= first:
-                self._start_state, self._pieces = states[start - first], []
-            self._pieces.append(outputs[max(start, first) - first : min(end, self.step) - first])
-            if end > self.step:
-                break
-            frames.append(self._frame(start, states[end - first]))
+        long = timing.exposure_steps + self._readout
+        while self._exposure is not None and self._exposure + long <= self.step:
+            start, whole = self._exposure, slice(self._exposure - self._kept_from, None)
+            if len(self._outputs) > 1:
+                self._outputs, self._states = [np.concatenate(self._outputs)], [np.concatenate(self._states)]
+            before = np.concatenate([self._states[0][whole][: long + 1], self._state[None]])
+            frames.append(self._frame(start, self._outputs[0][whole][:long], before[: long + 1]))
             self._exposures_left -= 1
-            self._exposure = None if self._exposures_left == 0 else start + self.rig.timing.frame_period_steps
+            self._exposure = None if self._exposures_left == 0 else start + timing.frame_period_steps
         return frames
+
+    def _keep(self, first: int, outputs: FloatArray, states: FloatArray) -> None:
+        """Keep outputs and states of the fast steps from ``first`` on, while an exposure needs them."""
+        needed = self.step if self._exposure is None else self._exposure
+        while self._outputs and self._kept_from + len(self._outputs[0]) <= needed:
+            self._kept_from += len(self._outputs.pop(0))
+            self._states.pop(0)
+        if len(outputs) and needed < self.step:
+            self._kept_from = self._kept_from if self._outputs else first
+            self._outputs.append(outputs)
+            self._states.append(states)
 
     def _run(self, u: FloatArray) -> FloatArray:
         """States before each of k steps and after the last, (k + 1, axes, n_states), by Mishra & Wen (1)."""
@@ -116,11 +130,18 @@ class RigPhysics:
         self._state = states[-1].copy()
         return states
 
-    def _frame(self, first_step: int, end_state: FloatArray) -> CameraFrame:
-        sensor, faults = self.rig.sensor, self.rig.simulation.faults
-        path = np.concatenate(self._pieces).T.copy()
+    def _frame(self, first_step: int, outputs: FloatArray, states: FloatArray) -> CameraFrame:
+        """The frame of an exposure, from the outputs at the fast steps from the first row's first to the last row's
+        last, and the states there and after them."""
+        sensor, faults, n_steps = self.rig.sensor, self.rig.simulation.faults, self.rig.timing.exposure_steps
+        every = np.ascontiguousarray(outputs.T)
+        held = np.concatenate([every, every[:, -1:]], axis=1) if self._readout else every  # read with a share of zero
+        path = self._own_path(every)
+        axes = np.arange(self.rig.plant.axes)
+        start_state = states[self._delay, axes]
+        end_state = states[self._delay + self.rig.window_steps, axes]
         self._frames += 1
-        path, density = self._illuminate(path, end_state)
+        path, density = self._illuminate(path, held, end_state)
         if faults.dark_rate and self._faulty.random() < faults.dark_rate:
             density = np.zeros_like(density)
         if sensor.photoelectrons:
@@ -131,12 +152,20 @@ class RigPhysics:
         if faults.saturation_rate:
             pixels[self._faulty.random(pixels.shape) < faults.saturation_rate] = (1 << sensor.bit_depth) - 1
         return CameraFrame(
-            frame_id=self._frames, first_step=first_step, n_steps=path.shape[1], pixels=pixels,
-            scene=None if self._scene is None else self._scene.frame(*self._held(path, end_state), self._light.kind),
-            truth=Truth(start_state=self._start_state.copy(), end_state=end_state.copy(), path=path),
+            frame_id=self._frames, first_step=first_step, n_steps=n_steps, pixels=pixels,
+            scene=None if self._scene is None else self._scene_picture(path, held, end_state),
+            truth=Truth(start_state=start_state, end_state=end_state, path=path),
         )  # fmt: skip
 
-    def _illuminate(self, path: FloatArray, end_state: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def _own_path(self, every: FloatArray) -> FloatArray:
+        """Each output in the model's window of its axis, (n_outputs, window_steps), from all steps of the exposure."""
+        n_steps = self.rig.window_steps
+        if not self._delay.any():
+            return every[:, :n_steps].copy()
+        starts = np.repeat(self._delay, self.rig.plant.n_outputs)
+        return np.stack([row[start : start + n_steps] for row, start in zip(every, starts, strict=True)])
+
+    def _illuminate(self, path: FloatArray, every: FloatArray, end_state: FloatArray) -> tuple[FloatArray, FloatArray]:
         """The path that the camera sees and the mean densities, (n_outputs, steps) and (rows, columns)."""
         sensor, light = self.rig.sensor, self._light
         if light.kind == "dark":
@@ -148,12 +177,41 @@ class RigPhysics:
             self._rest = path[:, :1] if self._rest is None else self._rest
             path = np.repeat(self._rest, path.shape[1], axis=1)
             return path, frame_density(sensor, path)
+        if sensor.row_starts_s.any():
+            return path, self._by_rows(every)
         density, offset = frame_density(sensor, path), self.rig.timing.exposure_offset
         if offset:
             held, weights = self._held(path, end_state)
             gained = frame_density(sensor, held[:, -1:]) - frame_density(sensor, path[:, :1])
             density = np.maximum(density + weights[-1] * gained, 0.0)
         return path, density
+
+    def _by_rows(self, every: FloatArray) -> FloatArray:
+        """The mean density where each row of pixels has its own interval: (rows, columns)."""
+        sensor, n_steps = self.rig.sensor, self.rig.timing.exposure_steps
+        height = sensor.shape[0] // sensor.grid[0]
+        density, row_of = np.empty(sensor.shape), np.repeat(sensor.lit // sensor.grid[1], sensor.directions)
+        for k in range(height):
+            starts = self._row_starts(sensor.row_starts_s[k::height])
+            whole, part = np.floor(starts).astype(np.intp), starts - np.floor(starts)
+            path = np.stack([each[n : n + n_steps + 1] for each, n in zip(every, whole[row_of], strict=True)])
+            first, last = (frame_density(sensor, path[:, each])[k::height] for each in (np.s_[:1], np.s_[n_steps:]))
+            mean = frame_density(sensor, path[:, :n_steps])[k::height]
+            density[k::height] = np.maximum(mean + part[:, None] / n_steps * (last - first), 0.0)
+        return density
+
+    def _row_starts(self, starts_s: FloatArray) -> FloatArray:
+        """When rows start, fast steps after the first step of the exposure."""
+        return np.round(starts_s / self.rig.timing.fast_step_s, 6) + self.rig.timing.exposure_offset
+
+    def _scene_picture(self, path: FloatArray, every: FloatArray, end_state: FloatArray) -> NDArray[np.uint16]:
+        assert self._scene is not None
+        assert self.rig.scene is not None
+        starts_s = self.rig.scene.row_starts_s
+        if self._light.kind == "moving" and starts_s.any():
+            return self._scene.frame_by_rows(every, self._row_starts(starts_s), self.rig.timing.exposure_steps)
+        seen = every[:, : self.rig.timing.exposure_steps] if self._light.kind == "moving" else path
+        return self._scene.frame(*self._held(seen, end_state), self._light.kind)
 
     def _held(self, path: FloatArray, end_state: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Positions of the spots, step by step, (n_outputs, k), and each step's share of the exposure, (k,).
@@ -193,6 +251,7 @@ def simulate(
     rig = rig if isinstance(rig, Rig) else load_rig(rig)
     timing = rig.timing
     n_steps = (n_exposures - 1) * timing.frame_period_steps + timing.exposure_steps if n_exposures else 0
+    n_steps += rig.readout_steps if n_exposures else 0
     if inputs is None:
         inputs = rig.mirror.quantise(rig.drive.inputs(0, n_steps, timing.fast_step_s))
     elif inputs.ndim != 2 or inputs.shape[0] < n_steps or inputs.shape[1] != rig.n_inputs:
@@ -201,19 +260,24 @@ def simulate(
     if n_exposures:
         model.start_camera(0, n_exposures)
     frames = model.advance(inputs[:n_steps])
-    ends = [0] + [frame.first_step + frame.n_steps for frame in frames]
+    long, late = rig.window_steps, rig.axis_delays
+    ends = [-int(late.max())] + [frame.first_step + long for frame in frames]
     return [
-        exposure_of(rig, frame, inputs[frame.first_step : end].copy(), inputs[after : frame.first_step].copy())
-        for frame, after, end in zip(frames, ends[:-1], ends[1:], strict=True)
-    ]
+        exposure_of(
+            rig, frame, inputs_by_axis(rig.plant, late, inputs, frame.first_step, long).copy(),
+            inputs_by_axis(rig.plant, late, inputs, after, frame.first_step - after).copy(),
+        )
+        for frame, after in zip(frames, ends, strict=False)
+    ]  # fmt: skip
 
 
 def exposure_of(rig: Rig, frame: CameraFrame, inputs: FloatArray, lead_inputs: FloatArray) -> Exposure:
-    """The exposure of a frame, with the inputs in it and those since the exposure before, (k, n_inputs)."""
+    """The exposure of a frame, with the inputs of each axis in its window and since that of the exposure before, (k,
+    n_inputs)."""
     start, end = frame.first_step, frame.first_step + frame.n_steps
     step_ns, late_ns = rig.timing.fast_step_ns, rig.timing.exposure_offset_ns
     return Exposure(
-        frame_id=frame.frame_id, first_step=start, n_steps=frame.n_steps, pixels=frame.pixels,
+        frame_id=frame.frame_id, first_step=start, n_steps=len(inputs), pixels=frame.pixels,
         mask=np.ones(frame.pixels.shape, dtype=np.bool_), inputs=inputs, lead_inputs=lead_inputs,
         start_offset=late_ns / step_ns, device_start_ns=start * step_ns + late_ns,
         device_end_ns=end * step_ns + late_ns, host_start_ns=start * step_ns + late_ns,

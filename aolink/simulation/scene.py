@@ -7,6 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from aolink.exposure import step_shares
 from aolink.numerics.arrays import FloatArray
 from aolink.optics.scene import framed, framed_columns, framed_rows, scene_motion
 from aolink.optics.sensor import Kernel
@@ -53,12 +54,32 @@ class SceneCamera:
         if light in ("dark", "flat"):
             intensity = np.full(sensor.shape, _FLAT if light == "flat" else 0.0)
         else:
-            spectrum = self._spectrum * self._motion(scene_motion(len(path)) @ path * self._scale, weights)
-            if self._along_x:
-                intensity = framed_columns(sensor, np.fft.irfft(spectrum, self._shape[1]))
-            else:
-                intensity = framed(sensor, np.fft.irfft2(spectrum, self._shape))
+            intensity = self._intensity(scene_motion(len(path)) @ path * self._scale, weights)
         return sensor.to_counts(intensity + sensor.noise_sd * self._rng.standard_normal(sensor.shape))
+
+    def frame_by_rows(self, path: FloatArray, starts: FloatArray, n_steps: int) -> NDArray[np.uint16]:
+        """Counts where each row of pixels has an exposure of its own.
+
+        ``path`` is that of `frame` at all fast steps of the exposure; ``starts`` says when each row's ``n_steps`` steps
+        start, fast steps after its first, (rows,).
+        """
+        sensor = self._sensor
+        moved = scene_motion(len(path)) @ path * self._scale
+        intensity = np.empty(sensor.shape)
+        for start in np.unique(starts):
+            whole = int(start)
+            of_row = moved[:, whole : whole + n_steps + 1]
+            shares = step_shares(n_steps, float(start - whole))
+            picture = self._intensity(of_row[:, : len(shares)], shares)
+            intensity[starts == start] = picture[starts == start]
+        return sensor.to_counts(intensity + sensor.noise_sd * self._rng.standard_normal(sensor.shape))
+
+    def _intensity(self, moved: FloatArray, weights: FloatArray) -> FloatArray:
+        """The picture without noise along a path in the picture's pixels, (rows, columns)."""
+        spectrum = self._spectrum * self._motion(moved, weights)
+        if self._along_x:
+            return framed_columns(self._sensor, np.fft.irfft(spectrum, self._shape[1]))
+        return framed(self._sensor, np.fft.irfft2(spectrum, self._shape))
 
     def _kernel(self, kernel: Kernel) -> FloatArray:
         """Transform of the sensor's kernel, (rows, columns // 2 + 1)."""

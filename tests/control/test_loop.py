@@ -17,6 +17,7 @@ from aolink.numerics.arrays import FloatArray
 from aolink.rig import Rig
 from aolink.simulation.model import simulate
 from tests.control.rigs import DRIFT, VIBRATION, small_rig
+from tests.simulation.rolling import rolling
 
 
 def residual(series: list[Closed]) -> float:
@@ -223,3 +224,9 @@ def test_a_controller_that_gives_nonsense_is_an_error_that_names_it(given: objec
     loop.see(exposure, None, 40)
     with pytest.raises(ControlError, match=message):
         loop.inputs(40, 20)
+
+
+def test_a_camera_that_exposes_row_by_row_is_refused() -> None:
+    with pytest.raises(ControlError, match="with a global shutter"):
+        ControlLoop(rolling("sh-4x4", 2e-4), "integrator")
+    ControlLoop(rolling("sh-4x4", 0.0), "integrator")

@@ -204,3 +204,22 @@ def test_the_smoother_and_the_blur_carry_it_on(rig: Rig, name: str) -> None:
     assert np.allclose(np.diag(covariance), estimate.path_sd.ravel() ** 2)
     change = estimate.alignment_path().ravel()
     assert np.linalg.eigvalsh(covariance - 0.9 * np.outer(change, change)).min() > -1e-9
+
+
+def test_each_axis_is_shifted_by_its_own_possible_skew() -> None:
+    """As if its exposures were those of a rig that has this axis alone."""
+    sh = load_rig("sh-4x4")
+    step_ns, axes, rng = sh.timing.fast_step_ns, sh.plant.axes, np.random.default_rng(4)
+    skews = rng.integers(0, 4, axes).astype(float) * 3.5 * step_ns
+    exposures = [replace(each, inputs=rng.standard_normal(each.inputs.shape)) for each in simulate(sh, 3)]
+    both = Shifted(0.5, step_ns)
+    shifted = [both(replace(each, row_sigma_ns=skews)) for each in exposures]
+    assert all(each.row_sigma_ns is None for each in shifted)
+    for axis in (0, 7, axes - 1):
+        alone = Shifted(0.5, step_ns)
+        for each, done in zip(exposures, shifted, strict=True):
+            one = replace(
+                each, inputs=each.inputs[:, [axis]], lead_inputs=each.lead_inputs[:, [axis]],
+                alignment_sigma_ns=skews[axis],
+            )  # fmt: skip
+            np.testing.assert_array_equal(alone(one).inputs[:, 0], done.inputs[:, axis])

@@ -56,6 +56,8 @@ def test_notes_and_warnings_are_printed(aolink, rig, tmp_path):
     assert made.stdout.splitlines() == [
         "note: the film does not state its frame rate: that of the rig file is assumed, 50 frames/s",
         "note: when the film was taken is not known: its times count from 1970 unless --start is given",
+        "note: it is not known whether the film's rows were exposed one after the other: say so with --row-time S, or"
+        " --row-time 0",
         "warning: 4 pixels (0.89%) are saturated in the film, hot or dead, no numbers, or shared by two objects: they"
         " are masked",
         "a.mcap: 7 exposures of 7 frames",
@@ -87,8 +89,9 @@ def test_frames_are_summed(aolink, tmp_path):
     (tmp_path / "rig.toml").write_text(small_rig(3, 3).toml)
     source = others.written_npy(tmp_path, FRAMES)
     made = aolink(
-        "import", source, "-o", "a.mcap", "--rig", "rig.toml", "--sum", "3", "--rate", "1000", "--start", "2026-11-22"
-    )
+        "import", source, "-o", "a.mcap", "--rig", "rig.toml", "--sum", "3", "--rate", "1000", "--start", "2026-11-22",
+        "--row-time", "0",
+    )  # fmt: skip
     assert made.stdout == "a.mcap: 2 exposures of 6 frames\n"
     first = next(iter(Recording(tmp_path / "a.mcap")))
     np.testing.assert_array_equal(first.pixels, np.rint(FRAMES[:3].mean(axis=0) * 256))

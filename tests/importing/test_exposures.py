@@ -18,7 +18,8 @@ from aolink.films.formats import open_film
 from aolink.importing.frames import FilmAccount, FilmSettings
 from aolink.importing.recording import import_film
 from aolink.recording.reader import Recording
-from aolink.rig import Rig, load_rig
+from aolink.rig import Rig, load_rig, parse_rig
+from aolink.rig.rows import possible_skew_ns
 from tests.importing import others
 from tests.importing.others import numbers
 from tests.importing.rigs import small_rig
@@ -87,7 +88,8 @@ def test_a_film_of_a_simulation_gives_its_estimates_through_a_recording(tmp_path
     rig = small_rig()
     simulated = aolink.simulate(rig, 8, seed=3)
     recording, account = made(
-        tmp_path, np.array([each.pixels for each in simulated]), rig, inputs=applied(rig, simulated)
+        tmp_path, np.array([each.pixels for each in simulated]), rig, FilmSettings(row_time_s=0.0),
+        inputs=applied(rig, simulated),
     )  # fmt: skip
     assert (account.frames, account.exposures, account.saturated, account.clipped) == (8, 8, 0, 0)
     for one, other in zip(
@@ -386,3 +388,32 @@ def test_nothing_is_left_of_a_film_that_ends_in_damage(tmp_path):
     with pytest.raises(AolinkError):
         import_film(source, small_rig(), PLAIN, out / "film.mcap", overwrite=True)
     assert [each.read_text() for each in out.iterdir()] == ["mine"]
+
+
+def test_the_row_time_of_a_film_is_known_or_said(tmp_path):
+    """With it a film has the exposures of a camera that exposes row by row; without it, its inputs are uncertain."""
+    rig = small_rig()
+    text = rig.toml.replace("[sensor]", "[sensor]\nrow_time_s = 1e-3", 1)
+    simulated = aolink.simulate(parse_rig(text), 8, seed=3)
+    frames = np.array([each.pixels for each in simulated])
+    inputs = np.random.default_rng(0).uniform(-0.01, 0.01, (200, rig.n_inputs))
+    recording, account = made(tmp_path, frames, rig, FilmSettings(row_time_s=1e-3), inputs=inputs)
+    assert recording.rig.sensor.row_time_s == 1e-3
+    assert not any("--row-time" in note for note in account.notes)
+    late, first = recording.rig.axis_delays[0], next(iter(recording.exposures()))
+    assert late > 0
+    assert first.row_sigma_ns is None
+    n = first.n_steps
+    quantised = inputs[late : late + n, 0]
+    np.testing.assert_array_equal(first.inputs[:, 0], quantised)
+    recording, account = made(tmp_path, frames, rig, inputs=inputs)
+    assert any("--row-time" in note for note in account.notes)
+    assert "row_time_s" in recording.metadata["camera_lacks"]
+    first = next(iter(recording.exposures()))
+    assert first.row_sigma_ns is not None
+    np.testing.assert_array_equal(first.row_sigma_ns, possible_skew_ns(rig))
+    estimate = next(iter(aolink.estimate(recording, "o3").estimates("o3")))
+    assert estimate.alignment is not None
+    assert estimate.alignment.steps == pytest.approx(possible_skew_ns(rig).max() / rig.timing.fast_step_ns)
+    none, _ = made(tmp_path, frames, rig)
+    assert next(iter(none.exposures())).row_sigma_ns is None  # a mirror that rests has the same inputs at any time

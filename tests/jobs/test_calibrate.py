@@ -27,6 +27,7 @@ from aolink.recording.reader import Recording
 from aolink.rig import Rig, load_rig, parse_light, parse_rig
 from aolink.session import record
 from aolink.simulation.model import RigPhysics
+from tests.calibration.test_row_time import PERIOD_S, blinking
 from tests.commands import simulated_rig
 
 Run = Callable[..., subprocess.CompletedProcess[str]]
@@ -587,3 +588,21 @@ def test_a_mirror_is_poked_for_its_interaction_matrix(aolink: Run, tmp_path: Pat
         refused = aolink("calibrate", "--interaction", *wrong)
         assert refused.returncode == 8
         assert what in refused.stderr
+
+
+def test_a_film_of_blinking_light_gives_the_row_time(aolink: Run, tmp_path: Path) -> None:
+    """Its value and its standard deviation are written into the rig file, comments and all else stay."""
+    film = np.maximum(blinking(-1.7e-4, 197.0, 5), 0)[:, :, None].repeat(40, axis=2)
+    np.savez(tmp_path / "film.npz", frames=film.astype(np.uint16), rate_hz=1 / PERIOD_S)
+    made = aolink("calibrate", "film.npz", "--row-time", "197", "--rig", "sh-4x4", "-o", "out.toml")
+    assert (made.returncode, made.stderr) == (0, "")
+    text = (tmp_path / "out.toml").read_text()
+    assert parse_rig(text).sensor.row_time_s == pytest.approx(-1.7e-4, rel=5e-3)
+    (line,) = (each for each in text.splitlines() if each.startswith("row_time_s"))
+    assert "# +- " in line
+    assert "30 frames of film.npz" in line
+    assert [each for each in text.splitlines() if each != line] == load_rig("sh-4x4").toml.splitlines()
+    again = aolink("calibrate", "film.npz", "--row-time", "210", "--rig", "sh-4x4", "-o", "b.toml")
+    assert again.returncode != 0
+    assert "in step" in again.stderr
+    assert not (tmp_path / "b.toml").exists()

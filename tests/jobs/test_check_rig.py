@@ -153,3 +153,17 @@ def test_the_rigs_that_come_along_have_no_error(name: str) -> None:
     assert any("o2 needs a spot off centre" in f.message and "here they do not" in f.message for f in findings) == (
         name in ("loop", "membrane-12x12", "sh-30x30", "sh-8x8")
     )
+
+
+def test_rows_of_one_spot_that_are_exposed_too_far_apart_are_a_warning() -> None:
+    said = {}
+    for skew in (0.05, 0.2, -0.2):
+        rig = load_rig("sh-4x4")
+        rows = 4 * rig.sensor.kernel.sigma / math.sqrt(2) / rig.sensor.pixel_width
+        row_time = skew * rig.timing.exposure_steps * rig.timing.fast_step_s / rows
+        rolled = parse_rig(rig.toml.replace("[sensor]", f"[sensor]\nrow_time_s = {row_time}", 1))
+        said[skew] = {(f.severity, f.message) for f in check_rig(rolled) if f.key == "sensor.row_time_s"}
+    assert {severity for severity, _ in said[0.05]} == {"info"}
+    for skew in (0.2, -0.2):
+        assert any(severity == "warning" and "up to 0.2 of an exposure" in text for severity, text in said[skew])
+    assert not [f for f in check_rig(load_rig("sh-4x4")) if f.key == "sensor.row_time_s"]

@@ -17,6 +17,7 @@ from aolink.recording.reader import Recording
 from aolink.recording.reestimate import write_reestimated
 from tests.needs import needed
 from tests.recording.small import write_small
+from tests.simulation.rolling import rolling
 
 Figure = needed("matplotlib.figure").Figure
 StepPatch = needed("matplotlib.patches").StepPatch
@@ -202,3 +203,17 @@ def test_a_dark_recording_and_an_empty_one(tmp_path: Path) -> None:
     for draw in (plotting.plot_blur, plotting.plot_nis, plotting.plot_errors, plotting.plot_losses):
         with pytest.raises(ExportError, match="holds no exposure"):
             draw(empty, Figure().subplots())
+
+
+def test_the_picture_of_a_spot_shows_when_each_of_its_rows_is_exposed() -> None:
+    rig = rolling("sh-4x4", -2e-4)
+    series = aolink.simulate(rig, 2)
+    spot = 5
+    figure = plotting.plot_exposure(series, 1, Figure(), spot=spot, estimators=[])
+    (beside,) = (each for axes in figure.axes for each in axes.child_axes)
+    assert beside.get_ylabel() == "start of a row's exposure (ms)"
+    rows = rig.sensor.window_of(spot)[0]
+    start = vars(beside)["_functions"][0]
+    centres = rig.sensor.profile.centres
+    np.testing.assert_allclose(start(centres), 1e3 * rig.sensor.row_starts_s[rows])
+    assert all(not each.child_axes for each in plotting.plot_exposure(aolink.simulate("sh-4x4", 2), 1, Figure()).axes)

@@ -7,10 +7,11 @@ import time
 from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 from aolink.devices.cameras import pictures
 from aolink.devices.cameras.pictures import check_timing, check_within, checked_corner
+from aolink.devices.interfaces import Lacks
 from aolink.devices.simple import SimpleFrame, ThreadCamera
 from aolink.errors import DeviceError
 from aolink.extensions import needs_extra
@@ -42,6 +43,8 @@ class OpenCVCamera(ThreadCamera):
     DeviceError
         OpenCV is not installed or cannot open the source, or size or rate of its pictures are not the rig file's.
     """
+
+    lacks: ClassVar[tuple[Lacks, ...]] = (Lacks.TIME, Lacks.COUNT, Lacks.TRIGGER, Lacks.ROWS)
 
     def __init__(self, rig: Rig, *, source: int | str = 0, corner: list[int] | None = None) -> None:
         with needs_extra("opencv", DeviceError):

@@ -14,6 +14,9 @@ and the standard deviation of a path contains it.
 The spot rests at theta(k) for the whole of fast step k, as in the sum of Mishra & Wen (12). An exposure that starts a
 part f of a step late loses that part of its first step and gains the same part of the one after its last: a mean over
 it is (1/N) [sum_i g(theta_i) + f g(theta_N) - f g(theta_0)]. Start state, end state and path stay those of whole steps.
+
+Where the camera sees the outputs one after the other (`Plant.delays`), the path covers all steps from the first one's
+interval to the last one's, and a mean is that over the output's own interval, of whole steps.
 """
 
 from __future__ import annotations
@@ -73,10 +76,13 @@ class ExposureModel(ABC):
         self.transition, self.process_noise = lift(plant, n_steps)
         self.mean_row = mean_row
         """C-bar, (n_outputs, n_states)."""
+        self.delays = plant.delays if n_steps > plant.last_delay else ()
+        self.exposed_steps = n_steps - max(self.delays, default=0)
+        """N, the exposure of one output; fewer than ``n_steps`` where the outputs have delays."""
         self.moved = 0.0
         """f/N: the share of the exposure that is in the step after its last, and not in its first."""
         unmodelled = plant.unmodelled
-        mean, rest = unmodelled.variances(n_steps) if unmodelled else (0.0, 0.0)
+        mean, rest = unmodelled.variances(self.exposed_steps) if unmodelled else (0.0, 0.0)
         self.n_unmodelled = plant.n_outputs if unmodelled else 0
         """Coefficients of `UnmodelledSlopes`, which come after the start state; the process noise comes after them."""
         self.unmodelled_sd = float(np.sqrt(mean))
@@ -142,6 +148,8 @@ class ExposureModel(ABC):
         """The model for exposures that start ``offset`` of a fast step into their first one, 0 <= offset < 1."""
         if not 0 <= offset < 1:
             raise ValueError(f"an exposure starts from 0 to 1 fast step into its first one, not {offset:g}")
+        if self.delays:  # they are rounded to whole steps
+            return self
         _ = self.factors, self.end_rows  # made once, for all offsets
         model = copy(self)
         model.moved = offset / self.n_steps
@@ -153,7 +161,8 @@ class ExposureModel(ABC):
     @cached_property
     def quadratic(self) -> FloatArray:
         """M = mean_i (C A^i)'(C A^i) for each output, (n_outputs, n_states, n_states)."""
-        mean = np.einsum("oij,oik->ojk", self.state_rows, self.state_rows) / self.n_steps
+        rows = self.seen(self.state_rows)
+        mean = np.einsum("oij,oik->ojk", rows, rows) / self.exposed_steps
         if not self.moved:
             return np.asarray(mean)
         first, last = self.plant.C, self.last_rows
@@ -177,6 +186,18 @@ class ExposureModel(ABC):
     def n_coefficients(self) -> int:
         """States, unmodelled slopes and noise coefficients together."""
         return int(self.end_rows.shape[1])
+
+    def seen(self, values: FloatArray) -> FloatArray:
+        """The values of each output in its own interval, (..., n_outputs, n_steps, k) -> (..., n_outputs,
+        exposed_steps, k)."""
+        if not self.delays:
+            return values
+        own = [values[..., o, d : d + self.exposed_steps, :] for o, d in enumerate(self.delays)]
+        return np.stack(own, axis=-3)
+
+    def seen_path(self, path: FloatArray) -> FloatArray:
+        """A path as `seen`, (..., n_outputs, n_steps)."""
+        return self.seen(path[..., None])[..., 0]
 
     def response(self, inputs: FloatArray) -> InputResponse:
         """Response to the inputs of an exposure, (n_steps, axes * n_inputs)."""

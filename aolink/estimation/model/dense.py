@@ -29,6 +29,8 @@ class DenseModel(ExposureModel):
     def __init__(self, plant: Plant, n_steps: int) -> None:
         self._state_rows = output_rows(plant, n_steps)
         super().__init__(plant, n_steps, self._state_rows.mean(axis=1))
+        if self.delays:
+            self.mean_row = self.seen(self._state_rows).mean(axis=1)
         # Where outputs are more than states, and each has no unmodelled slope of its own, they are sums of the states:
         # paths of the states are computed then.
         few = plant.n_outputs > plant.n_states and not self.n_unmodelled
@@ -103,7 +105,8 @@ class DenseModel(ExposureModel):
     def responses(self, inputs: FloatArray) -> InputResponse:
         if not (inputs[:, -1].any() or inputs.any()):
             return self._at_rest(len(inputs) * self.plant.axes)
-        found = (self._stepped if self.plant.n_states <= _FEW_STATES else self._multiplied)(inputs)
+        few = self.plant.n_states <= _FEW_STATES and not self.delays
+        found = (self._stepped if few else self._multiplied)(inputs)
         if not self.moved:
             return found
         # Inputs have done nothing yet in the first step.
@@ -145,8 +148,11 @@ class DenseModel(ExposureModel):
     def _multiplied(self, inputs: FloatArray) -> InputResponse:
         """`responses` by products of matrices, of many steps at once."""
         path, end = input_response(self.plant, by_axis(self.plant, inputs))
-        mean, square = batched.mean_over_path(path), batched.mean_over_path(path * path)
-        if self._few is self.plant:
+        seen = self.seen_path(path)
+        mean, square = batched.mean_over_path(seen), batched.mean_over_path(seen * seen)
+        if self.delays:
+            slope = np.einsum("aoi,ois->aos", seen, self.seen(self.state_rows)) / self.exposed_steps
+        elif self._few is self.plant:
             # Column by column, so that the products lie in memory as they are summed.
             columns = [batched.mean_over_path(path * column) for column in self._columns[: self.plant.n_states]]
             slope = np.stack(columns, axis=-1)

@@ -96,8 +96,9 @@ class QuadraturePaths:
 
 def quadrature_paths(model: ExposureModel, response: InputResponse, q: QuadratureRule) -> QuadraturePaths:
     """An exposure at its nodes, and at two more where it starts between two steps."""
-    basis, weights = np.ascontiguousarray(q.at(model.basis.swapaxes(1, 2)).swapaxes(1, 2)), q.weights
-    inputs = q.at(response.path)
+    seen = model.seen(model.basis)
+    basis, weights = np.ascontiguousarray(q.at(seen.swapaxes(1, 2)).swapaxes(1, 2)), q.weights
+    inputs = q.at(model.seen_path(response.path))
     if model.moved:
         # This share of the exposure is not in its first step but in the one after its last.
         ends = (model.basis[:, 0], model.rows_after)

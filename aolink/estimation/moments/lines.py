@@ -49,7 +49,7 @@ class WindowedMoments:
 
     def update(self, model: ExposureModel, response: InputResponse, prior: Gaussian, measured: Profile) -> Update:
         """Iterated statistical linearisation, from the prior to the posterior."""
-        nodes = quadrature_paths(model, response, equal_parts(model.n_steps, MOST_NODES))
+        nodes = quadrature_paths(model, response, equal_parts(model.exposed_steps, MOST_NODES))
         axes, n_states = len(prior.mean), len(model.transition)
         lines = _lines(self.sensor, self.orders, self.flux, nodes, measured, n_states, model.end_rows)
         mean, covariance = _contiguous(prior.mean), _contiguous(prior.covariance)

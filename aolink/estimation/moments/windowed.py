@@ -96,7 +96,7 @@ class Windowed(ABC, Generic[Data]):
 
     def update(self, model: ExposureModel, response: InputResponse, prior: Gaussian, measured: Data) -> Update:
         """Iterated statistical linearisation, from the prior to the posterior."""
-        nodes = quadrature_paths(model, response, equal_parts(model.n_steps, self.most_nodes))
+        nodes = quadrature_paths(model, response, equal_parts(model.exposed_steps, self.most_nodes))
         parts = [
             self._update(model, nodes.part(s), prior.part(s), measured.part(s))
             for s in (slice(k, k + _AT_ONCE) for k in range(0, len(prior.mean), _AT_ONCE))

@@ -148,7 +148,7 @@ class MixtureFilter(Filter):
         if measured is not None:
             usable = np.arange(axes) if measured.usable is None else np.flatnonzero(measured.usable)
             # Each axis gets the nodes that its own path needs, whatever the other axes need.
-            level = reduced.resolution.of(model.path(prior.gaussian.mean, response.path))
+            level = reduced.resolution.of(model.seen_path(model.path(prior.gaussian.mean, response.path)))
             views, parts = {}, []
             for k in np.unique(level[usable]).tolist():
                 views[k] = PixelView(self.sensor, model, response, measured, reduced, k)

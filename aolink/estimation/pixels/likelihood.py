@@ -204,7 +204,8 @@ def _paths(model: ExposureModel, expand: FloatArray, count: int = _PATHS) -> Flo
     t = np.random.default_rng(0).standard_normal((count, expand.shape[1]))
     n = model.plant.n_states
     t[:, :n] = t[:, :n] @ psd_root(model.plant.initial_covariance).T
-    return np.asarray(np.tensordot(t, model.basis @ expand, axes=(1, 2))).reshape(-1, model.n_steps)
+    basis = model.seen(model.basis)
+    return np.asarray(np.tensordot(t, basis @ expand, axes=(1, 2))).reshape(-1, model.exposed_steps)
 
 
 class PixelView:

@@ -65,8 +65,10 @@ def test_a_film_that_ends_ends_the_session_with_what_there_is(film: Path, tmp_pa
     rig = rig_of(table(film.name), tmp_path, **BITS_8)
     with pytest.raises(DeviceError, match=r"film.avi has ended after 20 frames: ask for fewer exposures; .* are saved"):
         record(rig, None, None, tmp_path / "a.mcap", exposures=50)
-    found = list(Recording(tmp_path / "a.mcap").exposures())
+    recording = Recording(tmp_path / "a.mcap")
+    found = list(recording.exposures())
     assert shown_in(found, pictures(20, 8)) == list(range(20 - len(found), 20))
+    assert "sensor.row_time_s" in recording.metadata["camera_lacks"]
 
 
 class Stream(BaseHTTPRequestHandler):
