@@ -77,7 +77,7 @@ def log_warnings(
     """Warnings in words, on the timelines: ``/warnings``; gives how many there are.
 
     They are about frames lost or incomplete, inputs that the mirror did not report, exposures that an estimator gated,
-    could not use or had no time for, and those in which it diverged or began anew.
+    could not use or had no time for, those in which it diverged or began anew, and its verdicts on the model.
     """
     said: list[tuple[Exposure, str]] = []
     for last, e in zip([before, *exposures], exposures, strict=False):
@@ -91,6 +91,8 @@ def log_warnings(
             if e.frame_id in skipped.get(name, ()):
                 said.append((e, f"{name} had no time for frame {e.frame_id}"))
             found = by_frame.get(e.frame_id)
+            if found is not None and found.verdict is not None and found.verdict.begins_with(e.frame_id):
+                said.append((e, f"{name}: frame {e.frame_id}: {found.verdict.text}"))
             if found is not None and found.status in _REFUSED:
                 why = f": {found.reason}" if found.reason else ""
                 said.append((e, f"{name}: frame {e.frame_id} {_REFUSED[found.status]}{why}"))
