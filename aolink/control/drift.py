@@ -32,7 +32,7 @@ class Fit:
     whiteness: float
     """Correlation of neighbouring innovations, in units of their own covariance: 0 where the model is right."""
     fits: bool
-    """Whether both are within what chance and an inexact model explain, and the estimator's verdict is not against it."""
+    """Whether both are within what chance and an inexact model explain, and the estimator's verdict agrees."""
     verdict: str = ""
     """The estimator's verdict, where it is that the model does not fit."""
 

@@ -18,7 +18,7 @@ import numpy as np
 from aolink.estimation.estimate import Estimate, Status
 from aolink.estimation.kalman.gaussian import Gaussian
 from aolink.estimation.model.base import over_steps
-from aolink.estimation.pixels.residuals import SIGNATURES, Residuals, residuals
+from aolink.estimation.pixels.residuals import Residuals, residuals
 from aolink.estimation.verdict import Fit, Verdict
 from aolink.exposure import Exposure
 from aolink.numerics.arrays import FloatArray
@@ -52,7 +52,7 @@ class Statistics(NamedTuple):
     static: float
     """Largest mean residual of a single pixel, as Student's t."""
     signatures: FloatArray
-    """Mean products with `SIGNATURES`, as Student's t."""
+    """Mean products with `residuals.SIGNATURES`, as Student's t."""
     squares: float
     """Mean square of the white errors of position."""
     excess: float
@@ -155,7 +155,7 @@ def judged(found: Statistics, before: Verdict, compared: int) -> Verdict:
     numbers = {"pixels": found.pixels, "motion": max(found.motion, found.mean), "exposures": compared}
     if fit is not Fit.DOES_NOT_FIT:
         return Verdict(fit=fit, **numbers)  # type: ignore[arg-type]
-    width, light, background, fade, ends = np.abs(found.signatures)
+    width, _, _, fade, ends = np.abs(found.signatures)
     if found.static > _STATIC or pixels >= motion:
         where = "everywhere in the spot"
         if found.static > _STATIC:

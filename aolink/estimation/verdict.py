@@ -62,6 +62,5 @@ class Verdict:
         if self.fit is Fit.FITS:
             return "the model fits"
         where = f"residuals {self.where}" if self.kind == "pixels" else f"positions are off {self.where}"
-        return (
-            f"the model does not fit ({self.kind}: {where}): {ADVICE[self.where]}; intervals {self.widening:.2g} times"
-        )
+        what = f"the model does not fit ({self.kind}: {where}): {ADVICE[self.where]}"
+        return f"{what}; intervals are {self.widening:.2g} times as wide"

@@ -8,20 +8,24 @@ simulated rig's.
 from __future__ import annotations
 
 import dataclasses
+import json
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from pathlib import Path
 from typing import Literal, get_args
 
 import numpy as np
 from scipy import integrate, special
 
+from aolink.estimation import make_estimator
+from aolink.estimation.verdict import Fit, Verdict
 from aolink.exposure import Exposure
 from aolink.numerics.arrays import FloatArray
 from aolink.optics.camera import pixel_noise_sd, to_counts
 from aolink.optics.sensor import SpotSensor
-from aolink.rig import Rig
+from aolink.rig import Plant, Rig
 from aolink.simulation.model import simulate
 from paper_report.family import Scene, commands_of, draw, plant_of, rig_of, with_flaws
 
@@ -31,9 +35,14 @@ Fault = Literal[
 ]  # fmt: skip
 FAULTS: tuple[Fault, ...] = get_args(Fault)[1:]
 PIXELS = ("airy", "coma", "wide kernel", "shot noise", "hot pixel", "second object")
-"""Faults whose evidence is in the pixels; that of the others is in the motion. `_EITHER` may count as both."""
+"""Faults whose evidence is in the pixels; that of the others is in the motion."""
 EITHER = ("fading light", "zero off")
+"""Faults that may be seen as either."""
+HARMFUL = 0.85
+"""Coverage below which a fault does harm."""
 EXPOSURES = 100
+_SETTLING = 4
+_BEYOND_95 = 1.959964
 _SIZES = {
     "fading light": (0.3, 0.9), "unmodelled line": (0.3, 3.0), "late exposure": (0.03, 0.1), "zero off": (0.1, 2.0),
     "process noise": (1.5, 4.0), "frequency": (0.02, 0.1), "airy": (1.0, 1.0), "coma": (0.5, 1.5),
@@ -77,7 +86,7 @@ def recording(seed: int, fault: Fault, exposures: int = EXPOSURES) -> Recording:
     )  # fmt: skip
 
 
-def _true_plant(scene: Scene, rig: Rig, exposures: int, fault: Fault, size: float):  # type: ignore[no-untyped-def]
+def _true_plant(scene: Scene, rig: Rig, exposures: int, fault: Fault, size: float) -> Plant:
     plant = rig.plant
     if fault == "frequency":
         modes = tuple(dataclasses.replace(each, swings=each.swings * (1 + size)) for each in scene.modes)
@@ -169,3 +178,98 @@ def _table(fault: Fault, size: float) -> tuple[FloatArray, FloatArray] | None:
         return None
     below = np.concatenate([[0.0], np.cumsum((line[1:] + line[:-1]) / 2)])
     return u, below / below[-1]
+
+
+@dataclass(frozen=True, kw_only=True)
+class FaultRow:
+    """The verdict on one recording."""
+
+    seed: int
+    fault: Fault
+    size: float
+    estimator: str
+    inside: float
+    """Share of the path in the filter's own 95 % intervals, over the recording without its start."""
+    called: int
+    """Exposure with which the model was first said not to fit; -1 for none."""
+    kind: str
+    """That of the last such verdict."""
+    where: str
+    inside_after: float
+    """Share of the path in the intervals from that exposure on; NaN where there was none."""
+    width: float
+    """Median half width of these, over the rms error there."""
+    pixels: float
+    motion: float
+    """The last verdict's evidence."""
+
+
+def judge_recording(seed: int, fault: Fault, name: str) -> FaultRow:
+    """The row of one recording by an estimator."""
+    made = recording(seed, fault)
+    estimator = make_estimator(made.rig, name)
+    own, after, errors, widths = [], [], [], []
+    called, last = -1, Verdict(fit=Fit.UNKNOWN)
+    for k, exposure in enumerate(made.exposures):
+        estimate = estimator.step(exposure)
+        truth = exposure.truth
+        assert truth is not None
+        verdict = estimate.verdict or last
+        error, reach = np.abs(estimate.path - truth.path), _BEYOND_95 * estimate.path_sd
+        if k >= _SETTLING:
+            own.append(np.mean(error < reach / verdict.widening))
+        if verdict.fit is Fit.DOES_NOT_FIT:
+            called, last = (k if called < 0 else called), verdict
+            after.append(np.mean(error < reach))
+            errors.append(np.mean(error**2))
+            widths.append(np.median(reach))
+        elif called < 0:
+            last = verdict
+    return FaultRow(
+        seed=seed, fault=fault, size=made.size, estimator=name, inside=float(np.mean(own)), called=called,
+        kind=last.kind, where=last.where, inside_after=float(np.mean(after)) if after else math.nan,
+        width=float(np.median(widths) / math.sqrt(np.mean(errors))) if after else math.nan,
+        pixels=last.pixels, motion=last.motion,
+    )  # fmt: skip
+
+
+def judge_faults(path: Path, first: int, right: int, each: int, name: str) -> list[FaultRow]:
+    """Judge recordings one after the other; rows that the file has already are not made again. Seeds are ``first`` and
+    those after it."""
+    lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
+    rows = [FaultRow(**json.loads(line)) for line in lines]
+    there = {(row.seed, row.fault) for row in rows if row.estimator == name}
+    wanted: list[tuple[int, Fault]] = [(first + k, "none") for k in range(right)]
+    faults = [(first + right + k, FAULTS[k % len(FAULTS)]) for k in range(each * len(FAULTS))]
+    with path.open("a", encoding="utf-8") as file:
+        for seed, fault in [*faults, *wanted]:
+            if (seed, fault) not in there:
+                rows.append(judge_recording(seed, fault, name))
+                file.write(f"{json.dumps(dataclasses.asdict(rows[-1]))}\n")
+                file.flush()
+    return [row for row in rows if row.estimator == name]
+
+
+def table_of_faults(rows: Sequence[FaultRow]) -> str:
+    """Lines of text by kinds of faults: how many there are, how many are called wrong, and the same of those whose
+    intervals hold less than .85 of the path; how often the kind of evidence is right, and the coverage afterwards."""
+    heads = ("fault", "n", "called", "harmful", "called", "kind right", "inside before", "after", "width")
+    lines = [heads, *(_line(fault, [row for row in rows if row.fault == fault]) for fault in ("none", *FAULTS))]
+    lines.append(_line("all faults", [row for row in rows if row.fault != "none"]))
+    return "\n".join("".join(f"{cell:>{18 if k == 0 else 14}}" for k, cell in enumerate(line)) for line in lines)
+
+
+def _line(fault: str, rows: Sequence[FaultRow]) -> tuple[str, ...]:
+    harmful = [row for row in rows if row.inside < HARMFUL]
+    found = [row for row in harmful if row.called >= 0]
+    called = [row for row in rows if row.called >= 0]
+    right = [row.fault in EITHER or (row.kind == "pixels") == (row.fault in PIXELS) for row in called]
+
+    def mean(values: Sequence[float], digits: int = 2) -> str:
+        return f"{np.mean(values):.{digits}f}" if len(values) else "-"
+
+    return (
+        fault, str(len(rows)), str(len(called)), str(len(harmful)), str(len(found)),
+        f"{sum(right)} of {len(right)}", mean([row.inside for row in found]),
+        mean([row.inside_after for row in found]), mean([row.width for row in found]),
+    )  # fmt: skip

@@ -35,6 +35,9 @@ _NEEDS = Needs(what="profile", least_usable=HALF)
 _PASSES = 8
 _FIRST_DAMPING, _LARGEST_DAMPING = 1e-3, 1e4
 _CONVERGED = 0.02
+_NOTHING_NEW = 1e-3
+_UNMET = 0.2
+"""Mean squared residual beyond the noise at which a fit to a frame drawn counts as failed."""
 
 
 class Residuals(NamedTuple):
@@ -49,7 +52,8 @@ class Residuals(NamedTuple):
     static: FloatArray
     """Residuals of the pixels, zero where none was used, (rows, pixels)."""
     position: FloatArray
-    """Mean of the path less its prediction from the exposure before, white where the model is right, (n,)."""
+    """What the pixels change of the path's mean as predicted from the exposure before, white where the model is right,
+    (n,)."""
 
 
 def residuals(
@@ -66,7 +70,7 @@ def residuals(
     density = measured.density.reshape(plant.axes, plant.n_outputs, -1)
     mask = measured.mask.reshape(density.shape)
     usable = np.broadcast_to(True if measured.usable is None else measured.usable, (plant.axes,))
-    axes = axes[usable[axes] & (estimate.nis[axes] > 0) & (estimate.status <= 0)]
+    axes = axes[usable[axes] & (estimate.nis[axes] > 0)]
     if not len(axes):
         return None
     fit = _Fit(rig.sensor.profile, reduction(model, rig.sensor), estimate, axes)
@@ -84,6 +88,8 @@ def residuals(
         position = fit.position(fitted, fit.reduced.prior(before.part(axes)))
     # The noise itself is known there, and left out of the difference.
     absorbed = float((noise**2).sum() - (again.residual**2).sum())
+    if absorbed < -_UNMET * int(seen.sum()):
+        return None  # a fit from there does not even find the path of the frame drawn
     excess = float((fitted.residual**2).sum()) - int(seen.sum()) + absorbed
     return Residuals(excess, int(seen.sum()), signatures, fitted.residual.reshape(-1, y.shape[-1]), position)
 
@@ -188,12 +194,18 @@ class _Fit:
         return np.array([float((each / fitted.sd * fitted.residual).sum()) for each in shapes])
 
     def position(self, fitted: _Fitted, before: Gaussian) -> FloatArray:
-        """Mean path less its prediction, whitened, (axes * outputs,)."""
+        """Change of the mean path by the pixels, from its prediction, white where the model is right, (n,)."""
         rows = np.einsum("k,okn->on", self.weights, self.basis)
-        away = np.einsum("on,an->ao", rows, fitted.t - before.mean)
-        spread = np.linalg.inv(fitted.information) + before.covariance
-        spread = np.einsum("oi,aij,pj->aop", rows, spread, rows)
-        # Of an unstable plant a prediction may be too wide for this.
-        known = np.linalg.eigvalsh(spread)[:, 0] > 0
+        seen = np.matmul(fitted.slope.swapaxes(1, 2), fitted.slope)
+        new = np.einsum("apn,ap->an", fitted.slope, fitted.residual.reshape(len(seen), -1))
+        new += np.einsum("aij,aj->ai", seen, fitted.t - before.mean)
+        # The Kalman update in information form: what the pixels change of the prediction, and the variance of that.
+        n = seen.shape[-1]
+        after = np.linalg.solve(np.eye(n) + before.covariance @ seen, before.covariance)
+        away = np.einsum("oi,aij,aj->ao", rows, after, new)
+        spread = np.einsum("oi,aij,pj->aop", rows, before.covariance - after, rows)
+        prior = np.einsum("oi,aij,oj->a", rows, before.covariance, rows)
+        # The pixels may say nothing that was not known.
+        known = np.linalg.eigvalsh((spread + spread.swapaxes(1, 2)) / 2)[:, 0] > _NOTHING_NEW * prior
         root = np.linalg.cholesky(spread[known])
         return np.linalg.solve(root, away[known][..., None]).ravel()
