@@ -33,10 +33,10 @@ WINDOW, FEWEST, BETWEEN = 48, 24, 8
 """Comparisons that are judged together, the fewest of them, and those from one judgement to the next."""
 _AT_ONCE = 4
 """Most axes that are compared in one exposure."""
-PIXELS_OFF, MOTION_OFF = 3.4, 4.0
+PIXELS_OFF, MOTION_OFF = 3.8, 4.0
 """Statistics from which on the model does not fit; below `FITS` of them it does."""
 FITS = 0.7
-_SPREAD = 1.2
+_SPREAD = 1.0
 """Standard deviation of the statistic of the motion where the model is right, measured by `tools/verdict`."""
 _STATIC = 7.0
 _MOST = 4.0

@@ -36,7 +36,7 @@ _PASSES = 8
 _FIRST_DAMPING, _LARGEST_DAMPING = 1e-3, 1e4
 _CONVERGED = 0.02
 _NOTHING_NEW = 1e-3
-_UNMET = 0.2
+_UNMET = 0.5
 """Mean squared residual beyond the noise at which a fit to a frame drawn counts as failed."""
 
 
