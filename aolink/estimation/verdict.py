@@ -38,6 +38,8 @@ class Verdict:
     motion: float = 0.0
     """The squared errors with which the spot's positions were predicted, beyond what is expected, in standard errors;
     or those of their mean, if larger."""
+    nis: float = 0.0
+    """The estimator's NIS beyond what is expected, in the standard deviations that its sum has where the model fits."""
     since: int = 0
     """Number of the frame with which ``fit`` became what it is."""
     exposures: int = 0
