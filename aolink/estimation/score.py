@@ -248,7 +248,9 @@ def score_table(by_name: Mapping[str, Score], only: Container[str] = ()) -> Scor
         norm = "RMSE of states: norm over the states. " if of_states else ""
         notes += [f"{norm}! outside the 95 % bounds of a consistent filter:", bounds]
     rows = {name: [column(each) for column in columns.values()] for name, each in by_name.items()}
-    verdicts = [f"{name}: {each.verdict.text}" for name, each in by_name.items() if each.verdict is not None]
+    verdicts = [
+        f"{name}: {each.verdict.text}" for name, each in by_name.items() if each.verdict and each.verdict.exposures
+    ]
     return ScoreTable(list(columns), rows, [*notes, *unused_lines(by_name), *verdicts])
 
 
