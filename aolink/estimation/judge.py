@@ -116,7 +116,7 @@ class Judge:
             self.verdict = replace(after, since=since)
 
     def _models_noise(self, estimate: Estimate) -> bool:
-        return estimate.coefficients.shape[1] > self._rig.plant.n_states
+        return bool(estimate.coefficients.shape[1] > self._rig.plant.n_states)
 
     def _prediction(self, exposure: Exposure, estimate: Estimate) -> Gaussian | None:
         """The start states as predicted from the exposure before; None where that is not known, and for the paper's
@@ -136,11 +136,10 @@ class Judge:
 
 def statistics(seen: deque[Residuals]) -> Statistics:
     """What some comparisons say together."""
-    excess, pixels = (np.array([float(each[k]) for each in seen]) for k in (0, 1))  # type: ignore[arg-type]
-    squares, degrees = (
-        np.array([part(each.position) for each in seen if len(each.position)])
-        for part in (lambda e: float(e @ e), lambda e: float(len(e)))
-    )
+    excess = np.array([each.excess for each in seen])
+    pixels = sum(each.pixels for each in seen)
+    known = [each.position for each in seen if len(each.position)]
+    squares, degrees = np.array([float(each @ each) for each in known]), np.array([float(len(each)) for each in known])
     motion = mean = 0.0
     if len(squares) >= FEWEST // 2:
         motion = float(_normal(squares, degrees).sum()) / math.sqrt(len(squares))
@@ -154,7 +153,7 @@ def statistics(seen: deque[Residuals]) -> Statistics:
     signatures = _student(np.array([each.signatures for each in seen]))
     total = float(squares.sum() / degrees.sum()) if len(squares) else 1.0
     return Statistics(
-        float(_student(excess)), motion, mean, static, alone, signatures, total, float(excess.sum() / pixels.sum())
+        float(_student(excess)), motion, mean, static, alone, signatures, total, float(excess.sum() / pixels)
     )
 
 

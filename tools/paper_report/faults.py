@@ -80,10 +80,8 @@ def recording(seed: int, fault: Fault, exposures: int = EXPOSURES) -> Recording:
     late = max(1, round(size * scene.steps)) if fault == "late exposure" else 0
     inputs = commands_of(scene, rig.plant, exposures * scene.period + late)
     made = simulate(true, exposures, seed, inputs=inputs[late:])
-    return Recording(
-        rig=rig, exposures=list(with_flaws(scene, rig, _frames(rig, made, inputs, rng, fault, size))), fault=fault,
-        size=size, scene=scene,
-    )  # fmt: skip
+    seen = with_flaws(scene, rig, list(_frames(rig, made, inputs, rng, fault, size)))
+    return Recording(rig=rig, exposures=list(seen), fault=fault, size=size, scene=scene)
 
 
 def _true_plant(scene: Scene, rig: Rig, exposures: int, fault: Fault, size: float) -> Plant:

@@ -79,7 +79,7 @@ def residuals(
     spread = plant.initial_covariance + model.process_noise + estimate.start_covariance[axes]
     wide = fit.reduced.prior(Gaussian(estimate.start_state[axes], spread))
     fitted = fit.to(y, seen, start, wide)
-    noise = np.where(seen, np.random.default_rng(zlib.crc32(exposure.pixels)).standard_normal(y.shape), 0.0)
+    noise = np.where(seen, np.random.default_rng(zlib.crc32(exposure.pixels.tobytes())).standard_normal(y.shape), 0.0)
     drawn = np.where(seen, fitted.light + fitted.sd * noise, 0.0)
     again = fit.to(drawn, seen, start, wide)
     signatures = fit.signatures(fitted) - fit.signatures(again)
@@ -136,7 +136,7 @@ class _Fit:
 
     def to(self, y: FloatArray, seen: BoolArray, t: FloatArray, prior: Gaussian) -> _Fitted:
         """The mode that a start leads to, by Levenberg and Marquardt's method."""
-        precision = np.linalg.pinv(prior.covariance, hermitian=True)
+        precision = np.asarray(np.linalg.pinv(prior.covariance, hermitian=True), np.float64)
         now, objective = self._at(y, seen, t, prior.mean, precision)
         damping = np.full(len(t), _FIRST_DAMPING)
         diagonal = np.eye(t.shape[1])
