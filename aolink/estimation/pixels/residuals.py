@@ -145,6 +145,8 @@ class _Fit:
             pull -= np.einsum("aij,aj->ai", precision, now.t - prior.mean)
             damped = now.information * (1 + damping[:, None, None] * diagonal)
             step = np.linalg.solve(damped, pull[..., None])[..., 0]
+            if ((step * pull).sum(axis=1) < _CONVERGED).all() and (damping <= _FIRST_DAMPING).all():
+                break
             there, reached = self._at(y, seen, now.t + step, prior.mean, precision)
             better = reached < objective
             damping = np.where(better, damping / 8, 8 * np.maximum(damping, _FIRST_DAMPING))
