@@ -54,7 +54,7 @@ MAPS = {
 }
 """Maps over the lenslets by the name of their values: title, meaning of the colours, colour map."""
 FRAME_INCIDENTS = ("frames lost", "frames incomplete", "inputs not reported")
-NO_TIME = "no time for it"
+NO_TIME, VERDICT = "no time for it", "verdict"
 REFUSED = {
     Status.GATED: "gated",
     Status.DIVERGED: "diverged",
@@ -195,7 +195,7 @@ def nis_bounds(degrees_of_freedom: int) -> tuple[float, float]:
 def incidents_of(before: Exposure | None, step: Step) -> Iterator[tuple[str, str]]:
     """What went wrong with an exposure: the kind of each incident, and a sentence.
 
-    Kinds are `FRAME_INCIDENTS` and, of each estimator, "NAME: " with a word of `REFUSED` or `NO_TIME`. Frames are lost
+    Kinds are `FRAME_INCIDENTS` and, of each estimator, "NAME: " with a word of `REFUSED`, `NO_TIME` or `VERDICT`. Frames are lost
     after the exposure ``before``.
     """
     e = step.exposure
@@ -212,6 +212,8 @@ def incidents_of(before: Exposure | None, step: Step) -> Iterator[tuple[str, str
         if (word := REFUSED.get(estimate.status)) is not None:
             why = f": {estimate.reason}" if estimate.reason else ""
             yield f"{name}: {word}", f"{name}: frame {e.frame_id} {word}{why}"
+        if estimate.verdict is not None and estimate.verdict.begins_with(e.frame_id):
+            yield f"{name}: {VERDICT}", f"{name}: frame {e.frame_id}: {estimate.verdict.text}"
 
 
 def has_pupil(rig: Rig) -> bool:

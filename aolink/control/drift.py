@@ -10,6 +10,8 @@ from typing import NamedTuple
 import numpy as np
 
 from aolink.estimation import Estimate
+from aolink.estimation.verdict import Fit as VerdictFit
+from aolink.estimation.verdict import Verdict
 from aolink.numerics.arrays import FloatArray
 
 WINDOW = 60
@@ -30,9 +32,13 @@ class Fit:
     whiteness: float
     """Correlation of neighbouring innovations, in units of their own covariance: 0 where the model is right."""
     fits: bool
-    """Whether both are within what chance and an inexact model explain."""
+    """Whether both are within what chance and an inexact model explain, and the estimator's verdict agrees."""
+    verdict: str = ""
+    """The estimator's verdict, where it is that the model does not fit."""
 
     def text(self) -> str:
+        if self.verdict:
+            return self.verdict
         squares = f"squared errors of prediction (NIS) {self.nis_ratio:.2f} times what the model expects"
         return f"{squares}, correlation of neighbouring errors {self.whiteness:+.2f} where it expects 0"
 
@@ -50,10 +56,11 @@ class FitMonitor:
     def __init__(self) -> None:
         self._window: deque[_Sums] = deque(maxlen=WINDOW)
         self._before: FloatArray | None = None
+        self._verdict: Verdict | None = None
 
     def add(self, estimate: Estimate) -> Fit | None:
         """Take the next estimate; None while fewer than `WINDOW` of them had a measurement."""
-        measured = estimate.nis > 0
+        measured, self._verdict = estimate.nis > 0, estimate.verdict
         if not measured.any():
             self._before = None
             return self.fit()
@@ -68,13 +75,15 @@ class FitMonitor:
 
     def fit(self) -> Fit | None:
         """Statistics of the innovations of the newest exposures; None while they are too few."""
-        if len(self._window) < WINDOW:
+        wrong = self._verdict is not None and self._verdict.fit is VerdictFit.DOES_NOT_FIT
+        if len(self._window) < (1 if wrong else WINDOW):
             return None
         nis, count, product, square = (sum(each) for each in zip(*self._window, strict=True))
         ratio, whiteness = nis / count, product / square
         off = max(ratio, 1 / ratio) > max(TOLERATED_RATIO, 1 + _SIGMAS * math.sqrt(2 / count))
         coloured = abs(whiteness) > max(_TOLERATED_CORRELATION, _SIGMAS / math.sqrt(count))
-        return Fit(nis_ratio=ratio, whiteness=whiteness, fits=not (off or coloured))
+        verdict = self._verdict.text if wrong and self._verdict is not None else ""
+        return Fit(nis_ratio=ratio, whiteness=whiteness, fits=not (off or coloured or wrong), verdict=verdict)
 
 
 def _whitened(estimate: Estimate) -> FloatArray:

@@ -12,6 +12,7 @@ import numpy as np
 
 from aolink.estimation.model.base import ExposureModel
 from aolink.estimation.model.exposure_model import path_of, path_sd_of
+from aolink.estimation.verdict import Verdict
 from aolink.numerics.arrays import FloatArray, Indices
 from aolink.numerics.covariance import from_correlation_steps, in_correlation_steps, psd_root
 from aolink.plain import plain_data
@@ -139,6 +140,9 @@ class Estimate:
     components: Components | None = field(default=None, compare=False, repr=False)
     """The mixture's components, where the estimator carries a mixture; recordings do not have them. `smooth` uses
     them."""
+    verdict: Verdict | None = field(default=None, compare=False)
+    """Whether the model fits, by the exposures up to this one; None where that is not judged, and in older recordings.
+    Where it does not fit, the covariances are those of the filter times ``verdict.widening`` squared."""
     wandering: WanderingValue | None = field(default=None, compare=False)
     """The drifting quantity, where the rig has ``plant.wandering`` and the estimator follows it; recordings do not have
     it."""

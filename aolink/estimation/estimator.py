@@ -13,6 +13,7 @@ from aolink.estimation.alignment import Shifted, considered, matters, share_of_s
 from aolink.estimation.batch import Batch
 from aolink.estimation.estimate import Estimate, Status, as_recorded
 from aolink.estimation.frames.measure import MeasuredFrame, Measurements
+from aolink.estimation.judge import Judge
 from aolink.estimation.kalman.filter import Filter, Posterior
 from aolink.estimation.model.base import ExposureModel
 from aolink.exposure import Exposure
@@ -33,6 +34,8 @@ class Estimator:
         filter does not search for modes."""
         self.posterior: Posterior | None = None
         """The filter's last posterior, of an exposure that it took by itself."""
+        self.judge: Judge | None = Judge(rig)
+        """Judges whether the model fits; None in copies whose estimates are not those that are given."""
         self._next_step: int | None = None
         self._last_input = np.zeros(rig.n_inputs)
         self._copies: tuple[float, list[tuple[Estimator, Shifted]]] | None = None
@@ -55,7 +58,8 @@ class Estimator:
         Raises EstimatorError where the rig has numbers that cannot be computed with.
         """
         try:
-            yield from self._steps(batch)
+            for exposure, estimate in zip(batch.exposures, self._steps(batch), strict=True):
+                yield estimate if self.judge is None else self.judge.take(exposure, estimate)
         except (ArithmeticError, np.linalg.LinAlgError) as error:
             raise EstimatorError(
                 f"{self.name} cannot compute with this rig: {error}; are its numbers too large or too small?"
@@ -71,6 +75,8 @@ class Estimator:
                         batch = Batch(self.rig, batch.exposures[k:])
                     share, shared = share_of_shift(exposure, step_ns), {id(part): part for part in self.shared}
                     both = [(copy.deepcopy(self, dict(shared)), Shifted(each, step_ns)) for each in (share, -share)]
+                    for copied, _ in both:
+                        copied.judge = None
                     self._copies = share, both
                     break
         made = self.steps_as_aligned(batch)

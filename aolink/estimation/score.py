@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from aolink.estimation.estimate import Estimate, Status
+from aolink.estimation.verdict import Verdict
 from aolink.exposure import Exposure
 from aolink.numerics.arrays import FloatArray
 from aolink.numerics.chi_square import chi_square_quantile
@@ -101,6 +102,8 @@ class Score:
     nis: Consistency
     start_nees: Consistency
     end_nees: Consistency
+    verdict: Verdict | None = None
+    """Whether the model fits, by the last of the estimates; None where that is not judged."""
 
     @property
     def nothing_measured(self) -> str:
@@ -121,6 +124,7 @@ class Scorer:
         self._start_nees, self._end_nees, self._nis = RunningMean(), RunningMean(), RunningMean()
         self._measurements = self._estimated = self._measured = self._gated = 0
         self._looks = False
+        self._verdict: Verdict | None = None
         self._unused = UnusedCounter()
 
     def add(self, exposure: Exposure, estimate: Estimate) -> None:
@@ -128,6 +132,7 @@ class Scorer:
         self._estimated += 1
         self._gated += estimate.status in (Status.GATED, Status.DIVERGED)
         self._looks |= estimate.status != Status.PREDICTED
+        self._verdict = estimate.verdict
         self._unused.add(estimate.status, estimate.reason, estimate.frame_id)
         if estimate.innovation.shape[1]:
             seen = estimate.nis > 0  # nothing was measured of the other axes
@@ -158,7 +163,7 @@ class Scorer:
             end_rmse=math.sqrt(self._end.mean), path_rmse=math.sqrt(self._path.mean),
             nis=_consistency(self._nis, self._measurements),
             start_nees=_consistency(self._start_nees, self._states),
-            end_nees=_consistency(self._end_nees, self._states),
+            end_nees=_consistency(self._end_nees, self._states), verdict=self._verdict,
         )  # fmt: skip
 
 
@@ -243,7 +248,10 @@ def score_table(by_name: Mapping[str, Score], only: Container[str] = ()) -> Scor
         norm = "RMSE of states: norm over the states. " if of_states else ""
         notes += [f"{norm}! outside the 95 % bounds of a consistent filter:", bounds]
     rows = {name: [column(each) for column in columns.values()] for name, each in by_name.items()}
-    return ScoreTable(list(columns), rows, [*notes, *unused_lines(by_name)])
+    verdicts = [
+        f"{name}: {each.verdict.text}" for name, each in by_name.items() if each.verdict and each.verdict.exposures
+    ]
+    return ScoreTable(list(columns), rows, [*notes, *unused_lines(by_name), *verdicts])
 
 
 def unused_lines(by_name: Mapping[str, Score]) -> list[str]:

@@ -297,7 +297,7 @@ def _gain(profiles: list[FloatArray], sd: float, noises: list[FloatArray], dark:
         density, left = _densities(profile, sd, noise)
         bright = profile - left > _BRIGHT * profile.max()
         # A density that is not zero takes the noise of one pixel from the residuals.
-        taken = np.count_nonzero(density.reshape(*profile.shape, _FINE).max(axis=-1)[bright] > 0)
+        taken = int(np.count_nonzero(density.reshape(*profile.shape, _FINE).max(axis=-1)[bright] > 0))
         square += float((left[bright] ** 2).sum())
         shine += float((profile - left)[bright].sum())
         count += int(bright.sum())

@@ -4,6 +4,7 @@ which was written, bit for bit."""
 from __future__ import annotations
 
 import math
+from dataclasses import asdict
 from functools import lru_cache
 from typing import TYPE_CHECKING
 
@@ -17,6 +18,7 @@ from aolink.assembly import Frame
 from aolink.errors import RecordingError
 from aolink.estimation import ExposureModel
 from aolink.estimation.estimate import LARGE, AlignmentError, Estimate, Status
+from aolink.estimation.verdict import Fit, Verdict
 from aolink.exposure import Exposure, Truth
 from aolink.limits import limits
 from aolink.numerics.covariance import CORRELATION_STEP, correlation_steps, from_correlation_steps
@@ -39,6 +41,7 @@ _OF_ACT = (
     "frame_id", "first_step", "delay_steps", "late", "reason", "slope_rms", "path_rms", "clipped_steps", "acting",
 )  # fmt: skip
 _OF_RESTORATION = ("frame_id", "estimator", "method", "scene_noise_sd", "path_noise_sd", "reason")
+_OF_VERDICT = ("where", "pixels", "motion", "exposures", "widening", "since", "nis")
 _OF_ESTIMATE = ("estimator", "frame_id", "first_step", "n_steps", "reason")
 
 
@@ -138,7 +141,17 @@ def estimate_message(estimate: Estimate) -> pb.Estimate:
         message.alignment_steps = estimate.alignment.steps
         _fill(message, "alignment_coefficients", estimate.alignment.coefficients)
         _fill(message, "alignment_end_state", estimate.alignment.end_state)
+    if estimate.verdict is not None:
+        message.verdict.CopyFrom(pb.Verdict(**asdict(estimate.verdict)))
     return message
+
+
+def verdict_of(message: pb.Estimate) -> Verdict | None:
+    """The verdict in the message of an estimate, where there is one."""
+    if not message.HasField("verdict"):
+        return None
+    numbers = {name: getattr(message.verdict, name) for name in _OF_VERDICT}
+    return Verdict(fit=Fit(message.verdict.fit), **numbers)
 
 
 def correlated(covariance: NDArray[np.float64]) -> bytes:
@@ -256,7 +269,7 @@ def estimate_from_message(message: pb.Estimate, model: ExposureModel, exposure: 
         end_state=_array(message.end_state, axes, n), end_covariance=_covariance(message, "end_covariance", axes, n),
         coefficients=coefficients, coefficient_covariance=covariance, inputs=exposure.inputs, model=model,
         innovation=_array(message.innovation, axes, m), innovation_covariance=spread, nis=_array(message.nis, axes),
-        alignment=alignment,
+        alignment=alignment, verdict=verdict_of(message),
     )  # fmt: skip
 
 

@@ -15,6 +15,7 @@ from aolink.estimation import Status
 from aolink.estimation.score import UnusedCounter
 from aolink.recording import topics
 from aolink.recording.answers import AnswerCounter, Answers
+from aolink.recording.convert import verdict_of
 from aolink.recording.messages import RecordedMessage
 from aolink.recording.reader import Recording
 from aolink.recording.schemas_pb2 import CommandAnswer, ExposureInfo
@@ -48,6 +49,7 @@ class Counted:
         self._gaps: list[int] = []
         names = recording.estimators
         self._counts, self._unused = dict.fromkeys(names, 0), {name: UnusedCounter() for name in names}
+        self._verdicts: dict[str, dict[str, Any]] = {}
         self._answers = AnswerCounter()
 
     def see(self, recorded: RecordedMessage) -> None:
@@ -64,6 +66,8 @@ class Counted:
         elif isinstance(message, EstimateMessage):
             name = recorded.topic.removeprefix(topics.ESTIMATE)
             self._counts[name] += 1
+            if (verdict := verdict_of(message)) is not None and verdict.exposures:
+                self._verdicts[name] = asdict(verdict) | {"kind": verdict.kind, "text": verdict.text}
             with contextlib.suppress(ValueError):  # a status of a later aolink
                 self._unused[name].add(Status(message.status), message.reason, message.frame_id)
 
@@ -72,7 +76,11 @@ class Counted:
         each estimator, and why some could not use their exposure; what the mirror answered to its commands, and why
         some had no effect."""
         estimates: dict[str, Any] = {
-            name: {"count": count, "unused": [asdict(each) for each in self._unused[name].result()]}
+            name: {
+                "count": count,
+                "unused": [asdict(each) for each in self._unused[name].result()],
+                "verdict": self._verdicts.get(name),
+            }
             for name, count in self._counts.items()
         }
         gaps = {"count": len(self._gaps), "longest_steps": max(self._gaps, default=0)}

@@ -2,7 +2,7 @@ from google.protobuf.internal import containers as _containers
 from google.protobuf.internal import enum_type_wrapper as _enum_type_wrapper
 from google.protobuf import descriptor as _descriptor
 from google.protobuf import message as _message
-from collections.abc import Iterable as _Iterable
+from collections.abc import Iterable as _Iterable, Mapping as _Mapping
 from typing import ClassVar as _ClassVar, Optional as _Optional, Union as _Union
 
 DESCRIPTOR: _descriptor.FileDescriptor
@@ -172,7 +172,7 @@ class Latency(_message.Message):
     def __init__(self, frame_id: _Optional[int] = ..., exposure_end_ns: _Optional[int] = ..., first_byte_ns: _Optional[int] = ..., complete_ns: _Optional[int] = ..., estimated_ns: _Optional[int] = ..., command_sent_ns: _Optional[int] = ..., command_acknowledged_ns: _Optional[int] = ..., command_applied_ns: _Optional[int] = ...) -> None: ...
 
 class Estimate(_message.Message):
-    __slots__ = ("estimator", "frame_id", "first_step", "n_steps", "status", "reason", "axes", "n_states", "n_coefficients", "n_measurements", "end_state", "end_covariance", "coefficients", "coefficient_covariance", "innovation", "innovation_covariance", "nis", "innovation_variance", "correlated_end_covariance", "correlated_coefficient_covariance", "packed_end_covariance", "packed_coefficient_covariance", "alignment_steps", "alignment_coefficients", "alignment_end_state")
+    __slots__ = ("estimator", "frame_id", "first_step", "n_steps", "status", "reason", "axes", "n_states", "n_coefficients", "n_measurements", "end_state", "end_covariance", "coefficients", "coefficient_covariance", "innovation", "innovation_covariance", "nis", "innovation_variance", "correlated_end_covariance", "correlated_coefficient_covariance", "packed_end_covariance", "packed_coefficient_covariance", "alignment_steps", "alignment_coefficients", "alignment_end_state", "verdict")
     class Status(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
         __slots__ = ()
         OK: _ClassVar[Estimate.Status]
@@ -212,6 +212,7 @@ class Estimate(_message.Message):
     ALIGNMENT_STEPS_FIELD_NUMBER: _ClassVar[int]
     ALIGNMENT_COEFFICIENTS_FIELD_NUMBER: _ClassVar[int]
     ALIGNMENT_END_STATE_FIELD_NUMBER: _ClassVar[int]
+    VERDICT_FIELD_NUMBER: _ClassVar[int]
     estimator: str
     frame_id: int
     first_step: int
@@ -237,7 +238,36 @@ class Estimate(_message.Message):
     alignment_steps: float
     alignment_coefficients: _containers.RepeatedScalarFieldContainer[float]
     alignment_end_state: _containers.RepeatedScalarFieldContainer[float]
-    def __init__(self, estimator: _Optional[str] = ..., frame_id: _Optional[int] = ..., first_step: _Optional[int] = ..., n_steps: _Optional[int] = ..., status: _Optional[_Union[Estimate.Status, str]] = ..., reason: _Optional[str] = ..., axes: _Optional[int] = ..., n_states: _Optional[int] = ..., n_coefficients: _Optional[int] = ..., n_measurements: _Optional[int] = ..., end_state: _Optional[_Iterable[float]] = ..., end_covariance: _Optional[_Iterable[float]] = ..., coefficients: _Optional[_Iterable[float]] = ..., coefficient_covariance: _Optional[_Iterable[float]] = ..., innovation: _Optional[_Iterable[float]] = ..., innovation_covariance: _Optional[_Iterable[float]] = ..., nis: _Optional[_Iterable[float]] = ..., innovation_variance: _Optional[_Iterable[float]] = ..., correlated_end_covariance: _Optional[bytes] = ..., correlated_coefficient_covariance: _Optional[bytes] = ..., packed_end_covariance: _Optional[bytes] = ..., packed_coefficient_covariance: _Optional[bytes] = ..., alignment_steps: _Optional[float] = ..., alignment_coefficients: _Optional[_Iterable[float]] = ..., alignment_end_state: _Optional[_Iterable[float]] = ...) -> None: ...
+    verdict: Verdict
+    def __init__(self, estimator: _Optional[str] = ..., frame_id: _Optional[int] = ..., first_step: _Optional[int] = ..., n_steps: _Optional[int] = ..., status: _Optional[_Union[Estimate.Status, str]] = ..., reason: _Optional[str] = ..., axes: _Optional[int] = ..., n_states: _Optional[int] = ..., n_coefficients: _Optional[int] = ..., n_measurements: _Optional[int] = ..., end_state: _Optional[_Iterable[float]] = ..., end_covariance: _Optional[_Iterable[float]] = ..., coefficients: _Optional[_Iterable[float]] = ..., coefficient_covariance: _Optional[_Iterable[float]] = ..., innovation: _Optional[_Iterable[float]] = ..., innovation_covariance: _Optional[_Iterable[float]] = ..., nis: _Optional[_Iterable[float]] = ..., innovation_variance: _Optional[_Iterable[float]] = ..., correlated_end_covariance: _Optional[bytes] = ..., correlated_coefficient_covariance: _Optional[bytes] = ..., packed_end_covariance: _Optional[bytes] = ..., packed_coefficient_covariance: _Optional[bytes] = ..., alignment_steps: _Optional[float] = ..., alignment_coefficients: _Optional[_Iterable[float]] = ..., alignment_end_state: _Optional[_Iterable[float]] = ..., verdict: _Optional[_Union[Verdict, _Mapping]] = ...) -> None: ...
+
+class Verdict(_message.Message):
+    __slots__ = ("fit", "where", "pixels", "motion", "exposures", "nis", "since", "widening")
+    class Fit(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+        __slots__ = ()
+        UNKNOWN: _ClassVar[Verdict.Fit]
+        FITS: _ClassVar[Verdict.Fit]
+        DOES_NOT_FIT: _ClassVar[Verdict.Fit]
+    UNKNOWN: Verdict.Fit
+    FITS: Verdict.Fit
+    DOES_NOT_FIT: Verdict.Fit
+    FIT_FIELD_NUMBER: _ClassVar[int]
+    WHERE_FIELD_NUMBER: _ClassVar[int]
+    PIXELS_FIELD_NUMBER: _ClassVar[int]
+    MOTION_FIELD_NUMBER: _ClassVar[int]
+    EXPOSURES_FIELD_NUMBER: _ClassVar[int]
+    NIS_FIELD_NUMBER: _ClassVar[int]
+    SINCE_FIELD_NUMBER: _ClassVar[int]
+    WIDENING_FIELD_NUMBER: _ClassVar[int]
+    fit: Verdict.Fit
+    where: str
+    pixels: float
+    motion: float
+    exposures: int
+    nis: float
+    since: int
+    widening: float
+    def __init__(self, fit: _Optional[_Union[Verdict.Fit, str]] = ..., where: _Optional[str] = ..., pixels: _Optional[float] = ..., motion: _Optional[float] = ..., exposures: _Optional[int] = ..., nis: _Optional[float] = ..., since: _Optional[int] = ..., widening: _Optional[float] = ...) -> None: ...
 
 class Estimation(_message.Message):
     __slots__ = ("estimator", "frame_id", "skipped", "reason", "took_ns")

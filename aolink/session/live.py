@@ -11,8 +11,10 @@ from foxglove_schemas_protobuf.Log_pb2 import Log
 from aolink.assembly import Frame
 from aolink.devices.interfaces import Time
 from aolink.estimation import Estimate
+from aolink.estimation.verdict import Fit
 from aolink.exposure import Exposure, Picture
-from aolink.recording import topics
+from aolink.recording import convert, topics
+from aolink.recording import schemas_pb2 as pb
 from aolink.rig import Rig
 from aolink.session.estimating import Estimating, Outcome
 from aolink.session.journal import Journal
@@ -90,6 +92,7 @@ class LiveExposures:
             name, frame_id, message = outcome.estimator, outcome.exposure.frame_id, outcome.message
             if message is not None:
                 self._journal.record(topics.estimate_topic(name), message, log_time_ns)
+                self._say_verdict(name, message)
                 if self._control is not None and name == self._serves:
                     self._control(outcome.exposure, outcome.estimate(self._rig), log_time_ns)
                 if self._show is not None:
@@ -105,6 +108,13 @@ class LiveExposures:
                 self._note_failures()
             if len(outcomes_so_far) == len(self._estimating.names):
                 self._settle(frame_id)
+
+    def _say_verdict(self, name: str, message: pb.Estimate) -> None:
+        """Say that the model no longer fits, or that it does."""
+        verdict = convert.verdict_of(message)
+        if verdict is not None and verdict.begins_with(message.frame_id):
+            say = self._journal.warn if verdict.fit is Fit.DOES_NOT_FIT else self._journal.log
+            say(f"{name}, from frame {message.frame_id} on: {verdict.text}")
 
     def _note_failures(self) -> None:
         for name, why in self._estimating.failures.items():

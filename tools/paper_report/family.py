@@ -262,10 +262,10 @@ def exposures_of(scene: Scene, runs: int, exposures: int) -> tuple[Rig, list[Exp
     rig = rig_of(scene, runs, exposures)
     inputs = commands_of(scene, rig.plant, exposures * scene.period)
     made = simulate(rig, exposures, scene.seed, inputs=inputs)
-    return rig, list(_flawed(scene, rig, made))
+    return rig, list(with_flaws(scene, rig, made))
 
 
-def _flawed(scene: Scene, rig: Rig, made: Sequence[Exposure]) -> Iterator[Exposure]:
+def with_flaws(scene: Scene, rig: Rig, made: Sequence[Exposure]) -> Iterator[Exposure]:
     """Exposures without lost frames and masked pixels: the same ones in all runs, as each alone would have them."""
     rng, skipped = np.random.default_rng([20, scene.seed]), SkippedInputs()
     pixels = rig.sensor.profile.pixels

@@ -104,7 +104,9 @@ def _readable(name: str, value: Any) -> tuple[str, str]:
 
 
 def _unused(estimates: Mapping[str, Any]) -> list[str]:
-    return [f"{name}: {Unused(**each).text(of['count'])}" for name, of in estimates.items() for each in of["unused"]]
+    """Why estimators could not use some exposures, and their verdicts on the model."""
+    lines = [f"{name}: {Unused(**each).text(of['count'])}" for name, of in estimates.items() for each in of["unused"]]
+    return lines + [f"{name}: {of['verdict']['text']}" for name, of in estimates.items() if of.get("verdict")]
 
 
 def batch(rows: Sequence[Mapping[str, Any]]) -> Table:

@@ -7,7 +7,7 @@ import time
 from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 from aolink.devices.cameras import pictures
 from aolink.devices.cameras.pictures import check_timing, check_within, checked_corner
@@ -44,7 +44,7 @@ class OpenCVCamera(ThreadCamera):
         OpenCV is not installed or cannot open the source, or size or rate of its pictures are not the rig file's.
     """
 
-    lacks: ClassVar[tuple[Lacks, ...]] = (Lacks.TIME, Lacks.COUNT, Lacks.TRIGGER, Lacks.ROWS)
+    lacks: tuple[Lacks, ...] = (Lacks.TIME, Lacks.COUNT, Lacks.TRIGGER, Lacks.ROWS)
 
     def __init__(self, rig: Rig, *, source: int | str = 0, corner: list[int] | None = None) -> None:
         with needs_extra("opencv", DeviceError):
