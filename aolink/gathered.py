@@ -195,8 +195,8 @@ def nis_bounds(degrees_of_freedom: int) -> tuple[float, float]:
 def incidents_of(before: Exposure | None, step: Step) -> Iterator[tuple[str, str]]:
     """What went wrong with an exposure: the kind of each incident, and a sentence.
 
-    Kinds are `FRAME_INCIDENTS` and, of each estimator, "NAME: " with a word of `REFUSED`, `NO_TIME` or `VERDICT`. Frames are lost
-    after the exposure ``before``.
+    Kinds are `FRAME_INCIDENTS` and, of each estimator, "NAME: " with a word of `REFUSED`, `NO_TIME` or `VERDICT`.
+    Frames are lost after the exposure ``before``.
     """
     e = step.exposure
     lost, incomplete, assumed = FRAME_INCIDENTS
