@@ -100,7 +100,6 @@ def code_blocks(page: Path) -> Iterator[CodeBlock]:
 
 BLOCKS = [block for page in PAGES for block in code_blocks(page)]
 NO_CODE = {
-    "estimator   RMSE": "tests/jobs/test_demo.py compares it with what the demo prints",
     "errors, files, limits, signals": "the list of subpackages",
     "Copyright (c)": "a licence",
     "MIT License": "a licence",

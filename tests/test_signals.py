@@ -19,6 +19,7 @@ from io import TextIOBase
 from pathlib import Path
 from typing import Any, Self
 
+import numpy as np
 import pytest
 
 from aolink.cli.common import app
@@ -26,6 +27,7 @@ from aolink.recording.editing import cut
 from aolink.recording.reader import Recording
 from tests.commands import simulated_rig
 from tests.conftest import Session
+from tests.importing.test_blurred import shaken
 from tests.kinds import must_be
 
 SIGNALS = {signal.SIGINT: 130, signal.SIGTERM: 143, signal.SIGHUP: 129}
@@ -52,6 +54,7 @@ COMMANDS = {
     "report": "report {session} -o a.html",
     "plot": "plot {session} blur -o a.png",
     "identify": "identify {session} -o a.toml",
+    "look": "look {film} -o looked",
 }
 """A call of every command, for the places of files and ports."""
 
@@ -62,6 +65,7 @@ def places(recorded: Session, tmp_path_factory: pytest.TempPathFactory, mmirs: P
     folder = tmp_path_factory.mktemp("places")
     cut(recorded.path, folder / "first.mcap", 0.0, 1.0)
     cut(recorded.path, folder / "second.mcap", 1.0, 2.0)
+    np.savez(folder / "film.npz", frames=np.stack(list(shaken().frames())), rate_hz=50.0, exposure_s=0.018)
     master, slave = pty.openpty()
     with simulated_rig("section-vi", "--real-time") as (camera, mirror):
         yield {
@@ -72,6 +76,7 @@ def places(recorded: Session, tmp_path_factory: pytest.TempPathFactory, mmirs: P
             "reference": str(mmirs / "mmirs_camera2_ref.fits.gz"),
             "camera": camera,
             "mirror": mirror,
+            "film": str(folder / "film.npz"),
             "silent": os.ttyname(slave),
         }
     os.close(master)

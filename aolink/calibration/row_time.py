@@ -25,8 +25,10 @@ _FINER = 4
 """Points of the periodogram for one of the film."""
 _SEEN = 5.0
 """Least share of the largest peak in what the rows vary by, over that of noise alone."""
+IN_STEP = (0.0, 1 / 3, 1 / 2, 2 / 3, 1.0)
+"""Cycles in a frame period with which a harmonic cannot be told from another one, or from its mirror image."""
 _AMBIGUOUS = 0.03
-"""Cycles in a frame period by which nu must differ from whole and half ones."""
+"""Cycles by which nu must differ from these."""
 _ON_RATE = 0.15
 """The most by which nu may differ from that of the light's rate, cycles: clocks of light and camera differ."""
 
@@ -69,9 +71,9 @@ def row_time(light: FloatArray, numbers: IntArray, frame_period_s: float, blink_
             f"a row time needs {_FEWEST_FRAMES} frames of {_FEWEST_ROWS} rows or more, the film has {frames} of {rows}"
         )
     wanted = blink_hz * frame_period_s % 1.0
-    if min(abs(wanted - each) for each in (0.0, 0.5, 1.0)) < _AMBIGUOUS:
+    if min(abs(wanted - each) for each in IN_STEP) < _AMBIGUOUS:
         raise CalibrationError(
-            f"{blink_hz:g} blinks/s are in step with {1 / frame_period_s:g} frames/s or half of them, so that the bands"
+            f"{blink_hz:g} blinks/s are in step with {1 / frame_period_s:g} frames/s, or a half or a third of them, so that the bands"
             " do not say which row comes first: film a light of another rate, such as"
             f" {blink_hz + 0.23 / frame_period_s:.4g} blinks/s"
         )

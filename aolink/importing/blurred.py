@@ -243,6 +243,9 @@ def _densities(profile: FloatArray, sd: float, noise: FloatArray) -> tuple[Float
 def _kernel_and_electrons(profiles: list[FloatArray], dark: float) -> tuple[float, float]:
     """The widest kernel that explains profiles along x and along y, whose noise in the dark is given, and a spot's
     photoelectrons. Shot noise is known once the kernel is, so both are found in turns."""
+    frames, spots, _ = profiles[0].shape
+    some = np.unique(np.linspace(0, frames - 1, max(_KERNEL_FRAMES // spots, 24)).round().astype(int))
+    profiles = [profile[some] for profile in profiles]
     # With too much noise the kernel is too wide at first, and what it leaves says so; with too little all that is left
     # would be taken for a kernel that is too wide.
     gain = _NOISIEST**2 * max(float(profile.max()) for profile in profiles)
@@ -263,12 +266,11 @@ def _noise(profile: FloatArray, dark: float, gain: float) -> FloatArray:
 
 def _kernel(profiles: list[FloatArray], noises: list[FloatArray]) -> float:
     """The widest kernel that explains the profiles along x and along y, (frames, n, pixels) each."""
-    some = np.unique(np.linspace(0, len(profiles[0]) - 1, _KERNEL_FRAMES).round().astype(int))
     widest = math.inf
     for profile, noise in zip(profiles, noises, strict=True):
 
         @cache
-        def misfit(k: int, profile: FloatArray = profile[some], noise: FloatArray = noise[some]) -> FloatArray:
+        def misfit(k: int, profile: FloatArray = profile, noise: FloatArray = noise) -> FloatArray:
             """Squares of each frame's residuals, over their noise: a density that is not zero takes one away."""
             density, left = _densities(profile, float(_WIDTHS[k]), noise)
             taken = np.count_nonzero(density > 0, axis=2)

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from aolink.calibration.row_time import row_time
+from aolink.calibration.row_time import IN_STEP, row_time
 from aolink.errors import CalibrationError
 from aolink.numerics.arrays import FloatArray
 
@@ -50,7 +50,7 @@ def test_it_is_found_with_its_standard_deviation(row_time_s):
 @given(blink=st.floats(110, 380), readout=st.floats(-0.9, 0.9))
 def test_its_sign_follows_from_the_rate_of_the_light(blink, readout):
     phase = blink * PERIOD_S % 1
-    if min(abs(phase - each) for each in (0, 0.5, 1)) < 0.04 or abs(readout) < 0.05:
+    if min(abs(phase - each) for each in IN_STEP) < 0.04 or abs(readout) < 0.05:
         return
     true = readout * PERIOD_S / ROWS
     found = row_time(blinking(true, blink, 3), np.arange(30), PERIOD_S, blink)

@@ -115,9 +115,9 @@ def test_a_window_without_a_dark_pixel_has_no_pedestal_of_its_own() -> None:
     ("line", "says"),
     [
         ("defects = [[0, 40]]", r"\[0, 40\], outside the 1 x 40 pixels"),
-        ("defects = [3]", r"a list of \[row, column\]"),
-        ("defects = [[0, -1]]", r"a list of \[row, column\]"),
-        ("defects = [[0, 1.5]]", r"a list of \[row, column\]"),
+        ("defects = [3]", r"sensor.defects\[0\]: expected a list of 2, found 3"),
+        ("defects = [[0, -1]]", r"sensor.defects\[0\]\[1\] = -1 must be at least 0"),
+        ("defects = [[0, 1.5]]", r"sensor.defects\[0\]\[1\]: expected a whole number, found 1.5"),
         ('pedestal = "yes"', "known.*free"),
         ("defect = [[0, 1]]", "defects"),
     ],

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -48,10 +49,10 @@ def rig() -> Rig:
 
 @pytest.fixture(scope="module")
 def right(rig: Rig) -> list[Exposure]:
-    return simulate(rig, EXPOSURES, seed=5)
+    return list(simulate(rig, EXPOSURES, seed=5))
 
 
-def estimates_of(rig: Rig, exposures: list[Exposure], name: str = "moments", judged: bool = True) -> list[Estimate]:
+def estimates_of(rig: Rig, exposures: Sequence[Exposure], name: str = "moments", judged: bool = True) -> list[Estimate]:
     estimator = make_estimator(rig, name)
     if not judged:
         estimator.judge = None

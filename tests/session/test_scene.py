@@ -146,7 +146,7 @@ def test_a_bad_link_costs_scenes_their_own_pixels_and_is_reproducible(tmp_path: 
 
 
 def test_a_camera_with_another_scene_is_refused(tmp_path: Path) -> None:
-    other = replace(RIG, scene=replace(SCENE, shape=(128, 64)))
+    other = replace(RIG, scene=replace(SCENE, pixels=(128, 64)))
     with simulated_rig("moving-scene") as (camera, mirror):
         scene_less = replace(RIG, scene=None)
         for rig, found in ((other, r"\(128, 64\) in the file, \(128, 128\)"), (scene_less, r"\(0, 0\) in the")):

@@ -130,7 +130,9 @@ class _Fit:
         """Where a fit begins: the likeliest component of an estimate, otherwise its mean, (axes, n)."""
         if estimate.components is not None:
             each = (estimate.components.of(axis) for axis in axes.tolist())
-            return np.stack([mean[np.argmax(log_weight)] for log_weight, mean, _ in each])
+            likeliest = np.stack([mean[np.argmax(log_weight)] for log_weight, mean, _ in each])
+            if likeliest.shape[1] == self.reduced.expand.shape[1]:  # `sampled` has more coefficients
+                return likeliest
         z = estimate.coefficients[axes]
         return z @ self.reduced.expand[: z.shape[1]]
 
