@@ -73,8 +73,8 @@ def row_time(light: FloatArray, numbers: IntArray, frame_period_s: float, blink_
     wanted = blink_hz * frame_period_s % 1.0
     if min(abs(wanted - each) for each in IN_STEP) < _AMBIGUOUS:
         raise CalibrationError(
-            f"{blink_hz:g} blinks/s are in step with {1 / frame_period_s:g} frames/s, or a half or a third of them, so that the bands"
-            " do not say which row comes first: film a light of another rate, such as"
+            f"{blink_hz:g} blinks/s are in step with {1 / frame_period_s:g} frames/s, or a half or a third of them, so"
+            " that the bands do not say which row comes first: film a light of another rate, such as"
             f" {blink_hz + 0.23 / frame_period_s:.4g} blinks/s"
         )
     mean = light.mean(axis=0)
