@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from paper_report.judge import Row
 
 TOOLS = Path(__file__).parents[2] / "tools"
-CHEAP_SCENES = (100000, 100001)
+CHEAP_SCENES = (160003, 160005)
 """Reporting scenes of which the repository keeps rows."""
 
 
@@ -125,7 +125,7 @@ def test_rows_that_the_repository_keeps_are_those_of_todays_code() -> None:
     assert {seed for seed, _ in kept} <= set(SEEDS["reporting"])
     assert all(row.commit and not row.commit.endswith("+") for row in kept.values())
     for seed in CHEAP_SCENES:
-        for row in judge(draw(seed), ["open-loop", "o1", "moments"], Size()):
+        for row in judge(draw(seed), ["open-loop", "o1", "moments"], Size(runs=8)):
             there = kept[seed, row.estimator]
             assert (there.states, there.scored, there.statuses) == (row.states, row.scored, row.statuses)
             np.testing.assert_allclose([row.path, row.nees], [there.path, there.nees], rtol=1e-3)

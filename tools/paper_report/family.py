@@ -26,7 +26,7 @@ from aolink.rig import Drive, Plant, Rig, Timing, load_rig
 from aolink.simulation.model import simulate
 from paper_report.ensemble import SensorRows
 
-SEEDS = {"tuning": range(100_000), "reporting": range(100_000, 200_000)}
+SEEDS = {"tuning": range(100_000), "reporting": range(160_000, 200_000)}
 """Ranges of seeds by name; each judgement takes the first ones of its range."""
 
 MODES = (1, MOST_MODES)
