@@ -17,6 +17,7 @@ import numpy as np
 
 from aolink.errors import IdentificationError, ImportingError
 from aolink.estimation import make_estimator, run
+from aolink.estimation.verdict import Fit
 from aolink.exposure import Exposure
 from aolink.films.film import Film
 from aolink.identification import FEWEST, Identified, Maximum, Piece, Readings, kinds_of, maxima, readings
@@ -86,8 +87,8 @@ class Direction:
     """The same of the centroid, taken for the whole exposure."""
     path: FloatArray | None = None
     """The path in each exposure, pixels of the window, (frames, n, steps)."""
-    nis: float = math.nan
-    """NIS of the path's estimates, over what it is where the model is right."""
+    misfit: str = ""
+    """The estimator's verdict on the model in words; empty unless it does not fit."""
 
     @property
     def size(self) -> float:
@@ -280,14 +281,15 @@ def _identified(
     settled = [one for each in each_film for one in each[_SETTLED:]]
     error = float(np.mean(np.square([each.path_sd for each in settled])))
     within = float(np.mean((path[_SETTLED:] - path[_SETTLED:].mean(axis=2, keepdims=True)) ** 2))
-    nis = np.concatenate([each.nis[each.nis > 0] / each.innovation.shape[1] for each in settled])
+    verdicts = [each[-1].verdict for each in each_film]
+    misfits = [each.text for each in verdicts if each is not None and each.fit is Fit.DOES_NOT_FIT]
     return replace(
         direction,
         found=found,
         known=scene.unit * math.sqrt(error),
         held=scene.unit * math.sqrt(within + error),
         path=scene.unit * (path + 1) - 0.5,
-        nis=float(np.median(nis)) if len(nis) else math.nan,
+        misfit=misfits[0] if misfits else "",
     ), sd
 
 
@@ -495,6 +497,9 @@ def _doubts(spots: Spots, directions: Sequence[Direction], sd: float, *, given: 
             " from the steep sides of the blur alone, and holds for a Gaussian spot only; if a spot at rest is wider,"
             " frequencies may be wrong: give its width with --kernel"
         )
+    for each in directions:
+        if each.misfit:
+            yield f"along {each.name} {each.misfit}"
     if spots.saturated > 0.001:
         yield f"{spots.saturated:.1%} of the pixels about the spots are saturated or hot and are left out: expose less"
     if spots.at_edge:
