@@ -90,7 +90,7 @@ def read(path: str | Path, side: Sequence[str | Path] = (), *, rig: Rig | str | 
 
 
 def simulate(rig: Rig | str | Path, n_exposures: int, seed: int | None = None) -> Series:
-    """Exposures of a simulated rig with their truth, in memory: the model behind `aolink rig`, without a wire.
+    """Exposures of a simulated rig with their truth, in memory: the model behind `aolink sim`, without a wire.
 
     Parameters
     ----------

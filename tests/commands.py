@@ -119,7 +119,7 @@ def simulated_rig(rig: str | Path, *options: str) -> Iterator[tuple[str, str]]:
     """`aolink.jobs.demo.simulated_rig`, without the time that its process takes to load."""
     their_input, our_end = os.pipe()
     ours, their_output = os.pipe()
-    arguments = ["rig", str(rig), "--json", "--tied", *options]
+    arguments = ["sim", str(rig), "--json", "--tied", *options]
     process = command_server().start(arguments, Path.cwd(), [their_input, their_output, 2])
     os.close(their_input)
     os.close(their_output)

@@ -111,7 +111,7 @@ def test_only_plain_files_are_written(tmp_path: Path, overwrite: bool) -> None:
 
 def test_a_command_does_not_wait_for_a_pipe(aolink: Run, recorded: Session, tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "a.mcap")
-    refused = aolink("cut", recorded.path, "-o", "a.mcap", "--overwrite")
+    refused = aolink("copy", recorded.path, "-o", "a.mcap", "--overwrite")
     assert refused.returncode == 5
     assert refused.stderr.startswith("aolink: a.mcap is a named pipe")
 

@@ -55,7 +55,7 @@ SHORTER = {
     "[--view]": "",  # nor has it here
 }
 """What is changed about a command before it is run: times, and what needs a screen."""
-EXIT_CODES = {"aolink recover broken.mcap": 1}
+EXIT_CODES = {"aolink copy broken.mcap": 1}
 """Exit codes of commands that do not end with 0, as the page says beside them."""
 BY_CI = ("sh tools/demo", "sh tools/test")
 """They set everything up, so that CI runs them and no test can."""

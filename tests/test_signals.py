@@ -34,7 +34,8 @@ SIGNALS = {signal.SIGINT: 130, signal.SIGTERM: 143, signal.SIGHUP: 129}
 _PATIENCE_S = 120.0
 
 COMMANDS = {
-    "rig": "rig section-vi --real-time",
+    "sim": "sim section-vi --real-time",
+    "rig": "rig section-vi --check",
     "devices": "devices {silent}",
     "record": "record --camera {camera} --mirror {mirror} --rig section-vi -o a.mcap",
     "replay": "replay {session} -e o1 --rate 0.01",
@@ -43,16 +44,13 @@ COMMANDS = {
     "info": "info {session} --check",
     "estimate": "estimate {session} -e moments -o a.mcap",
     "compare": "compare {session}",
-    "recover": "recover {session} -o a.mcap",
-    "cut": "cut {session} -o a.mcap",
-    "merge": "merge {first} {second} -o a.mcap",
+    "copy": "copy {first} {second} -o a.mcap",
     "deblur": "deblur {session} -e o1 -o a.mcap",
     "import": "import {session} -o a.mcap --rig section-vi-lively --overwrite",
     "export": "export {session} -o a.npz",
     "slopes": "slopes {frame} --reference {reference} -o a.npz",
     "view": "view {session} --save a.rrd",
     "report": "report {session} -o a.html",
-    "plot": "plot {session} blur -o a.png",
     "identify": "identify {session} -o a.toml",
     "look": "look {film} -o looked",
 }
@@ -186,11 +184,11 @@ def test_a_signal_that_comes_where_nothing_can_be_caught_is_not_lost(tmp_path: P
 
 
 MIDST: dict[str, Callable[[Started], bool]] = {
-    "rig": lambda it: "camera" in must_be(TextIOBase, it.process.stdout).readline(),
+    "sim": lambda it: "camera" in must_be(TextIOBase, it.process.stdout).readline(),
     "record": lambda it: (it.folder / "a.mcap").exists() and (it.folder / "a.mcap").stat().st_size > 30_000,
     "calibrate": lambda it: "dark: cover the camera" in must_be(TextIOBase, it.process.stderr).read(30),
     "demo": lambda it: bool(it.unfinished()) and any("session.rrd" in each.name for each in it.unfinished()),
-    **dict.fromkeys(("estimate", "recover", "slopes", "view"), lambda it: bool(it.unfinished())),
+    **dict.fromkeys(("estimate", "copy", "slopes", "view"), lambda it: bool(it.unfinished())),
 }
 """What shows that a command is in the midst of its work; that of the others shows nowhere."""
 
@@ -252,7 +250,7 @@ def test_a_terminal_that_closes_ends_a_command(tmp_path: Path) -> None:
         fcntl.ioctl(slave, termios.TIOCSCTTY, 0)
 
     with subprocess.Popen(
-        [sys.executable, "-m", "aolink", "rig", "section-vi", "--real-time"], stdin=slave, stdout=slave, stderr=slave,
+        [sys.executable, "-m", "aolink", "sim", "section-vi", "--real-time"], stdin=slave, stdout=slave, stderr=slave,
         cwd=tmp_path, preexec_fn=take_terminal,
     ) as process:  # fmt: skip
         os.close(slave)

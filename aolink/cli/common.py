@@ -7,9 +7,10 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from typer.core import TyperGroup
 
 from aolink.cli.terminal import PlainConsole, progress_bar
 from aolink.errors import EstimatorError, PortError, RigError
@@ -22,7 +23,38 @@ if TYPE_CHECKING:
     from aolink.rig import Rig
 
 
+_GONE = {
+    "cut": "copy FILE --start S --end S -o PART.mcap", "merge": "copy FILE FILE... -o SESSION.mcap",
+    "recover": "copy FILE -o WHOLE.mcap", "plot": "report FILE --figure NAME -o X.pdf",
+}  # fmt: skip
+"""What does the same as a command of the release before."""
+
+
+_GROUPS = {
+    "A session": ("record", "info", "view", "estimate", "report"),
+    "Your own film": ("look", "import"),
+    "Rig and devices": ("rig", "devices", "calibrate", "identify", "sim", "demo"),
+    "Recordings": ("replay", "compare", "copy", "export"),
+    "Pictures": ("deblur", "slopes"),
+}
+"""The commands in the order in which `--help` lists them, the most used ones first."""
+
+
+class _Commands(TyperGroup):
+    def list_commands(self, ctx: Any) -> list[str]:
+        for group, names in _GROUPS.items():
+            for name in names:
+                self.commands[name].rich_help_panel = group  # type: ignore[attr-defined] # of Typer's commands
+        return [name for names in _GROUPS.values() for name in names]
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        if args and args[0] in _GONE:
+            raise typer.BadParameter(f"{args[0]} is now: aolink {_GONE[args[0]]}")
+        return super().resolve_command(ctx, args)
+
+
 app = typer.Typer(
+    cls=_Commands,
     no_args_is_help=True,
     add_completion=True,
     pretty_exceptions_enable=False,

@@ -1,4 +1,4 @@
-"""Commands that draw recordings on paper and on a page: plot, report."""
+"""The command that draws recordings on a page or on paper: report."""
 
 from enum import StrEnum
 from pathlib import Path
@@ -15,17 +15,25 @@ if TYPE_CHECKING:
     from aolink.recording.reader import Recording
 
 
-What = StrEnum("What", ["BLUR", "EXPOSURE", "NIS", "ERRORS", "LOSSES", "LATENCY", "PUPIL", "SCENE"])
-"""The figures that `aolink plot` draws: those of `aolink.plotting.FIGURES`."""
-
-StepsOption = Annotated[bool, typer.Option("--steps", help="Count fast steps on time axes, not seconds.")]
+Figure = StrEnum("Figure", ["BLUR", "EXPOSURE", "NIS", "ERRORS", "LOSSES", "LATENCY", "PUPIL", "SCENE"])
+"""The figures that can be drawn alone: those of `aolink.plotting.FIGURES`."""
 
 
-@app.command(epilog="Example: aolink plot session.mcap exposure -o exposure.pdf --width-mm 180")
-def plot(
-    file: Annotated[str, typer.Argument(help="A recording: a file, or a URL.", metavar="FILE")],
-    what: Annotated[What, typer.Argument(help="The figure.")],
-    output: Annotated[Path, typer.Option("--output", "-o", metavar="X.png|svg|pdf", help="The picture to write.")],
+@app.command(
+    epilog="Example: aolink report session.mcap -o report.html"
+    "  |  aolink report session.mcap results/session.o3.mcap -o report.html"
+    "  |  aolink report session.mcap --figure exposure -o exposure.pdf --width-mm 88"
+)
+def report(
+    context: typer.Context,
+    files: Annotated[
+        list[str], typer.Argument(metavar="FILE...", help="Recordings, folders of them, and their side files.")
+    ],
+    output: Annotated[
+        Path,
+        typer.Option("--output", "-o", metavar="FILE", help="The page to write, X.html; of a figure X.png|svg|pdf."),
+    ],
+    figure: Annotated[Figure | None, typer.Option(help="Draw this figure alone, in a paper's size.")] = None,
     estimator: EstimatorOption = None,
     exposure: Annotated[
         int | None,
@@ -34,61 +42,56 @@ def plot(
         ),
     ] = None,
     lenslet: LensletOption = None,
-    side: Annotated[
-        list[str] | None,
-        typer.Option("--side", metavar="FILE", help="A side file: its estimates instead of the recording's own."),
-    ] = None,
-    steps: StepsOption = False,
+    steps: Annotated[bool, typer.Option("--steps", help="Count fast steps on time axes, not seconds.")] = False,
     width_mm: Annotated[float, typer.Option(min=30, max=1000, help="Width on paper; 88 fits a column.")] = 180.0,
-    overwrite: OverwriteOption = False,
-) -> None:
-    """Draw one figure of a recording in a paper's size.
-
-    blur: the camera's blur over the session, and the paths. exposure: one exposure's path over its blur, the path's
-    histogram and the intensity profile. nis, errors, losses, latency: along the session. pupil: maps over the
-    lenslets. scene: a picture as it came, restored, and at rest.
-    """
-    from aolink.plotting.files import FORMATS, save_figure
-    from aolink.recording.remote import location
-
-    if output.suffix.lower() not in FORMATS:
-        raise ExportError(f"cannot write {output}: a figure is a {', '.join(FORMATS)} file; give such a name")
-    recording = open_recording(file, side=[location(each) for each in side or ()])
-    check_target(output, overwrite=overwrite, sources=recording.files, error=ExportError)
-    spot = common.spot_of(recording.rig.sensor, lenslet) if lenslet else 0
-    with progress("read", recording.n_frames) as tell:
-        save_figure(
-            recording, what.value, output, estimators=estimator, exposure=exposure,
-            output=2 * spot, spot=spot, unit="steps" if steps else "s", width_mm=width_mm, overwrite=overwrite,
-            progress=tell,
-        )  # fmt: skip
-    stdout.print(f"written: {output}", markup=False)
-
-
-@app.command(
-    epilog="Example: aolink report session.mcap -o report.html"
-    "  |  aolink report session.mcap results/session.o3.mcap -o report.html"
-)
-def report(
-    files: Annotated[
-        list[str], typer.Argument(metavar="FILE...", help="Recordings, folders of them, and their side files.")
-    ],
-    output: Annotated[Path, typer.Option("--output", "-o", metavar="X.html", help="The page to write.")],
-    steps: StepsOption = False,
     overwrite: OverwriteOption = False,
 ) -> None:
     """Write a page about a session: how good the estimates are, the most telling exposures, what was lost.
 
-    One file of HTML with everything in it. Two or three recordings stand side by side; for more there is a table.
+    One file of HTML with everything in it. Two or three recordings stand side by side; for more there is a table. With
+    --figure, one figure. blur: the camera's blur over the session, and the paths. exposure: one exposure's path over
+    its blur, the path's histogram and the intensity profile. nis, errors, losses, latency: along the session. pupil:
+    maps over the lenslets. scene: a picture as it came, restored, and at rest.
     """
     from aolink.plotting.report import write_report
 
+    if figure is not None:
+        _draw(files, output, figure, estimator, exposure, lenslet, steps=steps, width_mm=width_mm, overwrite=overwrite)
+        return
+    for name in ("estimator", "exposure", "lenslet", "width_mm"):
+        source = context.get_parameter_source(name)
+        if source is not None and source.name == "COMMANDLINE":
+            raise typer.BadParameter(f"--{name.replace('_', '-')} goes with --figure NAME")
     check_target(output, overwrite=overwrite, suffix=".html", error=ExportError)
     recordings = _with_sides(_in_folders(files))
     with progress("read", None) as tell:
         write_report(
             recordings, output, unit="steps" if steps else "s", overwrite=overwrite,
             progress=lambda name, done: tell(done, name),
+        )  # fmt: skip
+    stdout.print(f"written: {output}", markup=False)
+
+
+def _draw(
+    files: list[str], output: Path, figure: Figure, estimators: list[str] | None, exposure: int | None,
+    lenslet: str | None, *, steps: bool, width_mm: float, overwrite: bool,
+) -> None:  # fmt: skip
+    """Draw one figure of a recording, of its side files' estimates where some are given."""
+    from aolink.plotting.files import FORMATS, save_figure
+
+    if output.suffix.lower() not in FORMATS:
+        raise ExportError(f"cannot write {output}: a figure is a {', '.join(FORMATS)} file; give such a name")
+    recordings = _with_sides(_in_folders(files))
+    if len(recordings) != 1:
+        raise typer.BadParameter(f"--figure draws one recording, {len(recordings)} are given")
+    (recording,) = recordings
+    check_target(output, overwrite=overwrite, sources=recording.files, error=ExportError)
+    spot = common.spot_of(recording.rig.sensor, lenslet) if lenslet else 0
+    with progress("read", recording.n_frames) as tell:
+        save_figure(
+            recording, figure.value, output, estimators=estimators, exposure=exposure,
+            output=2 * spot, spot=spot, unit="steps" if steps else "s", width_mm=width_mm, overwrite=overwrite,
+            progress=tell,
         )  # fmt: skip
     stdout.print(f"written: {output}", markup=False)
 

@@ -1,4 +1,4 @@
-"""Commands on recordings: info, compare, recover, cut, merge."""
+"""Commands on recordings: info, compare, copy."""
 
 import json
 import math
@@ -102,55 +102,42 @@ def compare(
         raise typer.Exit(1)
 
 
-@app.command(epilog="Example: aolink recover broken.mcap -o whole.mcap")
-def recover(
-    file: common.FileArgument, output: OutputOption, overwrite: OverwriteOption = False, as_json: JsonOption = False
-) -> None:
-    """Save the undamaged part of a damaged or unfinished recording. Exit code 1 if something was lost."""
-    from aolink.recording.editing import recover as recover_recording
-
-    with progress("exposures", None) as tell:
-        edited = recover_recording(file, output, overwrite=overwrite, progress=tell)
-    _print_edited(edited, as_json)
-    if edited.losses:
-        raise typer.Exit(1)
-
-
-@app.command(epilog="Example: aolink cut session.mcap --start 10 --end 20 -o part.mcap")
-def cut(
-    file: common.FileArgument,
+@app.command(
+    epilog="Example: aolink copy session.mcap --start 10 --end 20 -o part.mcap"
+    "  |  aolink copy session-001.mcap session-002.mcap -o session.mcap  |  aolink copy broken.mcap -o whole.mcap"
+)
+def copy(
+    files: Annotated[
+        list[Path],
+        typer.Argument(metavar="FILE...", help="A recording, or the parts of one session.", parser=common.local_file),
+    ],
     output: OutputOption,
     start: CutTime = None,
     end: CutTime = None,
     overwrite: OverwriteOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Copy the exposures between two times, with the commands that belong to them."""
-    from aolink.recording.editing import cut as cut_recording
+    """Copy what is whole of a recording, a part of it between two times, or the parts of a session joined to one.
 
+    Of a damaged or unfinished recording the undamaged part is copied; exit code 1 if something was lost. Messages that
+    several parts hold are written once.
+    """
+    from aolink.recording import editing
+
+    timed = start is not None or end is not None
+    if timed and len(files) > 1:
+        raise typer.BadParameter("--start and --end cut one recording: join the parts first")
     with progress("exposures", None) as tell:
-        edited = cut_recording(
-            file, output, start or 0.0, math.inf if end is None else end,
-            overwrite=overwrite, progress=tell,
-        )  # fmt: skip
+        if len(files) > 1:
+            edited = editing.merge(files, output, overwrite=overwrite, progress=tell)
+        elif timed:
+            until = math.inf if end is None else end
+            edited = editing.cut(files[0], output, start or 0.0, until, overwrite=overwrite, progress=tell)
+        else:
+            edited = editing.recover(files[0], output, overwrite=overwrite, progress=tell)
     _print_edited(edited, as_json)
-
-
-@app.command(epilog="Example: aolink merge session-001.mcap session-002.mcap -o session.mcap")
-def merge(
-    files: Annotated[
-        list[Path], typer.Argument(metavar="FILE...", help="The parts of one session.", parser=common.local_file)
-    ],
-    output: OutputOption,
-    overwrite: OverwriteOption = False,
-    as_json: JsonOption = False,
-) -> None:
-    """Join the parts of one session; messages that several of them hold are written once."""
-    from aolink.recording.editing import merge as merge_recordings
-
-    with progress("exposures", None) as tell:
-        edited = merge_recordings(files, output, overwrite=overwrite, progress=tell)
-    _print_edited(edited, as_json)
+    if edited.losses and not timed and len(files) == 1:
+        raise typer.Exit(1)
 
 
 def _print_edited(edited: "Edited", as_json: bool) -> None:

@@ -1,4 +1,4 @@
-"""Commands about rigs and their devices: rig, devices."""
+"""Commands about rigs and their devices: rig, sim, devices."""
 
 import json
 from collections import Counter
@@ -36,25 +36,6 @@ def rig(
     exposure_scan: Annotated[
         bool, typer.Option("--exposure-scan", help="Print the error of o1 to expect at other exposure times, and end.")
     ] = False,
-    real_time: Annotated[bool, typer.Option("--real-time", help="Run in real time, not on virtual time.")] = False,
-    seed: Annotated[int | None, typer.Option(help="Instead of the rig file's seed.", min=0)] = None,
-    listen: Annotated[
-        str | None, typer.Option(metavar="HOST:PORT", help="Serve TCP ports, to this machine only, not terminals.")
-    ] = None,
-    key: KeyOption = None,
-    allow_remote: common.RemoteOption = False,
-    light: Annotated[
-        str | None,
-        typer.Option(
-            metavar="KIND,...",
-            help="What the camera sees, start by start: dark, flat, flat:DENSITY, still, moving; the last stays.",
-        ),
-    ] = None,
-    fault: Annotated[
-        list[str] | None,
-        typer.Option(metavar="NAME=VALUE", help="A fault of the line or the devices: bitflip=1e-6, stall=0.01, ..."),
-    ] = None,
-    tied: Annotated[bool, typer.Option("--tied", help="End when standard input ends, for a parent process.")] = False,
     film: Annotated[
         Path | None,
         typer.Option(
@@ -74,8 +55,8 @@ def rig(
     overwrite: OverwriteOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Run a simulated rig: print its two ports and serve them until stopped (Ctrl-C)."""
-    from aolink.rig import builtin_rigs, load_rig, parse_light, with_faults
+    """Check a rig file, list the rigs that come along, or write a first rig file for a film."""
+    from aolink.rig import builtin_rigs, load_rig
 
     if listed:
         for name in builtin_rigs():
@@ -94,37 +75,7 @@ def rig(
     if exposure_scan:
         _print_scan(load_rig(rig), as_json)
         return
-    loaded = load_checked(rig)
-    if light is not None:
-        loaded = replace(loaded, simulation=replace(loaded.simulation, light=parse_light(light, "--light")))
-    if fault:
-        faults = with_faults(loaded.simulation.faults, fault)
-        loaded = replace(loaded, simulation=replace(loaded.simulation, faults=faults))
-    from aolink.simulation.server import RigServer
-    from aolink.simulation.streams import open_streams
-
-    with StopRequest().installed() as stop, ExitStack() as stack:
-        links = None
-        if loaded.simulation.faults.vanish_rate:
-            links = Path(stack.enter_context(TemporaryDirectory(prefix="aolink-rig-")))
-        streams = open_streams(listen, links=links)
-        server = RigServer(loaded, streams, seed=seed, real_time=real_time)
-        ports = {line: stream.name for line, stream in streams.items()}
-        if as_json:
-            print(json.dumps(ports), flush=True)
-        else:
-            for line, name in ports.items():
-                print(f"{line}  {name}")
-            print(
-                f"rig {loaded.name}, {'real' if real_time else 'virtual'} time; to record 100 exposures from it:\n"
-                f"  {program()} record --camera {ports['camera']} --mirror {ports['mirror']} --rig {rig}"
-                " --estimator moments --exposures 100 -o session.mcap\nCtrl-C stops it.",
-                flush=True,
-            )
-        server.run(lambda: stop() or (tied and input_ended()))
-        for stream in streams.values():
-            stream.close()
-    stop.raise_if_asked()
+    raise typer.BadParameter(f"say what of {rig}: --check it, or serve it with `aolink sim {rig}`")
 
 
 _OF_FILMS = frozenset(("rate", "frames", "track", "at", "invert", "gamma", "topic", "overwrite"))
@@ -186,6 +137,66 @@ def _print_findings(loaded: "Rig", as_json: bool) -> None:
         raise typer.Exit(RigError.exit_code)
 
 
+@app.command(epilog="Example: aolink sim section-vi  |  aolink sim my.toml --real-time --fault bitflip=1e-6")
+def sim(
+    rig: RigArgument,
+    real_time: Annotated[bool, typer.Option("--real-time", help="Run in real time, not on virtual time.")] = False,
+    seed: Annotated[int | None, typer.Option(help="Instead of the rig file's seed.", min=0)] = None,
+    listen: Annotated[
+        str | None, typer.Option(metavar="HOST:PORT", help="Serve TCP ports, to this machine only, not terminals.")
+    ] = None,
+    key: KeyOption = None,
+    allow_remote: common.RemoteOption = False,
+    light: Annotated[
+        str | None,
+        typer.Option(
+            metavar="KIND,...",
+            help="What the camera sees, start by start: dark, flat, flat:DENSITY, still, moving; the last stays.",
+        ),
+    ] = None,
+    fault: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME=VALUE", help="A fault of the line or the devices: bitflip=1e-6, stall=0.01, ..."),
+    ] = None,
+    tied: Annotated[bool, typer.Option("--tied", help="End when standard input ends, for a parent process.")] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Run a simulated rig: print its two ports and serve them until stopped (Ctrl-C)."""
+    from aolink.rig import parse_light, with_faults
+
+    loaded = load_checked(rig)
+    if light is not None:
+        loaded = replace(loaded, simulation=replace(loaded.simulation, light=parse_light(light, "--light")))
+    if fault:
+        faults = with_faults(loaded.simulation.faults, fault)
+        loaded = replace(loaded, simulation=replace(loaded.simulation, faults=faults))
+    from aolink.simulation.server import RigServer
+    from aolink.simulation.streams import open_streams
+
+    with StopRequest().installed() as stop, ExitStack() as stack:
+        links = None
+        if loaded.simulation.faults.vanish_rate:
+            links = Path(stack.enter_context(TemporaryDirectory(prefix="aolink-rig-")))
+        streams = open_streams(listen, links=links)
+        server = RigServer(loaded, streams, seed=seed, real_time=real_time)
+        ports = {line: stream.name for line, stream in streams.items()}
+        if as_json:
+            print(json.dumps(ports), flush=True)
+        else:
+            for line, name in ports.items():
+                print(f"{line}  {name}")
+            print(
+                f"rig {loaded.name}, {'real' if real_time else 'virtual'} time; to record 100 exposures from it:\n"
+                f"  {program()} record --camera {ports['camera']} --mirror {ports['mirror']} --rig {rig}"
+                " --estimator moments --exposures 100 -o session.mcap\nCtrl-C stops it.",
+                flush=True,
+            )
+        server.run(lambda: stop() or (tied and input_ended()))
+        for stream in streams.values():
+            stream.close()
+    stop.raise_if_asked()
+
+
 @app.command(epilog="Example: aolink devices /dev/ttyACM0 socket://192.168.1.5:5000")
 def devices(
     ports: Annotated[
@@ -207,7 +218,7 @@ def devices(
         for name, text in listed:
             stdout.print(f"{name}  {escape(text)}")
         if not listed:
-            stdout.print("no serial ports on this machine; `aolink rig section-vi` makes a simulated pair")
+            stdout.print("no serial ports on this machine; `aolink sim section-vi` makes a simulated pair")
         for each in drivers:
             stdout.print(f"{each.kind} driver {each.name}{': ' if each.problem else ''}{escape(each.problem)}")
             for lack in each.lacks:

@@ -49,7 +49,7 @@ def mcap_film(path: Path, topic: str | None) -> Film:
         if _is_cut_off(file):
             raise ImportingError(
                 f"{path} has no end: it was cut off, or is still being written. `mcap recover` saves what is whole"
-                " of it (`aolink recover`, where it is a recording of aolink)"
+                " of it (`aolink copy`, where it is a recording of aolink)"
             )
         summary = make_reader(file, validate_crcs=True).get_summary()
         kinds = set[tuple[str, str]]()

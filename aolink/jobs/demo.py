@@ -69,14 +69,14 @@ def usual_estimators(rig: Rig, control: str = "") -> list[str]:
 
 @contextlib.contextmanager
 def simulated_rig(rig: str | Path, *options: str) -> Iterator[tuple[str, str]]:
-    """A simulated rig as a process of its own, `aolink rig` with ``options``; gives the ports of camera and mirror.
+    """A simulated rig as a process of its own, `aolink sim` with ``options``; gives the ports of camera and mirror.
 
     Raises
     ------
     DeviceError
         The process does not start.
     """
-    command = [sys.executable, "-P", "-m", "aolink", "rig", str(rig), "--json", "--tied", *options]
+    command = [sys.executable, "-P", "-m", "aolink", "sim", str(rig), "--json", "--tied", *options]
     # It has a process group of its own: Ctrl-C goes to the session, which still has to park the mirror.
     # Its input is a pipe that ends with this process, however that ends, and the rig ends with the pipe.
     started = False

@@ -296,7 +296,7 @@ def grown(file: IO[bytes], position: int, on_loss: Callable[[Loss], None]) -> tu
     if end > size:
         return position, [], False
     if not is_plausible(opcode, length, file, 0):
-        raise RecordingError(f"{name} makes no sense at byte {position}: `aolink recover` copies what is whole")
+        raise RecordingError(f"{name} makes no sense at byte {position}: `aolink copy` copies what is whole")
     record = _record_at(file, position, on_loss, budget := Budget(name, size))
     if isinstance(record, Chunk):
         return end, list(broken_up(record, position, on_loss, budget)), False

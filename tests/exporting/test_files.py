@@ -184,7 +184,7 @@ def test_what_would_fill_the_memory_is_refused_before_it_is_read(tmp_path: Path)
     recording = aolink.read(large)
     with pytest.raises(
         ExportError,
-        match=r"would take \d+ GiB of memory, at most [\d.]+ are allowed here.* \(`aolink cut`\), or a table",
+        match=r"would take \d+ GiB of memory, at most [\d.]+ are allowed here.* \(`aolink copy`\), or a table",
     ):
         export(recording, tmp_path / "out.npz")
     with pytest.raises(ExportError, match="holds no exposure to export"):

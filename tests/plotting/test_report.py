@@ -168,11 +168,15 @@ def test_the_commands_write_their_files_and_say_what_is_wrong(aolink: Aolink, tm
         (("report", source, "-o", "report.html"), 12, "exists and is not overwritten"),
         (("report", source, "-o", "report.pdf"), 12, "ends with .html"),
         (("report", tmp_path, "-o", "x.html"), 5, "holds no recording"),
-        (("plot", source, "exposure", "-o", "x.jpg"), 12, "a figure is a .png, .svg, .pdf file"),
-        (("plot", source, "moon", "-o", "x.png"), 2, "moon"),
-        (("plot", source, "pupil", "-o", "x.png"), 12, "fewer than 4 lenslets"),
-        (("plot", source, "exposure", "--lenslet", "1,0", "-o", "x.png"), 2, "the grid has 1 x 1 lenslets"),
-        (("plot", source, "exposure", "--exposure", "99", "-o", "x.png"), 12, "there is no exposure 99"),
+        (("report", source, "--figure", "exposure", "-o", "x.jpg"), 12, "a figure is a .png, .svg, .pdf file"),
+        (("report", source, "--figure", "moon", "-o", "x.png"), 2, "moon"),
+        (("report", source, "--figure", "pupil", "-o", "x.png"), 12, "fewer than 4 lenslets"),
+        (
+            ("report", source, "--figure", "exposure", "--lenslet", "1,0", "-o", "x.png"),
+            2,
+            "the grid has 1 x 1 lenslets",
+        ),
+        (("report", source, "--figure", "exposure", "--exposure", "99", "-o", "x.png"), 12, "there is no exposure 99"),
     ):
         failed = aolink(*arguments)
         assert failed.returncode == code, (arguments, failed.stderr)
@@ -195,7 +199,7 @@ def test_every_figure_is_a_file_of_its_size(tmp_path: Path) -> None:
 def test_a_figure_is_a_vector_graphic_too_and_the_same_each_time(aolink: Aolink, tmp_path: Path) -> None:
     small = write_small(tmp_path / "small.mcap", 2, rig="single-lenslet", truth=True)
     for ending, begins in ((".svg", b"<?xml"), (".pdf", b"%PDF")):
-        done = aolink("plot", small, "exposure", "--lenslet", "0,0", "--steps", "-o", f"x{ending}")
+        done = aolink("report", small, "--figure", "exposure", "--lenslet", "0,0", "--steps", "-o", f"x{ending}")
         assert (done.returncode, done.stdout) == (0, f"written: x{ending}\n"), done.stderr
         assert (tmp_path / f"x{ending}").read_bytes().startswith(begins)
     again = save_figure(Recording(small), "exposure", tmp_path / "again.pdf", unit="steps")

@@ -114,19 +114,19 @@ def test_the_source_is_never_the_target(recorded: Session) -> None:
 def test_the_editing_commands_say_what_they_did_and_lost(aolink: Run, recorded: Session, tmp_path: Path) -> None:
     data = recorded.path.read_bytes()
     (tmp_path / "broken.mcap").write_bytes(data[: len(data) * 2 // 3])
-    result = aolink("recover", "broken.mcap", "-o", "whole.mcap")
+    result = aolink("copy", "broken.mcap", "-o", "whole.mcap")
     assert result.returncode == 1
     assert "lost: it was cut off" in result.stdout
     assert aolink("info", "whole.mcap").returncode == 0
     assert aolink("info", "broken.mcap").returncode == 1
-    assert aolink("recover", recorded.path, "-o", "copy.mcap").returncode == 0
-    again = aolink("recover", recorded.path, "-o", "copy.mcap")
+    assert aolink("copy", recorded.path, "-o", "copy.mcap").returncode == 0
+    again = aolink("copy", recorded.path, "-o", "copy.mcap")
     assert again.returncode == 5
     assert "exists and is not overwritten" in again.stderr
     assert aolink("compare", recorded.path, "copy.mcap").returncode == 0
-    assert aolink("cut", "copy.mcap", "--start", "1", "--end", "2", "-o", "c1.mcap").returncode == 0
-    assert aolink("cut", "copy.mcap", "--start", "1.5", "-o", "c2.mcap").returncode == 0
-    assert aolink("merge", "c1.mcap", "c2.mcap", "-o", "m.mcap").returncode == 0
+    assert aolink("copy", "copy.mcap", "--start", "1", "--end", "2", "-o", "c1.mcap").returncode == 0
+    assert aolink("copy", "copy.mcap", "--start", "1.5", "-o", "c2.mcap").returncode == 0
+    assert aolink("copy", "c1.mcap", "c2.mcap", "-o", "m.mcap").returncode == 0
 
 
 @pytest.mark.slow
@@ -138,9 +138,9 @@ def test_no_command_writes_over_what_it_reads(aolink: Run, recorded: Session, tm
     (tmp_path / "link.mcap").hardlink_to(tmp_path / "a.mcap")
     for arguments in (
         ("estimate", "a.mcap", "-e", "o1", "-o", "a.mcap"),
-        ("recover", "a.mcap", "-o", "link.mcap"),
-        ("cut", "a.mcap", "--end", "1", "-o", "a.mcap"),
-        ("merge", "a.mcap", "b.mcap", "-o", "b.mcap"),
+        ("copy", "a.mcap", "-o", "link.mcap"),
+        ("copy", "a.mcap", "--end", "1", "-o", "a.mcap"),
+        ("copy", "a.mcap", "b.mcap", "-o", "b.mcap"),
         ("deblur", "a.mcap", "-e", "o1", "-o", "a.mcap"),
     ):
         result = aolink(*arguments, "--overwrite")
@@ -154,13 +154,13 @@ def test_a_command_that_fails_leaves_the_target_as_it_was(aolink: Run, recorded:
     import resource
 
     (tmp_path / "kept.mcap").write_bytes(b"something of mine")
-    failed = aolink("cut", recorded.path, "--start", "100", "-o", "kept.mcap", "--overwrite")
+    failed = aolink("copy", recorded.path, "--start", "100", "-o", "kept.mcap", "--overwrite")
     assert failed.returncode == 5
 
     def small_files() -> None:
         resource.setrlimit(resource.RLIMIT_FSIZE, (40_000, 40_000))
 
-    for command in (("recover",), ("cut", "--end", "99"), ("estimate", "-e", "o1")):
+    for command in (("copy",), ("copy", "--end", "99"), ("estimate", "-e", "o1")):
         full = aolink(command[0], recorded.path, *command[1:], "-o", "kept.mcap", "--overwrite", preexec_fn=small_files)
         assert full.returncode == 5
         why = "it would be larger than the disk or a limit (ulimit -f) lets a file be"
@@ -192,7 +192,7 @@ def test_nothing_is_recovered_from_nothing(recorded: Session, tmp_path: Path) ->
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("command", [["cut", "-o", "c.mcap"], ["replay", "-e", "o1"]])
+@pytest.mark.parametrize("command", [["copy", "-o", "c.mcap"], ["replay", "-e", "o1"]])
 def test_a_start_after_the_end_of_a_recording_is_said(aolink: Run, recorded: Session, command: list[str]) -> None:
     refused = aolink(command[0], recorded.path, *command[1:], "--start", "100")
     assert refused.returncode == 5
@@ -201,7 +201,7 @@ def test_a_start_after_the_end_of_a_recording_is_said(aolink: Run, recorded: Ses
 
 def test_a_url_is_not_taken_for_a_path(aolink: Run, tmp_path: Path) -> None:
     url = "https://127.0.0.1:1/a.mcap"
-    for command in (["merge", url, url, "-o", "m.mcap"], ["calibrate", "section-vi", url, "-o", "r.toml"]):
+    for command in (["copy", url, url, "-o", "m.mcap"], ["calibrate", "section-vi", url, "-o", "r.toml"]):
         refused = aolink(*command)
         assert refused.returncode == 2
         assert url in refused.stderr.replace("\n", "")

@@ -131,7 +131,7 @@ def test_a_file_that_makes_no_sense_or_is_replaced_is_one_error(recorded: Sessio
     data, path = recorded.path.read_bytes(), tmp_path / "damaged.mcap"
     end = data.rindex(b"\x0f\x04" + bytes(7))  # the end of the data
     path.write_bytes(data[:end] + b"\xc8\x04" + data[end + 2 :])
-    with pytest.raises(RecordingError, match="aolink recover"):
+    with pytest.raises(RecordingError, match="aolink copy"):
         list(GrowingRecording(path, never).exposures())
     parts = by_bytes(recorded.path, tmp_path / "short.mcap")
     next(parts)

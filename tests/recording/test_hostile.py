@@ -120,7 +120,7 @@ def test_a_small_file_with_millions_of_messages_is_refused_at_once(
     chunk = struct.pack("<QQQII", 1, 1, len(data), 0, 4) + b"zstd" + struct.pack("<Q", len(packed)) + packed
     whole, end = in_place_of_the_end(rig_only(path := tmp_path / "a.mcap"))
     path.write_bytes(whole[:end] + struct.pack("<BQ", Opcode.CHUNK, len(chunk)) + chunk)
-    for command in (["info", path], ["recover", path, "-o", tmp_path / "b.mcap"]):
+    for command in (["info", path], ["copy", path, "-o", tmp_path / "b.mcap"]):
         done = aolink(*command)
         assert done.returncode == 5
         assert "very many tiny records" in done.stderr

@@ -74,7 +74,7 @@ def test_what_is_between_two_times_has_its_estimates(tmp_path: Path) -> None:
 
 
 def test_a_damaged_recording_has_side_files_too(recorded: Session, tmp_path: Path) -> None:
-    """They know it as it is: what `aolink recover` makes of it is another file."""
+    """They know it as it is: what `aolink copy` makes of it is another file."""
     (cut := tmp_path / "cut.mcap").write_bytes(recorded.path.read_bytes()[:-3000])
     row = estimate_file(cut, side := tmp_path / "side.mcap")
     assert row["damage"] == Recording(cut).damage

@@ -237,7 +237,7 @@ def test_check_says_what_is_wrong_and_what_is_lost(
     result = aolink("rig", "far.toml", "--check")
     assert result.returncode == 2
     assert re.search(r"error +(drive.amplitude|sensor.field)", result.stdout), result.stdout
-    refused = aolink("rig", "far.toml")
+    refused = aolink("sim", "far.toml")
     assert refused.returncode == 2
     assert re.fullmatch(r"aolink: far.toml: (drive.amplitude|sensor.field): .*\n", refused.stderr), refused.stderr
     # An undamped mode at 10 Hz averages to nothing in 200 ms: the centroid loses it, the blur may not.
@@ -250,7 +250,7 @@ def test_check_says_what_is_wrong_and_what_is_lost(
     result = aolink("rig", "lost.toml", "--check")
     assert result.returncode == 0, result.stdout + result.stderr
     assert re.search(r"warning .*10(\.0+)? Hz", result.stdout), result.stdout
-    assert "warning: timing.exposure_steps: the centroid" in aolink("rig", "lost.toml", "--listen", "nonsense").stderr
+    assert "warning: timing.exposure_steps: the centroid" in aolink("sim", "lost.toml", "--listen", "nonsense").stderr
 
 
 @pytest.mark.parametrize(

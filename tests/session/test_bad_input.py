@@ -281,7 +281,7 @@ def test_ctrl_c_keeps_the_recording_whole_and_parks_the_mirror(
 
 @pytest.mark.slow
 def test_a_rig_killed_in_the_middle(start_aolink: Start, tmp_path: Path) -> None:
-    rig = start_aolink("rig", "section-vi", "--json")
+    rig = start_aolink("sim", "section-vi", "--json")
     assert rig.stdout is not None
     ports = json.loads(rig.stdout.readline())
     process = start_aolink(*record_arguments(ports["camera"], ports["mirror"], "--estimator", "o3"))
@@ -359,7 +359,7 @@ def test_a_command_beyond_the_limits_is_refused_by_the_host_and_by_the_device() 
 @pytest.mark.slow
 def test_ctrl_c_while_the_rig_is_held_up(start_aolink: Start, tmp_path: Path) -> None:
     """Nobody answers any more; the session ends all the same, as interrupted, and says what it could not do."""
-    rig = start_aolink("rig", "section-vi", "--json")
+    rig = start_aolink("sim", "section-vi", "--json")
     assert rig.stdout is not None
     ports = json.loads(rig.stdout.readline())
     process = start_aolink(*record_arguments(ports["camera"], ports["mirror"], "--estimator", "o3"))
@@ -393,7 +393,7 @@ def test_a_device_held_up_for_two_seconds_does_not_end_the_session(start_aolink:
     """As long as twice its watchdog is longer than that."""
     text = load_rig("section-vi").toml.replace("block_steps = 50", "block_steps = 50\nwatchdog_s = 3")
     (tmp_path / "rig.toml").write_text(text)
-    rig = start_aolink("rig", "rig.toml", "--json", "--real-time", "--listen", "127.0.0.1:0")
+    rig = start_aolink("sim", "rig.toml", "--json", "--real-time", "--listen", "127.0.0.1:0")
     assert rig.stdout is not None
     ports = json.loads(rig.stdout.readline())
     process = start_aolink(*record_arguments(ports["camera"], ports["mirror"], "--exposures", "16", rig="rig.toml"))

@@ -117,7 +117,7 @@ def test_a_rig_whose_ports_vanish_by_its_rate(aolink: Run) -> None:
 
 @pytest.mark.slow
 def test_virtual_time_has_no_ports_that_vanish(aolink: Run) -> None:
-    rig = aolink("rig", "section-vi", "--fault", "vanish=0.01")
+    rig = aolink("sim", "section-vi", "--fault", "vanish=0.01")
     assert rig.returncode == RigError.exit_code
     assert "ports vanish in real time only: add --real-time" in rig.stderr
     with simulated_rig("section-vi") as (camera, mirror):

@@ -40,7 +40,7 @@ def test_a_web_page_moves_no_mirror_and_keeps_nobody_out(aolink: Run) -> None:
 
 
 def test_no_other_machine_is_served(aolink: Run) -> None:
-    result = aolink("rig", "section-vi", "--listen", "0.0.0.0:0")
+    result = aolink("sim", "section-vi", "--listen", "0.0.0.0:0")
     assert result.returncode == PortError.exit_code
     assert result.stderr.startswith("aolink: --listen 0.0.0.0:0 would let every machine that reaches this one move")
     assert result.stderr.count("\n") == 1
