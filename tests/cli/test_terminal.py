@@ -36,7 +36,7 @@ def test_no_colour_where_it_is_not_wanted() -> None:
 
 @pytest.mark.parametrize(
     ("words", "number", "completed"),
-    [("aolink re", 1, "record report replay"), ("aolink report x.mcap --figure ex", 4, "exposure")],
+    [("aolink re", 1, "record replay report"), ("aolink report x.mcap --figure ex", 4, "exposure")],
 )
 def test_the_shell_completes_commands_and_figures(words: str, number: int, completed: str) -> None:
     asked = {"_AOLINK_COMPLETE": "complete_bash", "COMP_WORDS": words, "COMP_CWORD": str(number)}

@@ -33,6 +33,7 @@ def shaken(
     return array_film(np.clip(np.rint(frames), 0, 65535).astype(np.uint16), "shaken", rate_hz=50.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("sd", "amplitude", "angle"),
     [(1.8, 3.2, 0.0), (1.8, 3.2, 0.7), (3.1, 4.0, 0.7), (1.0, 3.0, 0.3), (1.8, 0.0, 0.0), (1.8, 1.0, 0.5)],
@@ -45,10 +46,12 @@ def test_the_kernel_is_found_whether_frames_are_sharp_or_blurred(sd: float, ampl
         assert found.sd == pytest.approx(sd, rel=0.02)
 
 
+@pytest.mark.slow
 def test_a_spot_that_swings_several_times_in_each_exposure_has_a_kernel_still() -> None:
     assert find_spots(shaken(cycles=2.2), FilmSettings(), FRAMES).sd == pytest.approx(1.8, rel=0.12)
 
 
+@pytest.mark.slow
 def test_windows_hold_the_spots_and_their_light() -> None:
     middles = ((16.0, 15.0), (46.0, 30.0))
     film = shaken(middles=middles, amplitude=2.0)
@@ -71,6 +74,7 @@ def test_what_cannot_be_looked_at_is_said_in_one_line() -> None:
         find_spots(array_film(next(iter(one.frames())), "one"), FilmSettings(), FRAMES)
 
 
+@pytest.mark.slow
 def test_a_hot_pixel_is_no_spot() -> None:
     film = shaken(amplitude=2.0)
     frames = np.stack(list(film.frames()))

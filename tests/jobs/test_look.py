@@ -58,6 +58,7 @@ def test_sharp_frames_leave_aliases_and_say_so() -> None:
     assert "which these frames cannot tell from it" in paragraph(looked)
 
 
+@pytest.mark.slow
 def test_a_film_without_motion_is_said_to_have_none() -> None:
     looked = look(shaken(amplitude=0.0), FilmSettings(exposure_s=EXPOSURE), "still")
     assert not looked.moves

@@ -24,6 +24,7 @@ def rolled(share: float) -> Rig:
     return parse_rig(rig.toml.replace("[scene]", f"[scene]\nrow_time_s = {row_time!r}", 1), rig.folder)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("share", [0.3, -0.5])
 def test_a_scene_is_restored_with_a_psf_that_changes_with_the_row(share: float) -> None:
     rig = rolled(share)
@@ -41,6 +42,7 @@ def test_a_scene_is_restored_with_a_psf_that_changes_with_the_row(share: float) 
     assert min(gains) > 3  # dB
 
 
+@pytest.mark.slow
 def test_the_middle_row_has_the_psf_of_its_own_interval() -> None:
     rig = rolled(0.4)
     assert rig.scene is not None
