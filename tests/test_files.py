@@ -270,9 +270,8 @@ def sources(recorded: Session, tmp_path_factory: pytest.TempPathFactory, mmirs: 
 
 
 WRITING = {
-    "cut": "cut {session} -o {target}.mcap",
-    "merge": "merge {first} {second} -o {target}.mcap",
-    "recover": "recover {session} -o {target}.mcap",
+    "copy": "copy {session} -o {target}.mcap",
+    "join": "copy {first} {second} -o {target}.mcap",
     "estimate": "estimate {session} -e o1 -o {target}.mcap",
     "deblur": "deblur {session} -e o1 -o {target}.mcap",
     "deblur --image": "deblur --image {picture} --psf {psf} --noise-sd 0.1 -o {target}.npy",

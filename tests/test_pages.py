@@ -33,6 +33,7 @@ from aolink.rig import load_rig, parse_rig
 from aolink.session import record
 from aolink.simulation.model import simulate
 from tests.commands import command_server, simulated_rig
+from tests.importing.test_blurred import shaken
 from tests.kinds import must_be
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tools"))
@@ -52,7 +53,9 @@ SHORTER = {
     "--exposures 30": "--exposures 6",
     "--start 10 --end 20": "--start 0.5 --end 1.5",
     "aolink view session.mcap": "aolink view session.mcap --save view.rrd",  # a test has no screen
+    "aolink view film-look/film.mcap": "aolink view film-look/film.mcap --save view.rrd",
     "[--view]": "",  # nor has it here
+    "aolink look film.tif": "aolink look film.tif --quick",
 }
 """What is changed about a command before it is run: times, and what needs a screen."""
 EXIT_CODES = {"aolink copy broken.mcap": 1}
@@ -103,7 +106,7 @@ NO_CODE = {
     "errors, files, limits, signals": "the list of subpackages",
     "Copyright (c)": "a licence",
     "MIT License": "a licence",
-    "aolink rig section-vi --real-time --listen": "test_the_block_of_a_tunnel_works",
+    "aolink sim section-vi --real-time --listen": "test_the_block_of_a_tunnel_works",
     "make ": "tests/tools/test_device.py makes the reference device, tests/session/test_real_time.py runs it",
 }
 """How indented blocks begin that are no commands, and what holds them."""
@@ -163,6 +166,7 @@ def laboratory(tmp_path_factory: pytest.TempPathFactory) -> Path:
     rng = np.random.default_rng(1)
     beads = spot_film(rng, random_walk(rng, 80, 2, 0.5), np.array([[24.0, 32.0], [70.0, 30.0]]))
     tifffile.imwrite(folder / "beads.tif", beads.frames)
+    tifffile.imwrite(folder / "film.tif", np.stack(list(shaken().frames())))
     np.savetxt(folder / "psf.csv", np.full((1, 9), 1 / 9), delimiter=",")
     (folder / "log.csv").write_text("time,x,y\n0.0,0.0,0.0\n0.1,5.0,1.0\n")
     return folder
@@ -218,7 +222,7 @@ def test_a_block_of_commands_works(block: CodeBlock, laboratory: Path, tmp_path:
 @pytest.mark.slow
 def test_the_block_of_a_tunnel_works(tmp_path: Path) -> None:
     """Where rig and host are one machine there is nothing to tunnel: both ends have the same ports."""
-    (block,) = (block for block in BLOCKS if block.text.startswith("aolink rig section-vi --real-time --listen"))
+    (block,) = (block for block in BLOCKS if block.text.startswith("aolink sim section-vi --real-time --listen"))
     serve, tunnel, save = commands(block)
     assert re.findall(r"-L (\d+):127\.0\.0\.1:(\d+)", tunnel) == [("5000", "5000"), ("5001", "5001")]
     _, _, rig, *options = serve.replace("127.0.0.1:5000", "127.0.0.1:0").split()
