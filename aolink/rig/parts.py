@@ -311,7 +311,7 @@ FAULT_NAMES = {
     "saturated": "saturation_rate",
     "dark": "dark_rate",
 }
-"""Short names of faults, as ``aolink rig --fault`` takes them beside the keys themselves."""
+"""Short names of faults, as ``aolink sim --fault`` takes them beside the keys themselves."""
 
 
 @dataclass(frozen=True, kw_only=True)

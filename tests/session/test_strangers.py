@@ -1,4 +1,4 @@
-"""Programs that are no hosts, on the TCP ports of `aolink rig --listen`."""
+"""Programs that are no hosts, on the TCP ports of `aolink sim --listen`."""
 
 from __future__ import annotations
 

@@ -123,7 +123,7 @@ class Cable:
     """A bad serial line to a device: a pseudo terminal whose bytes are damaged in both directions, and the undamaged
     data.
 
-    It damages packets from the first command of a session on, as `aolink rig --fault` does, and keeps the device's
+    It damages packets from the first command of a session on, as `aolink sim --fault` does, and keeps the device's
     messages before the damage: the pixels of frames, and which block held the mirror at each step, with which input.
     """
 
