@@ -3,6 +3,7 @@
 import json
 import math
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Annotated
 
 import typer
@@ -95,17 +96,15 @@ def look(
     folder.mkdir(parents=True, exist_ok=True)
     rig = parse_rig(looked.text)
     rig_file.write_text(looked.text, encoding="utf-8")
-    imported = folder / "film.partial.mcap"
-    try:
-        import_film(looked.cut, rig, looked.settings, imported, overwrite=True, sources=[source])
-        names = ["moments"] if looked.moves else []
+    with TemporaryDirectory(dir=folder, prefix=".look-") as place:
+        imported = Path(place) / recording.name
+        import_film(looked.cut, rig, looked.settings, imported, sources=[source])
         with progress("estimate", len(looked.spots.light)) as tell:
-            if names:
-                write_reestimated(Recording(imported), names, recording, only=False, overwrite=overwrite, progress=tell)
+            if looked.moves:
+                source_of = Recording(imported)
+                write_reestimated(source_of, ["moments"], recording, only=False, overwrite=overwrite, progress=tell)
             else:
                 imported.replace(recording)
-    finally:
-        imported.unlink(missing_ok=True)
     commands = [
         f"{program()} view {recording}",
         f"{program()} estimate {recording} -e profile",

@@ -48,7 +48,7 @@ class MicroManagerCamera(ThreadCamera):
         pymmcore is not installed, the adapter or its camera cannot be opened, or it cannot do what the rig file says.
     """
 
-    lacks: tuple[Lacks, ...] = (Lacks.TIME, Lacks.TRIGGER)
+    lacks: tuple[Lacks, ...] = (Lacks.TIME, Lacks.TRIGGER, Lacks.ROWS)
     triggers = ("free-running", "hardware")
 
     def __init__(

@@ -51,7 +51,8 @@ def test_a_session_records_what_the_camera_shows(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("trigger", "lacks"), [(FREE_RUNNING, (Lacks.TIME, Lacks.TRIGGER)), (Trigger("hardware"), (Lacks.TIME,))]
+    ("trigger", "lacks"),
+    [(FREE_RUNNING, (Lacks.TIME, Lacks.TRIGGER, Lacks.ROWS)), (Trigger("hardware"), (Lacks.TIME, Lacks.ROWS))],
 )
 def test_a_frame_has_the_cameras_own_count(trigger: Trigger, lacks: tuple[Lacks, ...], tmp_path: Path) -> None:
     """A hardware trigger is only declared: the demo camera has none, and runs."""
