@@ -23,6 +23,8 @@ RELATIVE = 1e-9
 ABSOLUTE = 1e-12
 _BYTES_KEPT = 32 << 20
 """Bytes in memory of messages whose counterpart has not come yet; the rest is in a temporary file."""
+_LATER = ("verdict",)
+"""Fields that recordings made before do not have: they are compared where both have them."""
 _Key = tuple[str, str]
 """Topic, and the name that a message and its counterpart share."""
 
@@ -273,6 +275,8 @@ def _compare_messages(
 ) -> None:  # fmt: skip
     for name in sorted({each.name for each in (*a.DESCRIPTOR.fields, *b.DESCRIPTOR.fields)}):
         if not times and _is_time(name):
+            continue
+        if name in _LATER and not (a.HasField(name) and b.HasField(name)):
             continue
         x, y = getattr(a, name, None), getattr(b, name, None)
         largest = largest_relative = 0.0

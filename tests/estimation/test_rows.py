@@ -54,6 +54,7 @@ def test_intervals_hold_the_truth_where_the_row_time_is_known_and_mostly_where_i
     assert ignored < 0.8
 
 
+@pytest.mark.slow
 def test_one_plant_of_several_spots_is_estimated_in_their_own_intervals() -> None:
     rig = parse_rig(COUPLED)
     assert 0.9 < np.mean([coverage(rig, simulate(rig, 40, seed)) for seed in (1, 2, 3)]) < 0.98

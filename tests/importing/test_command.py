@@ -255,7 +255,7 @@ def test_a_start_other_than_the_films_is_noted(aolink, rig, tmp_path):
     [
         (["rig.toml", "--track", "2"], "--track needs --from FILM"),
         (["rig.toml", "--check", "--topic", "/camera"], "--topic needs --from FILM"),
-        (["a.toml", "--from", "film.npy", "--track", "1", "--seed", "3"], "--seed makes no sense with --from"),
+        (["a.toml", "--from", "film.npy", "--track", "1", "--check"], "--check makes no sense with --from"),
         (["a.toml", "--from", "film.npy", "--track", "1", "--json"], "--json makes no sense with --from"),
     ],
 )

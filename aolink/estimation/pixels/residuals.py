@@ -190,7 +190,7 @@ class _Fit:
         time = np.cumsum(self.weights) - self.weights / 2
         time = 2 * time / self.weights.sum() - 1
         shapes = (
-            self.variance[..., None] * np.einsum("k,aokp->aop", self.weights, bent), fitted.light,
+            self.variance * np.einsum("k,aokp->aop", self.weights, bent), fitted.light,
             np.full_like(fitted.light, fitted.light.mean()),
             np.einsum("k,aokp->aop", -self.weights * time, masses),
             np.einsum("k,aokp->aop", self.weights * (3 * time**2 - 1), masses),
