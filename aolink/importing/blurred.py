@@ -168,6 +168,7 @@ def _boxes(film: Film, brightest: FloatArray, noise: float) -> tuple[list[tuple[
     labels, _ = ndimage.label(brightest > least, structure=np.ones((3, 3)))
     found = []
     for number, area in enumerate(ndimage.find_objects(labels), 1):
+        assert area is not None  # each number has its pixels
         own = labels[area] == number
         top = float(brightest[area][own].max()) - ground
         if top > _FAINTEST * height:
