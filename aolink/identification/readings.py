@@ -285,10 +285,10 @@ def _measured(seen: _Seen, variances: FloatArray, blank: Readings) -> Readings:
     middle = (sensor.field[0] + sensor.field[1]) / 2
     # First the spot may be anywhere; then weights are made for the motion that was found.
     found = _at(seen, variances, blank, np.full_like(expected, middle), blank.reach / _REACH)
-    if not found.usable.any():
-        raise IdentificationError("no exposure shows a spot on the rig's sensor")
     best = found
     for _ in range(_ROUNDS):
+        if not best.usable.any():
+            raise IdentificationError("no exposure shows a spot on the rig's sensor")
         place = best.mean + best.centre - expected  # the motion that the inputs do not explain
         mean = (place * best.usable).sum(axis=1) / np.maximum(best.usable.sum(axis=1), 1)
         still = expected + mean[:, None]

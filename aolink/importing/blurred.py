@@ -65,7 +65,7 @@ class Spots:
 
     light: FloatArray
     """Light above the ground in each spot's window, over the spot's light, (frames, n, side, side); NaN where a pixel
-    cannot be used."""
+    cannot be used, zero where it is nearer to another spot."""
     corners: IntArray
     """First pixel of each window, (n, 2)."""
     sd: float
@@ -106,7 +106,8 @@ def find_spots(
     middles = np.array([middle for middle, _ in boxes])
     corners = np.rint(middles - (side - 1) / 2).astype(np.int64)
     windows, bad = _windows(film, light, count, corners, side, lambda done: progress(count + done))
-    _leave_out_others(windows, corners, brightest, middles)
+    others = _nearer_to_others(corners, side, middles)
+    windows[:, others] = np.nan
     windows -= _ground(windows)
     amounts = np.nansum(windows, axis=(2, 3))
     windows /= brightness_of(np.maximum(amounts, 0.0))[:, None, None, None]
@@ -114,6 +115,7 @@ def find_spots(
     if (usual <= 0).any():
         raise ImportingError(f"{film.name}: the light of a spot is not above the ground about it")
     windows /= usual[:, None, None]
+    windows[:, others] = 0.0  # as dark as the ground, so that sums over the window can be used
     noise /= float(usual.mean())
     profiles = [np.nansum(windows, axis=axis) for axis in (2, 3)]  # along x, along y
     sd, electrons = _kernel_and_electrons(profiles, noise * math.sqrt(side))
@@ -203,13 +205,14 @@ def _windows(
     return windows, bad
 
 
-def _leave_out_others(windows: FloatArray, corners: IntArray, brightest: FloatArray, middles: FloatArray) -> None:
-    """Mark as unusable what is nearer to another spot than to the window's own."""
-    side = windows.shape[-1]
+def _nearer_to_others(corners: IntArray, side: int, middles: FloatArray) -> BoolArray:
+    """Which pixels of each window are nearer to another spot than to the window's own, (n, side, side)."""
+    out = np.zeros((len(corners), side, side), dtype=np.bool_)
     for k, corner in enumerate(corners):
         y, x = np.indices((side, side)) + corner[::-1, None, None]
         far = np.array([np.hypot(x - mx, y - my) for mx, my in middles])
-        windows[:, k][:, far[k] > far.min(axis=0)] = np.nan
+        out[k] = far[k] > far.min(axis=0)
+    return out
 
 
 def _ground(windows: FloatArray) -> FloatArray:
