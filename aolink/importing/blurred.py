@@ -105,7 +105,7 @@ def find_spots(
         )
     middles = np.array([middle for middle, _ in boxes])
     corners = np.rint(middles - (side - 1) / 2).astype(np.int64)
-    windows, bad = _windows(film, light, count, corners, side, lambda done: progress(count + done))
+    windows, bad = _windows(film, light, defects, count, corners, side, lambda done: progress(count + done))
     others = _nearer_to_others(corners, side, middles)
     windows[:, others] = np.nan
     windows -= _ground(windows)
@@ -186,7 +186,13 @@ def _boxes(film: Film, brightest: FloatArray, noise: float) -> tuple[list[tuple[
 
 
 def _windows(
-    film: Film, light: FilmLight, count: int, corners: IntArray, side: int, progress: Callable[[int], None]
+    film: Film,
+    light: FilmLight,
+    defects: BoolArray,
+    count: int,
+    corners: IntArray,
+    side: int,
+    progress: Callable[[int], None],
 ) -> tuple[FloatArray, BoolArray]:
     """The light in the windows, NaN where it cannot be used, and where it is saturated or hot, (frames, n, side, side)
     each."""
@@ -201,7 +207,9 @@ def _windows(
         shown, wrong = light.of(frame)
         windows[k] = shown[y[:, :, None], x[:, None, :]]
         bad[k] = wrong[y[:, :, None], x[:, None, :]] & inside
-    windows[bad | ~inside] = np.nan
+    # Hot and dead pixels have the light of those about them: without it no sum over the window could be used.
+    hot = defects[y[:, :, None], x[:, None, :]]
+    windows[(bad & ~hot) | ~inside] = np.nan
     return windows, bad
 
 
