@@ -10,7 +10,8 @@ import typer
 
 from aolink.cli.common import JsonOption, OverwriteOption, app, local_file, program, progress, stderr, stdout
 from aolink.cli.films import ColourOption, GammaOption, InvertOption, RateOption, TopicOption, film_settings
-from aolink.errors import ImportingError, RecordingError
+from aolink.errors import ExportError, ImportingError, RecordingError
+from aolink.files import writing
 from aolink.signals import Interrupted
 
 
@@ -47,16 +48,17 @@ def look(
 ) -> None:
     """Say what moves in a film of up to four spots, and how well its blur tells the path inside each exposure.
 
-    Writes a rig file to go on with, a recording with estimates, and a page with pictures. The first answer comes within
-    a minute; then sums of processes are tried. Ctrl-C keeps what there is.
+    Writes a rig file to go on with, a recording with estimates, and a page with pictures. The first answer comes in
+    about a minute; then sums of processes are tried. Ctrl-C keeps what there is.
     """
     from aolink.films.film import one_colour
     from aolink.films.formats import open_film
     from aolink.importing.recording import import_film
-    from aolink.jobs.look import Looked, paragraph
-    from aolink.jobs.look import as_json as numbers
+    from aolink.jobs.look import Looked
     from aolink.jobs.look import look as look_at
     from aolink.jobs.look_page import write_page
+    from aolink.jobs.look_words import as_json as numbers
+    from aolink.jobs.look_words import paragraph
     from aolink.recording.reader import Recording
     from aolink.recording.reestimate import write_reestimated
     from aolink.rig import parse_rig
@@ -78,7 +80,7 @@ def look(
         try:
             with progress("look", None) as tell:
                 said = look_at(
-                    film, settings, source.stem, kernel=kernel, thorough=thorough,
+                    film, settings, source.stem, kernel=kernel, thorough=thorough, before=looked,
                     tell=lambda what, done, of: tell(done, f"{what}: {done} of {of}"),
                 )  # fmt: skip
         except Interrupted as stopped:
@@ -95,7 +97,8 @@ def look(
     assert looked is not None
     folder.mkdir(parents=True, exist_ok=True)
     rig = parse_rig(looked.text)
-    rig_file.write_text(looked.text, encoding="utf-8")
+    with writing(rig_file, overwrite=overwrite, sources=[source], error=ImportingError) as partial:
+        partial.write_text(looked.text, encoding="utf-8")
     with TemporaryDirectory(dir=folder, prefix=".look-") as place:
         imported = Path(place) / recording.name
         import_film(looked.cut, rig, looked.settings, imported, sources=[source])
@@ -110,13 +113,17 @@ def look(
         f"{program()} estimate {recording} -e profile",
         f"{program()} report {recording} -o {folder / 'report.html'}",
     ]
-    write_page(looked, page, source.name, commands, overwrite=overwrite)
+    drawn = f"{page}: the pictures"
+    try:
+        write_page(looked, page, source.name, commands, overwrite=overwrite)
+    except ExportError as error:  # the answer does not need it
+        drawn = f"no page with pictures: {error}"
     if as_json:
-        files = {"rig": str(rig_file), "recording": str(recording), "page": str(page)}
+        files = {"rig": str(rig_file), "recording": str(recording), "page": str(page) if page.exists() else None}
         print(json.dumps({"text": paragraph(looked), **numbers(looked), **files}, allow_nan=False))
     else:
         lines = [*(f"{each}." for each in looked.doubts), "Assumed:", *(f"  {each}." for each in looked.assumed)]
-        lines += [f"{page}: the pictures. To go on:", *(f"  {each}" for each in commands)]
+        lines += [f"{drawn}. To go on:", *(f"  {each}" for each in commands)]
         stdout.print("\n".join(lines), markup=False)
     if interrupted is not None:
         raise interrupted

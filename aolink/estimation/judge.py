@@ -36,17 +36,19 @@ WINDOW, FEWEST, BETWEEN = 48, 24, 8
 _AT_ONCE = 4
 """Most axes that are compared in one exposure."""
 PIXELS_OFF, MOTION_OFF = 4.5, 4.0
-"""Statistics from which on the model does not fit; below `FITS` of them it does. Those of 86 right recordings of
-`moments` were 3.4 and 3.2 at most."""
+"""Statistics from which on the model does not fit; below `FITS` of them it does. They were
+chosen on some 40 right recordings of `moments`, and judged on others (`tools/verdict`)."""
 FITS = 0.7
 _NIS_SPREAD, _NIS_SPREAD_OF_MIXTURES = 1.5, 3.2
 """Standard deviation of the summed NIS where the model is right: of `moments`, and of `profile` and `sampled`."""
 _STATIC = 7.0
+"""Student's t of a single pixel's mean residual from which on it is no chance."""
 _WIDEST = 100.0
 """The most that a variance is multiplied by."""
 _ALONE = 0.5
 """Share of a single pixel in the mean residuals' squares from which on they are at fixed places."""
 _MOST = 4.0
+"""The most that one normal number counts: no single exposure decides."""
 
 
 class Statistics(NamedTuple):
@@ -187,7 +189,7 @@ def judged(found: Statistics, nis: float, ratio: float, before: Verdict, compare
     if found.static > _STATIC or pixels >= motion:
         where = "everywhere in the spot"
         if found.static > _STATIC and found.alone > _ALONE:
-            where = "pixels at fixed places"
+            where = "at fixed places"
         elif width > PIXELS_OFF or found.static > _STATIC:
             where = "in a ring about the spot"
         elif max(fade, ends) > PIXELS_OFF:

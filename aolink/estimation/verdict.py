@@ -16,7 +16,7 @@ class Fit(enum.IntEnum):
 
 
 ADVICE = {
-    "pixels at fixed places": "a hot pixel, a second object or a background: `sensor.defects`, or subtract it",
+    "at fixed places": "a hot pixel, a second object or a background: `sensor.defects`, or subtract it",
     "in a ring about the spot": "the kernel: `aolink calibrate`",
     "at the ends of the blur": "light that changes in the exposure, or its timing: check the lamp and the trigger",
     "everywhere in the spot": "the noise or the light: `aolink calibrate`",

@@ -190,7 +190,7 @@ def by_pixels(
     used = exposures[:_ENOUGH]
     for number, exposure in enumerate(used):
         tell(number, len(used))
-        each = np.array([log_evidence(exposure, estimator) for estimator in running.values()])
+        each = np.array([_log_evidence(exposure, estimator) for estimator in running.values()])
         if number < _SETTLED or not np.isfinite(each).any():
             continue
         at = list(running)
@@ -217,7 +217,7 @@ def refined(
     @cache
     def evidence(*x: float) -> FloatArray:
         estimator = make_estimator(rig_of(np.array(x)), _ESTIMATOR)
-        return np.array([log_evidence(exposure, estimator) for exposure in exposures[:_ENOUGH]][_SETTLED:])
+        return np.array([_log_evidence(exposure, estimator) for exposure in exposures[:_ENOUGH]][_SETTLED:])
 
     # With a damping that is far too high, any frequency nearby will do.
     moved = [at for k in space.vibrations for at in (k + 1, k)]
@@ -243,7 +243,7 @@ def refined(
     return x
 
 
-def log_evidence(exposure: Exposure, estimator: Estimator) -> float:
+def _log_evidence(exposure: Exposure, estimator: Estimator) -> float:
     """Log-evidence of a frame, nats, the sum over axes; NaN where it shows none."""
     estimator.step(exposure)
     assert estimator.posterior is not None

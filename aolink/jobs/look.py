@@ -16,13 +16,12 @@ from typing import Any
 import numpy as np
 
 from aolink.errors import IdentificationError, ImportingError
-from aolink.estimation import make_estimator, run
+from aolink.estimation import run
 from aolink.estimation.verdict import Fit
 from aolink.exposure import Exposure
 from aolink.films.film import Film
 from aolink.identification import FEWEST, Identified, Maximum, Piece, Readings, kinds_of, maxima, readings
 from aolink.identification.models import ProcessSum
-from aolink.identification.pixels import log_evidence
 from aolink.identification.rig_text import as_table
 from aolink.importing.blurred import Spots, find_spots
 from aolink.importing.exposures import film_series
@@ -53,8 +52,6 @@ _NOTHING = 1e6
 """Variance of readings that say nothing."""
 _SETTLED = 8
 """Exposures after which an estimator has found the path."""
-_KERNELS = np.array([0.92, 1.0, 1.08])
-"""Kernels over that of the frames between which the pixels decide."""
 _UNEVEN = 0.003
 """Share by which the exposure may differ from a whole number of fast steps."""
 _REST = 2.0
@@ -145,7 +142,7 @@ Tell = Callable[[str, int, int], None]
 
 def look(
     film: Film, settings: FilmSettings, name: str, *, kernel: float | None = None, frames: int = FRAMES,
-    thorough: bool = False, tell: Tell = lambda what, done, of: None,
+    thorough: bool = False, before: Looked | None = None, tell: Tell = lambda what, done, of: None,
 ) -> Looked:  # fmt: skip
     """Find out what moves in a film of up to four spots, and how.
 
@@ -157,12 +154,20 @@ def look(
         Standard deviation of a resting spot, pixels, where it is known.
     frames:
         Number of frames that are looked at, from the first on.
+    thorough:
+        Whether sums of processes are tried as well.
+    before:
+        What an earlier look at the film has found, so that its spots need not be searched again.
+    tell:
+        Called with the present task, how much of it is done, and how much there is.
 
     Raises
     ------
     ImportingError
         Rate or exposure time are not known, there is no spot, or there are too few frames.
     """
+    if film.slopes:
+        raise ImportingError(f"{film.name} has slopes and no pictures: there is no spot to look at")
     times = film_times(film, settings)
     rate, exposure_s = times.rate_hz, settings.exposure_s or film.exposure_s
     if missing := [f"--{what}" for what, value in (("rate HZ", rate), ("exposure S", exposure_s)) if value is None]:
@@ -177,7 +182,10 @@ def look(
         raise ImportingError(f"frames of {exposure_s:g} s do not fit into {1 / rate:g} s from one to the next")
     if film.count < FEWEST:
         raise ImportingError(f"{film.name} has {film.count} frame(s): {FEWEST} are needed to tell what moves")
-    spots = find_spots(film, settings, frames, lambda done: tell("read", done, 2 * min(frames, film.count)))
+    if before is not None:
+        spots = before.spots
+    else:
+        spots = find_spots(film, settings, frames, lambda done: tell("read", done, 2 * min(frames, film.count)))
     sd = spots.sd if kernel is None else kernel
     if not math.isfinite(sd):
         raise ImportingError(
@@ -187,23 +195,14 @@ def look(
     scene = _Scene(film, spots, times, rate, exposure_s, name)
     everything = range(len(spots.corners))
 
-    def measured(d: int, sd: float) -> tuple[Direction, list[Readings]]:
-        seen = [readings(*scene.along(d, k, sd)) for k in everything]
-        return _direction(DIRECTIONS[d], seen, scene.unit, sd), seen
-
-    both = [measured(d, sd) for d in (0, 1)]
-    together = len(everything) > 1 and _one_motion([seen for _, seen in both])
+    seen = [[readings(*scene.along(d, k, sd)) for k in everything] for d in (0, 1)]
+    directions = [_direction(DIRECTIONS[d], each, scene.unit, sd) for d, each in enumerate(seen)]
+    together = len(everything) > 1 and _one_motion(seen)
     which = [0] if together else everything
     names = (*_SINGLE, *_SUMS) if thorough else _SINGLE
-    directions = list[Direction]()
-    # The direction of more blur first: it tells most of the kernel.
-    for d in sorted((0, 1), key=lambda d: -both[d][0].blur):
-        each = measured(d, sd)[0]
+    for d, each in enumerate(directions):
         if each.moves:
-            told = partial(_say, tell, each.name)
-            each, sd = _identified(scene, d, each, which, sd, names, told, fixed=kernel is not None or bool(directions))
-        directions.append(each)
-    directions.sort(key=lambda each: each.name)
+            directions[d] = _identified(scene, d, each, which, sd, names, partial(_say, tell, each.name))
     doubts = tuple(_doubts(spots, directions, sd, given=kernel is not None))
     return Looked(
         spots=spots, rate_hz=rate, exposure_s=exposure_s, sd=sd, together=together, directions=tuple(directions),
@@ -259,9 +258,9 @@ def _one_motion(seen: Sequence[Sequence[Readings]]) -> bool:
 
 def _identified(
     scene: _Scene, d: int, direction: Direction, which: Sequence[int], sd: float, names: Sequence[str],
-    tell: Callable[[str, int, int], None], *, fixed: bool,
-) -> tuple[Direction, float]:  # fmt: skip
-    """The direction with the model of its motion and the errors of its path, and the kernel that the pixels prefer."""
+    tell: Tell,
+) -> Direction:  # fmt: skip
+    """The direction with the model of its motion and the errors of its path."""
     films = [scene.along(d, k, sd)[1] for k in which]
     rig, some = parse_rig(scene.line_text(sd)), films[0][:_SEARCHED]
     wanted, seen = Wanted(), [readings(rig, each[:_SEARCHED]) for each in films]
@@ -273,8 +272,6 @@ def _identified(
     found = from_readings(rig, seen, some, replace(wanted, models=(name,)), tell, tops).found[0]
     if not direction.blurred:
         found = _with_aliases(found, scene, LEAST_BLUR * sd)
-    if direction.blurred and not fixed:
-        sd *= _kernel_by_pixels(lambda factor: parse_rig(scene.line_text(sd * factor, found.model)), some)
     rig = parse_rig(scene.line_text(sd, found.model))
     each_film = [run(rig, each, ["profile"])["profile"] for each in films]
     path = np.array([[one.path[0] for one in each] for each in each_film]).swapaxes(0, 1)
@@ -290,7 +287,7 @@ def _identified(
         held=scene.unit * math.sqrt(within + error),
         path=scene.unit * (path + 1) - 0.5,
         misfit=misfits[0] if misfits else "",
-    ), sd
+    )
 
 
 def _with_aliases(found: IdentifiedModel, scene: _Scene, most_blur: float) -> IdentifiedModel:
@@ -321,7 +318,7 @@ def _with_aliases(found: IdentifiedModel, scene: _Scene, most_blur: float) -> Id
 
 
 def _best_model(
-    rig: Rig, seen: Sequence[Readings], names: Sequence[str], wanted: Wanted, tell: Callable[[str, int, int], None]
+    rig: Rig, seen: Sequence[Readings], names: Sequence[str], wanted: Wanted, tell: Tell
 ) -> tuple[str, list[Maximum]]:
     """The sum of kinds that explains readings best by the Bayesian information criterion, and its local maxima."""
     best: tuple[float, str, list[Maximum]] = (-math.inf, "", [])
@@ -338,19 +335,6 @@ def _best_model(
     if not best[1]:
         raise ImportingError("no model of the motion can be fitted to these frames: they show too little")
     return best[1:]
-
-
-def _kernel_by_pixels(rig_of: Callable[[float], Rig], exposures: Sequence[Exposure]) -> float:
-    """The factor of the kernel where the pixels' evidence is highest: the vertex of a parabola through three."""
-    each = []
-    for factor in _KERNELS:
-        estimator = make_estimator(rig_of(float(factor)), "profile:draws=5")
-        each.append([log_evidence(exposure, estimator) for exposure in exposures])
-    evidence = np.array(each)[:, _SETTLED:]
-    gains = np.clip(np.nan_to_num(evidence - evidence[1]), -10.0, 10.0).sum(axis=1)
-    square, slope, _ = np.polyfit(_KERNELS - 1, gains, 2)
-    vertex = -slope / (2 * square) if square < 0 else _KERNELS[gains.argmax()] - 1
-    return 1 + float(np.clip(vertex, _KERNELS[0] - 1, _KERNELS[-1] - 1))
 
 
 class _Scene:
@@ -504,102 +488,3 @@ def _doubts(spots: Spots, directions: Sequence[Direction], sd: float, *, given: 
         yield f"{spots.saturated:.1%} of the pixels about the spots are saturated or hot and are left out: expose less"
     if spots.at_edge:
         yield "a spot is at the edge of the picture: what it does beyond is not seen"
-
-
-def paragraph(looked: Looked) -> str:
-    """What moves, how, and how well it is known, in a few sentences."""
-    n = len(looked.spots.corners)
-    what = f"{n} spots, each" if n > 1 else "One spot,"
-    said = [f"{what} {looked.sd:.3g} pixels wide at rest (standard deviation)."]
-    if n > 1:
-        said.append("They move together." if looked.together else "Each moves on its own, all in the same way.")
-    moving = [each for each in looked.directions if each.moves]
-    for each in looked.directions:
-        if each.found is None:
-            said.append(f"Along {each.name} nothing moves by more than {_digits(each.least)} pixels rms.")
-        else:
-            said.append(f"Along {each.name}: {described(each, looked)}.")
-    for each in moving:
-        where = f" along {each.name}" if len(moving) > 1 else ""
-        if each.blurred:
-            better = each.held / each.known
-            tells = (
-                f"the blur tells {better:.2g} times more than the centroid here"
-                if better > 1.2
-                else ("the blur tells hardly more than the centroid here")
-            )
-            said.append(
-                f"Inside an exposure the path{where} is known to {_digits(each.known)} pixels rms; the centroid alone"
-                f" leaves {_digits(each.held)}: {tells}."
-            )
-    return " ".join(said)
-
-
-def described(direction: Direction, looked: Looked) -> str:
-    """The motion along one direction in words, with the sets of its frequencies."""
-    assert direction.found is not None
-    parts, sets = [], {each.name: each for each in direction.found.parameters}
-    processes = direction.found.model.processes
-    for number, process in enumerate(processes):
-        if process.kind != "resonance":
-            kind = "it walks at random" if process.kind == "random-walk" else "it wanders at random and returns within"
-            parts.append(kind if process.kind == "random-walk" else f"{kind} {process['correlation_s']:.2g} s")
-            continue
-        names = [name for name in sets if name.endswith("frequency_hz")]
-        one = sets[names[sum(each.kind == "resonance" for each in processes[:number])]]
-        size = f", {_digits(direction.size)} pixels rms" if len(processes) == 1 else ""
-        parts.append(f"it vibrates at {in_set(one)}{size}")
-    alone = (
-        ""
-        if processes[0].kind == "resonance" and len(processes) == 1
-        else f", {_digits(direction.size)} pixels rms in all"
-    )
-    return " and ".join(parts) + alone
-
-
-def in_set(each: Identified, most: int = 4) -> str:
-    """A frequency with its set in words; of many pieces the first ones."""
-    finest = min((piece.high - piece.low for piece in each.pieces), default=0.0)
-    digits = max(0, min(3, 1 - math.floor(math.log10(max(finest, 1e-3)))))
-    if not each.pieces:
-        return f"{each.best:.{digits}f} Hz, though no frequency explains both the width and the shape of the blur"
-    own = next((piece for piece in each.pieces if piece.low <= each.best <= piece.high), each.pieces[0])
-    others = [piece for piece in each.pieces if piece is not own]
-    said = f"{each.best:.{digits}f} Hz [{own.low:.{digits}f}, {own.high:.{digits}f}]"
-    if not others:
-        return said
-    named = ", ".join(f"{piece.best:.{digits}f}" for piece in others[:most])
-    more = " and so on" if len(others) > most else ""
-    return f"{said} or an alias of it, {named} Hz{more}, which these frames cannot tell from it,"
-
-
-def _digits(value: float) -> str:
-    return f"{value:.2g}" if value < 1 else f"{value:.3g}"
-
-
-def as_json(looked: Looked) -> dict[str, Any]:
-    """The numbers of `paragraph`."""
-    return {
-        "spots": looked.spots.corners.tolist(), "window": int(looked.spots.light.shape[-1]), "kernel_sd": looked.sd,
-        "rate_hz": looked.rate_hz, "exposure_s": looked.exposure_s, "together": looked.together,
-        "blurred": looked.blurred, "moves": looked.moves,
-        "directions": {each.name: _direction_as_json(each) for each in looked.directions},
-        "assumed": list(looked.assumed), "doubts": list(looked.doubts),
-    }  # fmt: skip
-
-
-def _direction_as_json(each: Direction) -> dict[str, Any]:
-    found = None if each.found is None else each.found.model.name
-    parameters = (
-        {}
-        if each.found is None
-        else {
-            one.name: {"value": one.best, "set": [[piece.low, piece.high] for piece in one.pieces]}
-            for one in each.found.parameters
-        }
-    )
-    return {
-        "moves": each.moves, "rms_pixels": each.size, "model": found, "parameters": parameters,
-        "path_sd_pixels": None if math.isnan(each.known) else each.known,
-        "centroid_sd_pixels": None if math.isnan(each.held) else each.held,
-    }  # fmt: skip

@@ -12,7 +12,8 @@ import numpy as np
 
 from aolink.errors import ExportError
 from aolink.files import writing
-from aolink.jobs.look import Direction, Looked, in_set, paragraph
+from aolink.jobs.look import Direction, Looked
+from aolink.jobs.look_words import in_set, paragraph
 from aolink.numerics.arrays import FloatArray
 from aolink.optics.kernel import pixel_masses
 from aolink.plotting.report import facts_table, html_page, picture_in_page

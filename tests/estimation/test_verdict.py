@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -79,7 +79,7 @@ def test_a_right_model_fits_and_no_bit_of_an_estimate_changes(rig: Rig, right: l
 @pytest.mark.parametrize(
     ("wrong", "kind"), [(lambda rig: with_noise(rig, 6.0), "motion"), (lambda rig: with_read_noise(rig, 1.6), "pixels")]
 )
-def test_a_wrong_model_is_found_and_its_intervals_are_wider(rig: Rig, wrong, kind: str) -> None:  # type: ignore[no-untyped-def]
+def test_a_wrong_model_is_found_and_its_intervals_are_wider(rig: Rig, wrong: Callable[[Rig], Rig], kind: str) -> None:
     exposures = simulate(wrong(rig), EXPOSURES, seed=5)
     made, plain = estimates_of(rig, exposures), estimates_of(rig, exposures, judged=False)
     verdict = made[-1].verdict
@@ -140,6 +140,32 @@ def test_the_fit_finds_the_mode_that_scipy_finds(rig: Rig, right: list[Exposure]
 
     best = optimize.least_squares(misfit, found.t[0], xtol=1e-12, ftol=1e-12)
     assert np.sum(misfit(found.t[0]) ** 2) - 2 * best.cost < 0.1
+
+
+@pytest.mark.parametrize("name", ["section-vi-lively", "tip-tilt"])
+def test_a_wider_kernel_has_the_signature_of_the_heat_equation(name: str) -> None:
+    """With the variance v of the kernel light changes by half its second derivative, in each direction by itself."""
+    rig = load_rig(name)
+    exposures = list(simulate(rig, 4, seed=5))
+    estimate = estimates_of(rig, exposures)[-1]
+    axes = np.arange(rig.plant.axes)
+    fit = _Fit(rig.sensor.profile, reduction(estimate.model, rig.sensor), estimate, axes)
+    measured, _ = measure(rig, exposures[-1], Needs(what="profile"))
+    assert isinstance(measured, Profile)
+    y = measured.density.reshape(len(axes), rig.plant.n_outputs, -1)
+    prior = fit.reduced.prior(Gaussian(estimate.start_state, estimate.start_covariance))
+    found = fit.to(y, np.ones(y.shape, dtype=bool), fit.start(estimate, axes), prior)
+
+    def light(factor: float) -> FloatArray:
+        width = np.sqrt(factor * fit.variance)[..., None, None]
+        below = special.ndtr((rig.sensor.profile.edges - found.path[..., None]) / width.reshape(-1, 1, 1))
+        return np.asarray(
+            np.einsum("k,aokp->aop", fit.weights, np.diff(below, axis=-1)) / rig.sensor.profile.pixel_size
+        )
+
+    change = (light(1 + 1e-4) - light(1 - 1e-4)) / 1e-4  # 2 v dL/dv
+    expected = float((change / found.sd * found.residual).sum())
+    assert fit.signatures(found)[0] == pytest.approx(expected, rel=1e-4)
 
 
 def test_residuals_of_right_models_are_those_of_frames_drawn(rig: Rig, right: list[Exposure]) -> None:

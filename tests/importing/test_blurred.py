@@ -16,15 +16,16 @@ FRAMES, SHAPE = 60, (48, 64)
 
 def shaken(
     *, sd: float = 1.8, amplitude: float = 3.2, angle: float = 0.3, cycles: float = 0.67, light: float = 20_000.0,
-    middles: tuple[tuple[float, float], ...] = ((30.3, 24.6),), noise: float = 20.0,
+    middles: tuple[tuple[float, float], ...] = ((30.3, 24.6),), noise: float = 20.0, step: float = 0.746,
+    phases: tuple[float, ...] = (0.0, 0.0),
 ) -> Film:  # fmt: skip
-    """Spots on a sinusoid of so many cycles in an exposure, whose phase goes on from frame to frame."""
+    """Spots on a sinusoid of so many cycles in an exposure, whose phase goes on by ``step`` cycles from frame to frame;
+    ``phases`` are those at which each spot begins, rad."""
     rng = np.random.default_rng(3)
-    phase = 2 * np.pi * (0.746 * np.arange(FRAMES)[:, None] + cycles * (np.arange(40) + 0.5) / 40)
-    along = amplitude * np.sin(phase)
+    phase = 2 * np.pi * (step * np.arange(FRAMES)[:, None] + cycles * (np.arange(40) + 0.5) / 40)
     frames = 1000 + noise * rng.normal(size=(FRAMES, *SHAPE))
-    for middle in middles:
-        for k, each in enumerate(along):
+    for middle, begun in zip(middles, phases, strict=False):
+        for k, each in enumerate(amplitude * np.sin(phase + begun)):
             x, y = (
                 pixel_masses(sd**2, np.arange(-0.5, size), middle[d] + each * (np.cos(angle), np.sin(angle))[d], 0)[0]
                 for d, size in ((0, SHAPE[1]), (1, SHAPE[0]))

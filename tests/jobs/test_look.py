@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -13,7 +14,8 @@ import pytest
 from aolink.errors import ImportingError
 from aolink.films.film import array_film
 from aolink.importing.frames import FilmSettings
-from aolink.jobs.look import look, paragraph
+from aolink.jobs.look import look
+from aolink.jobs.look_words import paragraph
 from aolink.recording.reader import Recording
 from aolink.rig import load_rig, parse_rig
 from tests.importing.test_blurred import shaken
@@ -95,3 +97,48 @@ def test_the_command_writes_a_rig_file_a_recording_and_a_page(aolink: Run, tmp_p
     again = aolink("look", "film.npz", "--quick")
     assert again.returncode != 0
     assert "exists already" in again.stderr
+
+
+@pytest.mark.slow
+def test_an_alias_that_would_blur_the_spot_is_left_out_of_the_set() -> None:
+    """At 3.3 Hz the exposures hardly blur; at 46.7 or 53.3 Hz, which the centroids allow too, they would."""
+    looked = look(
+        shaken(cycles=0.9 * 3.3 / RATE, step=3.3 / RATE, angle=0.0), FilmSettings(exposure_s=0.9 / RATE), "slow"
+    )
+    found = looked.directions[0].found
+    assert not looked.blurred
+    assert found is not None
+    hz = next(each for each in found.parameters if each.name == "frequency_hz")
+    assert hz.holds(3.3)
+    assert len(hz.pieces) == 1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("apart", [False, pytest.param(True, marks=pytest.mark.rare)])
+def test_spots_with_one_motion_are_told_from_those_with_their_own(apart: bool) -> None:
+    """The likelihood says it; a hot pixel in a window costs no exposure."""
+    middles = ((14.0, 24.0), (48.0, 24.0))
+    film = shaken(middles=middles, amplitude=2.0, angle=0.0, phases=(0.0, 1.9) if apart else (0.0, 0.0))
+    frames = np.stack(list(film.frames()))
+    frames[:, 24, 52] = 3000
+    looked = look(array_film(frames, "two", rate_hz=RATE), FilmSettings(exposure_s=EXPOSURE), "two")
+    assert looked.together is not apart
+    assert len(looked.spots.corners) == 2
+    rig = parse_rig(looked.text)
+    assert (rig.plant.axes, rig.n_outputs) == ((2, 4) if apart else (1, 4))
+    assert looked.directions[0].found is not None
+
+
+@pytest.mark.slow
+def test_without_matplotlib_there_is_an_answer_and_no_page(tmp_path: Path) -> None:
+    np.savez(
+        tmp_path / "film.npz", frames=np.stack(list(shaken(amplitude=0.0).frames())), rate_hz=RATE, exposure_s=EXPOSURE
+    )
+    hidden = "import sys; sys.modules['matplotlib'] = None; from aolink.cli import main; main()"
+    done = subprocess.run(
+        [sys.executable, "-c", hidden, "look", "film.npz"], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert "nothing moves" in done.stdout
+    assert "no page with pictures" in done.stdout
+    assert sorted(each.name for each in (tmp_path / "film-look").iterdir()) == ["film.mcap", "rig.toml"]
