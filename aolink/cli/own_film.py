@@ -122,7 +122,7 @@ def look(
         files = {"rig": str(rig_file), "recording": str(recording), "page": str(page) if page.exists() else None}
         print(json.dumps({"text": paragraph(looked), **numbers(looked), **files}, allow_nan=False))
     else:
-        lines = [*(f"{each}." for each in looked.doubts), "Assumed:", *(f"  {each}." for each in looked.assumed)]
+        lines = [*(f"{each}." for each in looked.caveats), "Assumed:", *(f"  {each}." for each in looked.assumed)]
         lines += [f"{drawn}. To go on:", *(f"  {each}" for each in commands)]
         stdout.print("\n".join(lines), markup=False)
     if interrupted is not None:

@@ -143,8 +143,25 @@ class Likelihood:
                     patterns.setdefault(seen.usable[o, some].tobytes(), []).append((o, some))
         return list(patterns.values())
 
+    def whitened_means(self, model: DisturbanceProcesses, nodes: int | None = None) -> list[FloatArray]:
+        """The means of each long run of exposures as innovations: what the means before do not predict, over its
+        standard deviation. White noise of variance one where the model is right; (good exposures,) each."""
+        constants, runs = self._whitened(model, nodes or self.nodes(model), 1.0)
+        return [each for output, white, ones, _ in runs for each in (white - ones[:, None] * constants[output]).T]
+
     def _of_means(self, model: DisturbanceProcesses, nodes: int, noise: float, out: FloatArray) -> FloatArray:
         """Add the log-density of each output's means to ``out``; the constants of the outputs that make it largest."""
+        constants, runs = self._whitened(model, nodes, noise)
+        for output, white, ones, scale in runs:
+            left = white - ones[:, None] * constants[output]
+            np.add.at(out, output, -0.5 * (left**2).sum(axis=0) - scale)
+        return constants
+
+    def _whitened(
+        self, model: DisturbanceProcesses, nodes: int, noise: float
+    ) -> tuple[FloatArray, list[tuple[Indices, FloatArray, FloatArray, float]]]:
+        """The constants of the outputs that make the means' density largest; and of long runs that are alike the
+        outputs, the whitened means (exposures, runs), whitened ones, and the logarithm of the densities' scale."""
         seen, (rows, weights) = self.seen, self._rule(nodes)
         at = np.asarray(rows @ np.arange(float(seen.n_steps))) * seen.step_s
         run = min(_LONG_RUN, seen.slots)
@@ -159,7 +176,7 @@ class Likelihood:
             within = walk * (np.minimum(at[:, None], at) @ weights @ weights - weights @ at)
             sigma += walk * (np.minimum(begin[:, None], begin) + weights @ at) + _WALK_START * seen.reach**2
             sigma[np.diag_indices(run)] += within
-        top, count = np.zeros(len(out)), np.zeros(len(out))
+        top, count = np.zeros(len(seen.mean)), np.zeros(len(seen.mean))
         whitened = []
         for usable, output, y in self._in_long_runs(nodes, run):
             n = np.flatnonzero(usable)
@@ -173,11 +190,7 @@ class Likelihood:
             np.add.at(count, output, ones @ ones)
             scale = np.log(np.diagonal(root)).sum() + 0.5 * len(n) * math.log(2 * math.pi)
             whitened.append((output, white, ones, scale))
-        constants = np.asarray(top / np.maximum(count, 1e-300))
-        for output, white, ones, scale in whitened:
-            left = white - ones[:, None] * constants[output]
-            np.add.at(out, output, -0.5 * (left**2).sum(axis=0) - scale)
-        return constants
+        return np.asarray(top / np.maximum(count, 1e-300)), whitened
 
     def _in_long_runs(self, nodes: int, run: int) -> list[tuple[BoolArray, Indices, FloatArray]]:
         """The means without the inputs' response in long runs: usable (run,), outputs (runs,), means (runs, good)."""

@@ -141,7 +141,7 @@ class Space:
 
 def space_of(
     kinds: Sequence[str], seen: Sequence[Readings], kernel_variance: float, *, with_noise: bool, with_kernel: bool,
-    highest_hz: float | None = None, plant: str | None = None,
+    lowest_hz: float | None = None, highest_hz: float | None = None, plant: str | None = None,
 ) -> Space:  # fmt: skip
     """The parameters of a sum of processes, and of a plant, within limits that the recordings set.
 
@@ -157,7 +157,7 @@ def space_of(
     if top > 0.5 / one.step_s:
         raise IdentificationError(f"{top:g} Hz is above half of the fast rate, {0.5 / one.step_s:g} Hz")
     limits = {
-        "frequency_hz": (0.5 / whole, top),
+        "frequency_hz": (lowest_hz or 0.5 / whole, top),
         "damping": (1e-4, 0.95),
         "sd": (1e-4 * one.reach, 4 * one.reach),
         "correlation_s": (exposure / 100, 10 * whole),

@@ -48,9 +48,10 @@ _WIDTHS = 1.02 ** np.arange(-40, 92)
 """Standard deviations of the kernels that are tried, pixels: .45 to 6."""
 _FINE = 3
 """Places in a pixel at which a density may be: with one, a sharp spot between two pixels looks wider than it is."""
-_NARROWER, _WORSE, _SURE = 8, 1.0, 2.5
+_NARROWER, _WORSE, _SHARE, _SURE = 8, 1.0, 0.1, 2.5
 """A kernel is too wide where the squares of a profile's residuals exceed those with one so many steps narrower by so
-many squares of the noise, and by so many standard deviations of chance."""
+many squares of the noise, and by so many standard deviations of chance. The first too wide is looked for with a rise by
+such a share, since they rise a little with every width where the noise is larger than it is taken for."""
 _BRIGHT, _SHOT, _FEWEST_PIXELS = 0.3, 0.3, 100
 """Shot noise is looked for in pixels of profiles with this share of the brightest one's light; the share of the dark
 noise's variance that shows; and how many such pixels are enough."""
@@ -65,7 +66,7 @@ class Spots:
 
     light: FloatArray
     """Light above the ground in each spot's window, over the spot's light, (frames, n, side, side); NaN where a pixel
-    cannot be used, zero where it is nearer to another spot."""
+    cannot be used, zero where it is nearer to another spot or beyond the picture."""
     corners: IntArray
     """First pixel of each window, (n, 2)."""
     sd: float
@@ -105,8 +106,8 @@ def find_spots(
         )
     middles = np.array([middle for middle, _ in boxes])
     corners = np.rint(middles - (side - 1) / 2).astype(np.int64)
-    windows, bad = _windows(film, light, defects, count, corners, side, lambda done: progress(count + done))
-    others = _nearer_to_others(corners, side, middles)
+    windows, bad, outside = _windows(film, light, defects, count, corners, side, lambda done: progress(count + done))
+    others = _nearer_to_others(corners, side, middles) | outside
     windows[:, others] = np.nan
     windows -= _ground(windows)
     amounts = np.nansum(windows, axis=(2, 3))
@@ -193,9 +194,9 @@ def _windows(
     corners: IntArray,
     side: int,
     progress: Callable[[int], None],
-) -> tuple[FloatArray, BoolArray]:
+) -> tuple[FloatArray, BoolArray, BoolArray]:
     """The light in the windows, NaN where it cannot be used, and where it is saturated or hot, (frames, n, side, side)
-    each."""
+    each; where windows go beyond the picture, (n, side, side)."""
     windows = np.empty((count, len(corners), side, side))
     bad = np.zeros(windows.shape, dtype=np.bool_)
     rows, columns = film.shape
@@ -210,7 +211,7 @@ def _windows(
     # Hot and dead pixels have the light of those about them: without it no sum over the window could be used.
     hot = defects[y[:, :, None], x[:, None, :]]
     windows[(bad & ~hot) | ~inside] = np.nan
-    return windows, bad
+    return windows, bad, ~inside
 
 
 def _nearer_to_others(corners: IntArray, side: int, middles: FloatArray) -> BoolArray:
@@ -290,15 +291,17 @@ def _kernel(profiles: list[FloatArray], noises: list[FloatArray]) -> float:
 
         coarse = range(0, len(_WIDTHS), _NARROWER)
 
-        def too_wide(k: int) -> float:
+        def too_wide(k: int, share: float = 0.0) -> float:
             more = misfit(k) - misfit(k - _NARROWER)
-            return float(more.mean() - max(_WORSE, _SURE * more.std() / math.sqrt(len(more))))
+            chance = _SURE * float(more.std()) / math.sqrt(len(more))
+            return float(more.mean()) - max(_WORSE, share * float(misfit(k - _NARROWER).mean()), chance)
 
-        right = [k for k in coarse[1:] if too_wide(k) <= 0]
-        if not right or right[-1] == coarse[-1]:
+        wrong = next((k for k in coarse[1:] if too_wide(k, _SHARE) > 0), coarse[1])
+        if wrong == coarse[1]:
             continue
-        last = max(k for k in range(right[-1], right[-1] + _NARROWER) if too_wide(k) <= 0)
-        part = too_wide(last) / (too_wide(last) - too_wide(last + 1))
+        within = range(wrong - _NARROWER, wrong)
+        last = max((k for k in within if too_wide(k) <= 0), default=within[0])
+        part = max(0.0, too_wide(last) / (too_wide(last) - too_wide(last + 1)))
         widest = min(widest, float(_WIDTHS[last] * (_WIDTHS[1] / _WIDTHS[0]) ** part))
     return widest
 

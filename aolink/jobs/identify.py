@@ -39,6 +39,7 @@ class Wanted:
     """Whether the pixels' noise is fitted as well."""
     kernel: bool = False
     """Whether the kernel's width, and its changes from exposure to exposure, are fitted as well."""
+    lowest_hz: float | None = None
     highest_hz: float | None = None
     pixels: bool = True
     """Whether all pixels distinguish aliases, where they can."""
@@ -128,7 +129,7 @@ def space_wanted(rig: Rig, kinds: Sequence[str], seen: Sequence[Readings], wante
     """The parameters of a sum of kinds, and of all else that is wanted."""
     return identification.space_of(
         kinds, seen, rig.sensor.kernel.variance, with_noise=wanted.noise, with_kernel=wanted.kernel,
-        highest_hz=wanted.highest_hz, plant=wanted.plant,
+        lowest_hz=wanted.lowest_hz, highest_hz=wanted.highest_hz, plant=wanted.plant,
     )  # fmt: skip
 
 

@@ -21,6 +21,7 @@ from aolink.estimation.verdict import Fit
 from aolink.exposure import Exposure
 from aolink.films.film import Film
 from aolink.identification import FEWEST, Identified, Maximum, Piece, Readings, kinds_of, maxima, readings
+from aolink.identification.likelihood import Likelihood
 from aolink.identification.models import ProcessSum
 from aolink.identification.rig_text import as_table
 from aolink.importing.blurred import Spots, find_spots
@@ -52,6 +53,12 @@ _NOTHING = 1e6
 """Variance of readings that say nothing."""
 _SETTLED = 8
 """Exposures after which an estimator has found the path."""
+_SLOWEST = 50
+"""Frames in a cycle of the slowest vibration that is told from a drift, at most."""
+_CHANCE = 1e-3
+"""Chance of a line in what a model leaves of the places, below which it is taken for one."""
+_MUCH_WIDER = 1.5
+"""Widening of the intervals from which on the verdict that a model does not fit is a doubt."""
 _UNEVEN = 0.003
 """Share by which the exposure may differ from a whole number of fast steps."""
 _REST = 2.0
@@ -85,7 +92,9 @@ class Direction:
     path: FloatArray | None = None
     """The path in each exposure, pixels of the window, (frames, n, steps)."""
     misfit: str = ""
-    """The estimator's verdict on the model in words; empty unless it does not fit."""
+    """The estimator's verdict on the model in words; empty unless it does not fit, and by much."""
+    left_hz: float | None = None
+    """Frequency, below half the frame rate, of a line in what the model leaves of the places; None without one."""
 
     @property
     def size(self) -> float:
@@ -123,8 +132,15 @@ class Looked:
     """The settings to import it with."""
     assumed: tuple[str, ...]
     """What was assumed, and what follows where it is wrong."""
+    unknown: str
+    """Why it cannot be told what happens inside an exposure, and what would help; empty where it can."""
     doubts: tuple[str, ...]
-    """Why something cannot be told, and what would help."""
+    """Reasons to mistrust the answer, and what would help."""
+
+    @property
+    def caveats(self) -> tuple[str, ...]:
+        """What cannot be told, and all doubts."""
+        return ((self.unknown,) if self.unknown else ()) + self.doubts
 
     @property
     def blurred(self) -> bool:
@@ -203,11 +219,20 @@ def look(
     for d, each in enumerate(directions):
         if each.moves:
             directions[d] = _identified(scene, d, each, which, sd, names, partial(_say, tell, each.name))
-    doubts = tuple(_doubts(spots, directions, sd, given=kernel is not None))
+    for d, each in enumerate(directions):
+        if (band := _common_band(each, directions[1 - d])) is not None:
+            directions[d] = _identified(scene, d, each, which, sd, names, partial(_say, tell, each.name), band)
+    unknown = ""
+    if not any(each.blurred for each in directions):
+        unknown = (
+            f"cannot tell what happens inside an exposure: the blur, {max(each.blur for each in directions):.2g} pixels"
+            f" rms, is below a third of the kernel, {sd:.2g} pixels: expose longer"
+        )
+    doubts = tuple(_doubts(spots, directions, sd, given=kernel is not None, thorough=thorough))
     return Looked(
         spots=spots, rate_hz=rate, exposure_s=exposure_s, sd=sd, together=together, directions=tuple(directions),
         text=scene.text(sd, directions, together=together), cut=scene.cut(sd), settings=scene.settings,
-        assumed=tuple(_assumed(film, settings, scene, kernel)), doubts=doubts,
+        assumed=tuple(_assumed(film, settings, scene, kernel)), unknown=unknown, doubts=doubts,
     )  # fmt: skip
 
 
@@ -258,19 +283,21 @@ def _one_motion(seen: Sequence[Sequence[Readings]]) -> bool:
 
 def _identified(
     scene: _Scene, d: int, direction: Direction, which: Sequence[int], sd: float, names: Sequence[str],
-    tell: Tell,
+    tell: Tell, band: tuple[float, float] | None = None,
 ) -> Direction:  # fmt: skip
-    """The direction with the model of its motion and the errors of its path."""
+    """The direction with the model of its motion and the errors of its path; with a band, it is one vibration in it."""
     films = [scene.along(d, k, sd)[1] for k in which]
     rig, some = parse_rig(scene.line_text(sd)), films[0][:_SEARCHED]
-    wanted, seen = Wanted(), [readings(rig, each[:_SEARCHED]) for each in films]
+    wanted, seen = Wanted(lowest_hz=scene.rate_hz / _SLOWEST), [readings(rig, each[:_SEARCHED]) for each in films]
     if not direction.blurred:
         # Sharp frames show places, and of the width only how well the kernel is known.
-        wanted = Wanted(highest_hz=scene.rate_hz / 2, pixels=False)
+        wanted = replace(wanted, highest_hz=scene.rate_hz / 2, pixels=False)
         seen = [replace(each, square_noise=np.full_like(each.square_noise, _NOTHING)) for each in seen]
+    if band is not None:
+        wanted, names = replace(wanted, lowest_hz=band[0], highest_hz=band[1]), ("resonance",)
     name, tops = _best_model(rig, seen, names, wanted, tell)
     found = from_readings(rig, seen, some, replace(wanted, models=(name,)), tell, tops).found[0]
-    if not direction.blurred:
+    if not direction.blurred and band is None:
         found = _with_aliases(found, scene, LEAST_BLUR * sd)
     rig = parse_rig(scene.line_text(sd, found.model))
     each_film = [run(rig, each, ["profile"])["profile"] for each in films]
@@ -279,7 +306,12 @@ def _identified(
     error = float(np.mean(np.square([each.path_sd for each in settled])))
     within = float(np.mean((path[_SETTLED:] - path[_SETTLED:].mean(axis=2, keepdims=True)) ** 2))
     verdicts = [each[-1].verdict for each in each_film]
-    misfits = [each.text for each in verdicts if each is not None and each.fit is Fit.DOES_NOT_FIT]
+    misfits = [
+        each.text
+        for each in verdicts
+        if each is not None and each.fit is Fit.DOES_NOT_FIT and each.widening > _MUCH_WIDER
+        if direction.blurred or each.kind == "motion"  # what sharp frames tell needs no kernel
+    ]
     return replace(
         direction,
         found=found,
@@ -287,7 +319,35 @@ def _identified(
         held=scene.unit * math.sqrt(within + error),
         path=scene.unit * (path + 1) - 0.5,
         misfit=misfits[0] if misfits else "",
+        left_hz=_line_left([readings(rig, each) for each in films], found.model, scene.rate_hz),
     )
+
+
+def _common_band(one: Direction, other: Direction) -> tuple[float, float] | None:
+    """The band of the frequency of the vibration along the other direction, which is certain, where one of the aliases
+    along this one is in it: then a single vibration aslant explains both. None where there is no such thing."""
+    if one.found is None or other.found is None or {one.found.model.name, other.found.model.name} != {"resonance"}:
+        return None
+    (hz,), (certain,) = (
+        [each for each in found.parameters if each.name == "frequency_hz"] for found in (one.found, other.found)
+    )
+    if len(hz.pieces) < 2 or len(certain.pieces) != 1:
+        return None
+    (piece,) = certain.pieces
+    own = [each for each in hz.pieces if each.low <= piece.high and each.high >= piece.low]
+    return (min(own[0].low, piece.low), max(own[0].high, piece.high)) if own else None
+
+
+def _line_left(seen: Sequence[Readings], model: ProcessSum, rate_hz: float) -> float | None:
+    """The frequency of a line in the innovations of the places, where chance does not explain it: Fisher's test (1929)
+    of the largest value of a periodogram against their mean."""
+    left = [one for each in seen for one in Likelihood(each, 1).whitened_means(model)]
+    count = max(map(len, left))
+    power = np.mean([np.abs(np.fft.rfft(each - each.mean())) ** 2 for each in left if len(each) == count], axis=0)
+    power = power[1 : (count + 1) // 2]
+    top = int(power.argmax())
+    chance = len(power) * (1 - power[top] / power.sum()) ** (len(power) - 1)
+    return (top + 1) / count * rate_hz if chance < _CHANCE else None
 
 
 def _with_aliases(found: IdentifiedModel, scene: _Scene, most_blur: float) -> IdentifiedModel:
@@ -330,6 +390,9 @@ def _best_model(
             found = maxima(space, seen)
         except IdentificationError:
             continue
+        hz = [math.exp(x) for each, x in zip(space.names, found[0].x, strict=True) if each.endswith("frequency_hz")]
+        if len(names) > 1 and hz and wanted.lowest_hz and min(hz) < 1.05 * wanted.lowest_hz:
+            continue  # a drift, which the limit keeps from being as slow as it is
         value = found[0].log_likelihood - len(space.names) * math.log(count) / 2
         best = max(best, (value, name, found), key=lambda each: each[0])
     if not best[1]:
@@ -468,14 +531,9 @@ def _assumed(film: Film, settings: FilmSettings, scene: _Scene, kernel: float | 
         yield f"the first {len(spots.light)} of {film.count} frames are looked at: later motion may be another"
 
 
-def _doubts(spots: Spots, directions: Sequence[Direction], sd: float, *, given: bool) -> Iterator[str]:
-    """Why something cannot be told, and what would help."""
-    if not any(each.blurred for each in directions):
-        yield (
-            f"cannot tell what happens inside an exposure: the blur, {max(each.blur for each in directions):.2g} pixels"
-            f" rms, is below a third of the kernel, {sd:.2g} pixels: expose longer"
-        )
-    elif not given and min(each.least_blur for each in directions) >= LEAST_BLUR * sd:
+def _doubts(spots: Spots, directions: Sequence[Direction], sd: float, *, given: bool, thorough: bool) -> Iterator[str]:
+    """Reasons to mistrust what was found, and what would help."""
+    if not given and min(each.least_blur for each in directions) >= LEAST_BLUR * sd:
         yield (
             f"no frame shows the spot as narrow as its kernel, {sd:.2g} pixels, along x or along y: this width is known"
             " from the steep sides of the blur alone, and holds for a Gaussian spot only; if a spot at rest is wider,"
@@ -484,6 +542,11 @@ def _doubts(spots: Spots, directions: Sequence[Direction], sd: float, *, given: 
     for each in directions:
         if each.misfit:
             yield f"along {each.name} {each.misfit}"
+        if each.left_hz is not None:
+            yield (
+                f"along {each.name} a vibration at {each.left_hz:.3g} Hz or an alias of it is left over, which the"
+                f" model does not have: {'frequencies may be wrong' if thorough else 'without --quick sums are tried'}"
+            )
     if spots.saturated > 0.001:
         yield f"{spots.saturated:.1%} of the pixels about the spots are saturated or hot and are left out: expose less"
     if spots.at_edge:

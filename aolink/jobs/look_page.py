@@ -35,7 +35,7 @@ def write_page(looked: Looked, path: Path, name: str, commands: Sequence[str], *
     """Write the page. Raises ExportError where it exists and not ``overwrite``, or without matplotlib."""
     with paper(), writing(path, overwrite=overwrite, suffix=".html", error=ExportError) as partial:
         parts = [f"<h1>{escape(name)}</h1>", f"<p>{escape(paragraph(looked))}</p>"]
-        parts += [f'<p class="note">{escape(each)}.</p>' for each in looked.doubts]
+        parts += [f'<p class="note">{escape(each)}.</p>' for each in looked.caveats]
         figures = [picture_in_page(_whole(looked), "The mean of the frames, and the windows of the spots.")]
         if looked.moves:
             caption = "Three exposures, from much to little blur, with the path of the spot in them."

@@ -73,7 +73,7 @@ def in_set(each: Identified, most: int = 4) -> str:
         return said
     named = ", ".join(f"{piece.best:.{digits}f}" for piece in others[:most])
     more = " and so on" if len(others) > most else ""
-    return f"{said} or an alias of it, {named} Hz{more}, which these frames cannot tell from it,"
+    return f"{said} or an alias of it ({named} Hz{more}), which these frames cannot tell from it"
 
 
 def _digits(value: float) -> str:
@@ -87,7 +87,7 @@ def as_json(looked: Looked) -> dict[str, Any]:
         "rate_hz": looked.rate_hz, "exposure_s": looked.exposure_s, "together": looked.together,
         "blurred": looked.blurred, "moves": looked.moves,
         "directions": {each.name: _direction_as_json(each) for each in looked.directions},
-        "assumed": list(looked.assumed), "doubts": list(looked.doubts),
+        "assumed": list(looked.assumed), "unknown": looked.unknown or None, "doubts": list(looked.doubts),
     }  # fmt: skip
 
 
