@@ -1,4 +1,6 @@
-"""The function that estimates one recording in one call, for batches on any engine: see `aolink/jobs/README.md`.
+"""The function that estimates one recording in one call, for batches on any engine.
+
+`aolink/pages/many_recordings.md` shows how.
 
 >>> from aolink.batch import Settings
 >>> Settings(estimator="moments").estimator

@@ -1,5 +1,9 @@
 """Controllers: they give the mirror's inputs from exposures and estimates. The subpackage knows no time, files or
-ports."""
+ports: `aolink.session.controlling` runs a loop in a session, `aolink.jobs.closed_loop` in memory.
+
+An exposure ends at a fast step e, and the first step that a new command can reach is e + d. The inputs from e to
+e + d - 1 are fixed, and the controller is given them. The page is `aolink/pages/close_a_loop.md`.
+"""
 
 from aolink.control.controller import Controller, ControllerRow, Seen
 from aolink.control.drift import Fit, FitMonitor

@@ -2,6 +2,9 @@
 
 `overview` reads a series once; figures of the whole session are drawn from it, figures of one exposure from the series.
 `save_figure` writes one in a paper's size, `write_report` puts them on one page.
+
+To add a figure: a function like `plot_nis`, a row in `files.FIGURES`, its name here and in ``Figure`` of
+`aolink.cli.figures`, and a word in `aolink/pages/view_and_report.md`.
 """
 
 from aolink.plotting.devices import incidents, plot_latency, plot_losses

@@ -1,5 +1,9 @@
-"""Restoration: the estimated path gives a picture without its blur. The subpackage is pure: no time, no files, no
-ports."""
+"""Restoration: the estimated path gives a picture without its blur. The subpackage is pure: no time, no ports,
+and files in `films` only.
+
+To add a method: a row in `registry`, a test in `tests/restoration/test_restore.py`, and a line in the list of
+`aolink/pages/restore.md`. The command line, its help, the benchmark and the viewer read the row.
+"""
 
 from typing import TYPE_CHECKING, Any
 

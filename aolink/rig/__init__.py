@@ -1,4 +1,9 @@
-"""The description of a rig: a TOML file, and the frozen dataclasses that it becomes."""
+"""The description of a rig: a TOML file, and the frozen dataclasses that it becomes.
+
+A new key is a field of its table's dataclass, with its meaning and unit below it and a default, so that old files still
+work; a new table is a field of ``_File`` in `file`. Refuse what cannot work where the table is read; report what is
+doubtful in `aolink.jobs.check_rig`. Then ``tools/keys`` writes KEYS.md.
+"""
 
 from aolink.optics.sensor import Kernel, Sensor, SpotSensor
 from aolink.rig.file import Rig, builtin_rigs, load_rig, parse_rig

@@ -2,6 +2,10 @@
 
 Each topic has a function that turns a batch of plain data into Rerun entities on a given stream; `save_rrd`
 calls them with a whole recording, `LiveView` with one exposure after the other.
+
+To add a view: a name in `entities`, a function that sends it, its call (the topic's ``shown_by``, or `Sender.send`),
+and its place in `blueprint` with the unit in its name. What matplotlib draws too is computed in `aolink.gathered`. No
+estimator, SciPy or pandas is loaded until the first picture.
 """
 
 from typing import TYPE_CHECKING
