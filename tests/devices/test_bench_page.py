@@ -1,4 +1,4 @@
-"""The numbers that the page for the optical bench tells its reader to expect, with the simulated rig as the bench."""
+"""The numbers that the page of a first session tells its reader to expect, with the simulated rig as the bench."""
 
 from __future__ import annotations
 

@@ -19,8 +19,8 @@ from aolink.recording.reader import Recording
 from aolink.session import record
 from tests.devices.mirrors import bench
 
-PAGE = Path(__file__).parents[2] / "aolink" / "devices" / "README.md"
-WORDS = 2_500
+PAGE = Path(__file__).parents[2] / "aolink" / "pages" / "devices.md"
+WORDS = 1_500
 
 
 @pytest.fixture(autouse=True)

@@ -1,4 +1,4 @@
-"""Small recordings as other software writes them, by recordings/FORMAT.md: few exposures, dark ones, none at all."""
+"""Small recordings as other software writes them (pages/recording_format.md): few exposures, dark ones, none at all."""
 
 from __future__ import annotations
 

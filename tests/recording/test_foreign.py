@@ -25,6 +25,7 @@ from aolink.wire.runs_pb2 import Run
 from tests.conftest import Session
 
 ROOT = Path(__file__).parents[2]
+PAGE = ROOT / "aolink" / "pages" / "recording_format.md"
 RERUN = Path(sys.executable).parent / "rerun"
 
 
@@ -109,10 +110,10 @@ def test_messages_of_other_software_come_along(recorded: Session, tmp_path: Path
 
 def test_the_page_for_other_software_is_right(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The example runs as it stands, and what it writes can be estimated."""
-    (code,) = re.findall(r"```python\n(.*?)```", (ROOT / "recordings" / "FORMAT.md").read_text(), re.DOTALL)
+    (code,) = re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.DOTALL)
     shutil.copytree(ROOT / "aolink" / "rigs", tmp_path / "aolink" / "rigs")
     monkeypatch.chdir(tmp_path)
-    exec(compile(code, "FORMAT.md", "exec"), {})
+    exec(compile(code, PAGE.name, "exec"), {})
     recording = Recording(tmp_path / "mine.mcap")
     assert len(reestimate(recording, ["o3"])["o3"]) == 10
     rerun_check(tmp_path / "mine.mcap")
