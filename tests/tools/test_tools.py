@@ -35,6 +35,11 @@ def test_what_protocol_generates_is_what_is_there(tmp_path: Path) -> None:
         assert (tmp_path / each).read_bytes() == (ROOT / each).read_bytes(), f"run tools/protocol: {each} is old"
 
 
+def test_pages_that_are_made_from_the_code_say_what_it_says() -> None:
+    done = run(TOOLS / "pages", "--check")
+    assert done.returncode == 0, done.stderr
+
+
 def test_the_scene_is_the_one_that_is_drawn(tmp_path: Path) -> None:
     done = run(TOOLS / "scene", tmp_path / "scene.png")
     assert done.returncode == 0, done.stderr
