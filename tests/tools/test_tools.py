@@ -128,8 +128,11 @@ def test_pictures_are_made_and_are_those_of_the_pages(name: str, tmp_path: Path)
 
 
 def test_links_of_the_pages_lead_somewhere() -> None:
-    for page in (ROOT / "README.md", ROOT / "recordings" / "pictures" / "README.md"):
-        links = re.findall(r"\]\(([^)#]+)", page.read_text())
-        assert links
-        for link in links:
-            assert (page.parent / link).exists(), f"{page}: {link}"
+    pages = [
+        *ROOT.glob("*.md"),
+        *(page for top in ("aolink", "recordings", "tools") for page in (ROOT / top).rglob("*.md")),
+    ]
+    for page in pages:
+        for link in re.findall(r"\]\(([^)#]+)", page.read_text()):
+            assert link.startswith("https://") or (page.parent / link).exists(), f"{page}: {link}"
+    assert len(pages) > 10
