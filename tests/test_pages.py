@@ -102,7 +102,6 @@ def code_blocks(page: Path) -> Iterator[CodeBlock]:
 
 BLOCKS = [block for page in PAGES for block in code_blocks(page)]
 NO_CODE = {
-    "errors, files, limits, signals": "the list of subpackages",
     "Copyright (c)": "a licence",
     "MIT License": "a licence",
     "aolink sim section-vi --real-time --listen": "test_the_block_of_a_tunnel_works",

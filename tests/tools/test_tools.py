@@ -35,6 +35,11 @@ def test_what_protocol_generates_is_what_is_there(tmp_path: Path) -> None:
         assert (tmp_path / each).read_bytes() == (ROOT / each).read_bytes(), f"run tools/protocol: {each} is old"
 
 
+def test_pages_that_are_made_from_the_code_say_what_it_says() -> None:
+    done = run(TOOLS / "pages", "--check")
+    assert done.returncode == 0, done.stderr
+
+
 def test_the_scene_is_the_one_that_is_drawn(tmp_path: Path) -> None:
     done = run(TOOLS / "scene", tmp_path / "scene.png")
     assert done.returncode == 0, done.stderr
@@ -123,8 +128,11 @@ def test_pictures_are_made_and_are_those_of_the_pages(name: str, tmp_path: Path)
 
 
 def test_links_of_the_pages_lead_somewhere() -> None:
-    for page in (ROOT / "README.md", ROOT / "recordings" / "pictures" / "README.md"):
-        links = re.findall(r"\]\(([^)#]+)", page.read_text())
-        assert links
-        for link in links:
-            assert (page.parent / link).exists(), f"{page}: {link}"
+    pages = [
+        *ROOT.glob("*.md"),
+        *(page for top in ("aolink", "recordings", "tools") for page in (ROOT / top).rglob("*.md")),
+    ]
+    for page in pages:
+        for link in re.findall(r"\]\(([^)#]+)", page.read_text()):
+            assert link.startswith("https://") or (page.parent / link).exists(), f"{page}: {link}"
+    assert len(pages) > 10
