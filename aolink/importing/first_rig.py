@@ -45,7 +45,7 @@ def first_rig(film: Film, settings: FilmSettings, name: str, progress: Callable[
 
     The slope unit is half a window. The plant has a copy for each object and direction; its input is the shift of the
     window that follows the object. Raises `ImportingError` where there are fewer objects, or the frame rate is not
-    known or contradicts the film's times.
+    known or contradicts the film's times, or an exposure is a single frame: `aolink.jobs.look` is for these.
     """
     if film.slopes:
         raise ImportingError(f"{film.name} has slopes and no pictures: a first rig file is made from pictures")
@@ -60,6 +60,11 @@ def first_rig(film: Film, settings: FilmSettings, name: str, progress: Callable[
     if film.nonlinear and settings.gamma == 1.0:
         said.append(nonlinear_note(film))
     objects = find_objects(film, settings)
+    if settings.frames_per_exposure < 2:
+        raise ImportingError(
+            f"a first rig file is for exposures that are sums of sharp frames: say of how many, 2 or more; or let"
+            f" `aolink look {film.name}` make one whose exposures are the single frames, from their blur"
+        )
     known = survey(film, settings, objects, progress)
     places = np.full((int(periods[-1]) + 1, 2 * settings.track), np.nan)  # lost frames show nothing
     places[periods] = known.places.reshape(len(periods), -1)

@@ -210,6 +210,9 @@ def test_a_first_rig_file_has_the_films_name_where_none_is_given(aolink, tmp_pat
     along_x, along_y = np.exp(-(((np.arange(40) - at[..., None]) / 1.6) ** 2) / 2).swapaxes(0, 1)
     np.save(tmp_path / "bead.npy", (500 + 2000 * along_y[:, :, None] * along_x[:, None, :]).astype(np.uint16))
     done = aolink("rig", "--from", "bead.npy", "--rate", "50", "--track", "1")
+    assert (done.returncode, done.stdout) == (11, "")
+    assert "`aolink look bead.npy`" in done.stderr  # single frames are exposures whose blur tells more
+    done = aolink("rig", "--from", "bead.npy", "--rate", "50", "--track", "1", "--sum", "4")
     assert (done.returncode, done.stderr) == (0, "")
     assert "bead.toml: written from bead.npy" in done.stdout
     assert aolink("rig", "bead.toml", "--check").returncode == 0
