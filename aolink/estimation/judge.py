@@ -5,7 +5,7 @@ them decide. That of the pixels is Student's t of the residuals beyond those of 
 of the motion is the sum of squared, white errors of prediction of the spot's mean position, each made normal (Wilson &
 Hilferty, Proc. Natl. Acad. Sci. 17 (1931)), or the mean of these errors. The estimator's own NIS, made normal as well,
 decides with them; it does not say which of the two it is, and is wider than a chi-square, since posteriors are not
-Gaussian.
+Gaussian. So does the share of exposures that are gated, which cannot be compared.
 """
 
 from __future__ import annotations
@@ -43,6 +43,9 @@ _NIS_SPREAD, _NIS_SPREAD_OF_MIXTURES = 1.5, 3.2
 """Standard deviation of the summed NIS where the model is right: of `moments`, and of `profile` and `sampled`."""
 _STATIC = 7.0
 """Student's t of a single pixel's mean residual from which on it is no chance."""
+_GATED = 0.2
+"""Share of gated exposures from which on the model does not fit: where it is right, hardly one in a hundred is."""
+_REFUSED = (Status.GATED, Status.DIVERGED, Status.REINITIALISED)
 _WIDEST = 100.0
 """The most that a variance is multiplied by."""
 _ALONE = 0.5
@@ -70,6 +73,9 @@ class Statistics(NamedTuple):
     """Mean excess of a pixel's squared residual."""
 
 
+_NOTHING = Statistics(0.0, 0.0, 0.0, 0.0, 0.0, np.zeros(5), 1.0, 0.0)
+
+
 class Judge:
     """Judges the estimates of one estimator on a rig."""
 
@@ -78,6 +84,7 @@ class Judge:
         self._seen: deque[Residuals] = deque(maxlen=WINDOW)
         self._nis: deque[tuple[float, float]] = deque(maxlen=2 * WINDOW)
         """NIS made normal, and over its expectation; means over the axes, whose errors may be alike."""
+        self._gated: deque[bool] = deque(maxlen=2 * WINDOW)
         self._exposures = self._compared = 0
         self._before: tuple[int, Gaussian] | None = None
         self.verdict = Verdict(fit=Fit.UNKNOWN)
@@ -89,8 +96,13 @@ class Judge:
         """The estimate with the verdict on the exposures up to it, wider where the model does not fit."""
         if not self._able or estimate.status is Status.PREDICTED:
             return estimate
-        if self._exposures >= FIRST and self._exposures % self._every == 0:
-            self._compare(exposure, estimate)
+        if self._exposures >= FIRST:
+            self._gated.append(estimate.status in _REFUSED)
+            if self._exposures % self._every == 0:
+                self._compare(exposure, estimate)
+            due = len(self._gated) >= FEWEST and self._exposures % (self._every * BETWEEN) == 0
+            if due and np.mean(self._gated) > _GATED:
+                self._judge(exposure, estimate)
         degrees, seen = estimate.innovation.shape[1], estimate.nis > 0
         if self._exposures >= FIRST and seen.any() and self._models_noise(estimate):
             nis, each = estimate.nis[seen], np.full(int(seen.sum()), float(degrees))
@@ -110,12 +122,16 @@ class Judge:
         self._seen.append(found)
         self._compared += 1
         if len(self._seen) >= FEWEST and self._compared % BETWEEN == 0:
-            nis, ratio = np.array(self._nis or [(0.0, 1.0)]).T
-            spread = _NIS_SPREAD if estimate.components is None else _NIS_SPREAD_OF_MIXTURES
-            own = float(nis.sum()) / math.sqrt(len(nis)) / spread
-            after = judged(statistics(self._seen), own, float(ratio.mean()), self.verdict, self._compared)
-            since = self.verdict.since if after.fit is self.verdict.fit else exposure.frame_id
-            self.verdict = replace(after, since=since)
+            self._judge(exposure, estimate)
+
+    def _judge(self, exposure: Exposure, estimate: Estimate) -> None:
+        nis, ratio = np.array(self._nis or [(0.0, 1.0)]).T
+        spread = _NIS_SPREAD if estimate.components is None else _NIS_SPREAD_OF_MIXTURES
+        own, gated = float(nis.sum()) / math.sqrt(len(nis)) / spread, float(np.mean(self._gated))
+        found = statistics(self._seen) if len(self._seen) >= FEWEST else _NOTHING
+        after = judged(found, own, float(ratio.mean()), gated, self.verdict, self._compared)
+        since = self.verdict.since if after.fit is self.verdict.fit else exposure.frame_id
+        self.verdict = replace(after, since=since)
 
     def _models_noise(self, estimate: Estimate) -> bool:
         return bool(estimate.coefficients.shape[1] > self._rig.plant.n_states)
@@ -172,21 +188,22 @@ def _student(values: FloatArray) -> FloatArray:
         return np.asarray(np.where(spread > 0, values.mean(axis=0) / (spread / math.sqrt(len(values))), 0.0))
 
 
-def judged(found: Statistics, nis: float, ratio: float, before: Verdict, compared: int) -> Verdict:
+def judged(found: Statistics, nis: float, ratio: float, gated: float, before: Verdict, compared: int) -> Verdict:
     """The verdict by these statistics; between the limits it stays as it was.
 
-    ``nis`` is the summed NIS in standard deviations, ``ratio`` its mean over its expectation.
+    ``nis`` is the summed NIS in standard deviations, ``ratio`` its mean over its expectation, ``gated`` the share of
+    gated exposures.
     """
     # Many judgements of a right model go beyond any limit in the end.
     often = math.sqrt(1 + 2 * math.log(max(1.0, compared / WINDOW)) / MOTION_OFF**2)
     pixels, motion = found.pixels / (PIXELS_OFF * often), max(found.motion, found.mean) / (MOTION_OFF * often)
-    worst = max(pixels, motion, nis / (MOTION_OFF * often))
+    worst = max(pixels, motion, nis / (MOTION_OFF * often), gated / _GATED)
     fit = Fit.DOES_NOT_FIT if worst > 1 else Fit.FITS if worst < FITS else before.fit
     numbers = {"pixels": found.pixels, "motion": max(found.motion, found.mean), "nis": nis, "exposures": compared}
     if fit is not Fit.DOES_NOT_FIT:
         return Verdict(fit=fit, **numbers)  # type: ignore[arg-type]
     width, _, _, fade, ends = np.abs(found.signatures)
-    if found.static > _STATIC or pixels >= motion:
+    if found.static > _STATIC or pixels >= max(motion, gated / _GATED):
         where = "everywhere in the spot"
         if found.static > _STATIC and found.alone > _ALONE:
             where = "at fixed places"

@@ -12,7 +12,7 @@ from scipy import optimize, special
 from aolink import simulate
 from aolink.control.drift import FitMonitor
 from aolink.estimation import Driver, Estimate, make_estimator, score
-from aolink.estimation.estimate import COMPARED
+from aolink.estimation.estimate import COMPARED, Status
 from aolink.estimation.frames.frame_data import Needs, Profile
 from aolink.estimation.frames.measure import measure
 from aolink.estimation.kalman.gaussian import Gaussian
@@ -93,6 +93,16 @@ def test_a_wrong_model_is_found_and_its_intervals_are_wider(rig: Rig, wrong: Cal
     # The filter itself goes on as it was.
     assert np.array_equal(made[-1].end_state, plain[-1].end_state)
     assert any(each.verdict is not None and each.verdict.begins_with(each.frame_id) for each in made)
+
+
+def test_a_model_by_which_frames_are_refused_does_not_fit(rig: Rig) -> None:
+    quiet = with_read_noise(with_noise(rig, 1e-6), 1e-3)
+    estimates = estimates_of(quiet, list(simulate(rig, EXPOSURES, seed=5)))
+    assert sum(each.status in (Status.OK, Status.INPUT_INVALID) for each in estimates) < EXPOSURES / 2
+    verdict = estimates[-1].verdict
+    assert verdict is not None
+    assert (verdict.fit, verdict.kind) == (Fit.DOES_NOT_FIT, "motion")
+    assert verdict.widening > 2
 
 
 def test_it_is_the_same_exposure_by_exposure_and_in_batches(rig: Rig) -> None:
