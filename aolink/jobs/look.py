@@ -171,7 +171,7 @@ def look(
     frames:
         Number of frames that are looked at, from the first on.
     thorough:
-        Whether sums of processes are tried as well.
+        Whether sums of processes are tried for blurred frames as well.
     before:
         What an earlier look at the film has found, so that its spots need not be searched again.
     tell:
@@ -215,13 +215,13 @@ def look(
     directions = [_direction(DIRECTIONS[d], each, scene.unit, sd) for d, each in enumerate(seen)]
     together = len(everything) > 1 and _one_motion(seen)
     which = [0] if together else everything
-    names = (*_SINGLE, *_SUMS) if thorough else _SINGLE
     for d, each in enumerate(directions):
         if each.moves:
+            names = (*_SINGLE, *_SUMS) if thorough or not each.blurred else _SINGLE  # sharp frames take no time
             directions[d] = _identified(scene, d, each, which, sd, names, partial(_say, tell, each.name))
     for d, each in enumerate(directions):
         if (band := _common_band(each, directions[1 - d])) is not None:
-            directions[d] = _identified(scene, d, each, which, sd, names, partial(_say, tell, each.name), band)
+            directions[d] = _identified(scene, d, each, which, sd, ("resonance",), partial(_say, tell, each.name), band)
     unknown = ""
     if not any(each.blurred for each in directions):
         unknown = (
@@ -294,7 +294,7 @@ def _identified(
         wanted = replace(wanted, highest_hz=scene.rate_hz / 2, pixels=False)
         seen = [replace(each, square_noise=np.full_like(each.square_noise, _NOTHING)) for each in seen]
     if band is not None:
-        wanted, names = replace(wanted, lowest_hz=band[0], highest_hz=band[1]), ("resonance",)
+        wanted = replace(wanted, lowest_hz=band[0], highest_hz=band[1])
     name, tops = _best_model(rig, seen, names, wanted, tell)
     found = from_readings(rig, seen, some, replace(wanted, models=(name,)), tell, tops).found[0]
     if not direction.blurred and band is None:
@@ -543,9 +543,10 @@ def _doubts(spots: Spots, directions: Sequence[Direction], sd: float, *, given: 
         if each.misfit:
             yield f"along {each.name} {each.misfit}"
         if each.left_hz is not None:
+            more = "without --quick sums are tried" if each.blurred and not thorough else "frequencies may be wrong"
             yield (
                 f"along {each.name} a vibration at {each.left_hz:.3g} Hz or an alias of it is left over, which the"
-                f" model does not have: {'frequencies may be wrong' if thorough else 'without --quick sums are tried'}"
+                f" model does not have: {more}"
             )
     if spots.saturated > 0.001:
         yield f"{spots.saturated:.1%} of the pixels about the spots are saturated or hot and are left out: expose less"
