@@ -87,7 +87,7 @@ def row_time(light: FloatArray, numbers: IntArray, frame_period_s: float, blink_
     if min(off, other) > _ON_RATE:
         raise CalibrationError(
             f"the bands move by {nu % 1:.3f} of a band from frame to frame, a light of {blink_hz:g} blinks/s would move"
-            f" them by {wanted:.3f}: check --row-time HZ and the frame rate, and that nothing else flickers"
+            f" them by {wanted:.3f}: check blink_hz and the frame rate, and that nothing else flickers"
         )
     sign = 1 if off <= other else -1
     found = optimize.least_squares(

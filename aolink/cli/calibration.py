@@ -1,6 +1,7 @@
 """The command that measures a camera, or the interaction matrix of a mirror."""
 
 import json
+import math
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
@@ -20,8 +21,8 @@ if TYPE_CHECKING:
 
 
 @app.command(
-    epilog="Example: aolink calibrate dark.mcap flat.mcap still.mcap --rig my.toml -o calibrated.toml,"
-    " or aolink calibrate --interaction --camera PORT --mirror PORT --rig my.toml -o interaction.npz"
+    epilog="Example: aolink calibrate dark.mcap flat.mcap still.mcap --rig my.toml -o calibrated.toml"
+    "  |  aolink calibrate --measure interaction --camera PORT --mirror PORT --rig my.toml -o interaction.npz"
 )
 def calibrate(
     rig: Annotated[
@@ -32,7 +33,7 @@ def calibrate(
     ],
     output: Annotated[
         Path,
-        typer.Option("--output", "-o", metavar="FILE", help="The rig file to write; with --interaction a .npz file."),
+        typer.Option("--output", "-o", metavar="FILE", help="The rig file to write; of an interaction a .npz file."),
     ],
     files: Annotated[
         list[Path] | None,
@@ -47,59 +48,41 @@ def calibrate(
     ] = None,
     mirror: Annotated[str | None, typer.Option(metavar="PORT", help="Port of the mirror.")] = None,
     key: KeyOption = None,
-    frames: Annotated[int, typer.Option(help="How many frames of each light to record.")] = 100,
-    interaction: Annotated[
-        bool, typer.Option("--interaction", help="Poke the mirror, and measure its interaction matrix instead.")
-    ] = False,
-    poke: Annotated[
-        float, typer.Option(min=1e-6, max=1.0, help="How far to poke, as a share of each input's range.")
-    ] = 0.1,
-    repeats: Annotated[int, typer.Option(min=1, max=1000, help="How often each input is pushed and pulled.")] = 2,
-    hold: Annotated[
-        float,
+    measure: Annotated[
+        str,
         typer.Option(
-            min=0.0,
-            max=60.0,
-            metavar="S",
-            help="How long each poke rests before it is measured, s; one frame period at least.",
+            metavar="WHAT",
+            help="frames:count=100, frames of each light; interaction:poke=0.1,repeats=2,hold_s=0, the mirror's"
+            " interaction matrix, by pokes of a share of each input's range that rest before they are measured; or"
+            " row-time:blink_hz=HZ, the time between the camera's rows, from a film of even light that blinks.",
         ),
-    ] = 0.0,
-    row_time: Annotated[
-        float | None,
-        typer.Option(
-            "--row-time",
-            metavar="HZ",
-            help="Measure the time between the camera's rows instead, from a film of even light that blinks at HZ.",
-        ),
-    ] = None,
-    keep: Annotated[Path | None, typer.Option(metavar="DIR", help="Keep the recordings in this folder.")] = None,
+    ] = "frames",
     overwrite: OverwriteOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """Measure black level, noise, gain, scale and kernel width, and write them into a copy of the rig file.
 
-    It takes recordings of dark, flat and still light, or records from the devices, asking for each in turn. With
-    --interaction it pushes and pulls each of the mirror's inputs, and writes where the spots went. With --row-time it
-    takes one film.
+    It takes recordings of dark, flat and still light, or records from the devices, asking for each in turn; what it
+    records stays in a folder beside the output. An interaction pushes and pulls each of the mirror's inputs, and is
+    where the spots went. A row time is measured from one film.
     """
-    from shutil import rmtree
-    from tempfile import mkdtemp
-
     from aolink.jobs import calibrate
     from aolink.rig import load_rig
 
     loaded = load_rig(rig)
-    if row_time is not None:
-        if not files or len(files) != 1 or camera or mirror or interaction:
-            raise typer.BadParameter("--row-time takes one film of blinking light, and no devices")
+    what, given = _measured(measure)
+    interaction = what == "interaction"
+    if what == "row-time":
+        if not files or len(files) != 1 or camera or mirror:
+            raise typer.BadParameter("--measure row-time takes one film of blinking light, and no devices")
         check_target(output, overwrite=overwrite, sources=files, error=AolinkError)
-        _write_row_time(loaded, rig, files[0], row_time, output, overwrite=overwrite, as_json=as_json)
+        _write_row_time(loaded, rig, files[0], given["blink_hz"], output, overwrite=overwrite, as_json=as_json)
         return
     if (files and (camera or mirror)) or not (files or camera or "camera" in loaded.devices):
         raise typer.BadParameter("give recordings, or --camera, or [devices.camera] in the rig file")
     suffix, kind = (".npz", CalibrationError) if interaction else ("", AolinkError)
     check_target(output, overwrite=overwrite, sources=files or [], suffix=suffix, error=kind)
-    folder = keep or Path(mkdtemp(prefix="aolink-"))
+    folder, hold = output.with_name(f"{output.stem}-frames"), given.get("hold_s", 0.0)
     try:
         if files:
             paths = files
@@ -108,10 +91,11 @@ def calibrate(
             folder.mkdir(parents=True, exist_ok=True)
             with stop_after() as stop, progress("exposures", None) as tell:
                 calibrate.record_pokes(
-                    loaded, camera, mirror, paths[0], share=poke, repeats=repeats, overwrite=overwrite, stop=stop,
-                    progress=tell, hold_s=hold,
+                    loaded, camera, mirror, paths[0], share=given["poke"], repeats=round(given["repeats"]),
+                    overwrite=overwrite, stop=stop, progress=tell, hold_s=hold,
                 )  # fmt: skip
         else:
+            frames = round(given["count"])
             paths = calibrate.record_frames(
                 loaded, camera, mirror, folder, frames=frames, overwrite=overwrite,
                 ask=partial(ask, stderr), stoppable=stop_after, progress=partial(progress_bar, stderr, frames),
@@ -122,15 +106,40 @@ def calibrate(
             _write_calibrated(loaded, rig, paths, output, overwrite=overwrite, as_json=as_json)
     except AolinkError as error:
         # A person has covered and lit the camera for these recordings.
-        if not keep and (made := sorted(map(str, folder.glob("*.mcap")))):
-            keep = folder
+        if not files and (made := sorted(map(str, folder.glob("*.mcap")))):
             raise type(error)(f"{error}; `aolink calibrate` takes what was recorded: {' '.join(made)}") from None
         raise
-    finally:
-        if not keep:
-            rmtree(folder, ignore_errors=True)
     if not as_json:
-        stdout.print(f"written: {output}")
+        stdout.print(f"written: {output}{'' if files else f'; the recordings are in {folder}'}", markup=False)
+
+
+_MEASURES: dict[str, dict[str, tuple[float, float, float]]] = {
+    "frames": {"count": (100, 1, 10**6)},
+    "interaction": {"poke": (0.1, 1e-6, 1.0), "repeats": (2, 1, 1000), "hold_s": (0.0, 0.0, 60.0)},
+    "row-time": {"blink_hz": (math.nan, 1e-3, 1e6)},
+}
+"""What can be measured: its options with their defaults, least and largest values."""
+
+
+def _measured(text: str) -> tuple[str, dict[str, float]]:
+    """What --measure asks for, and its options."""
+    what, _, options = text.partition(":")
+    if what not in _MEASURES:
+        raise typer.BadParameter(f"--measure {what} is none of {', '.join(_MEASURES)}")
+    given = {name: default for name, (default, _, _) in _MEASURES[what].items()}
+    for each in filter(None, options.split(",")):
+        name, _, value = each.partition("=")
+        if name not in given:
+            raise typer.BadParameter(f"--measure {what} has no option {name}: it has {', '.join(given)}")
+        try:
+            given[name] = float(value)
+        except ValueError:
+            raise typer.BadParameter(f"--measure {what}: {each} is no number") from None
+    for name, number in given.items():
+        _, least, most = _MEASURES[what][name]
+        if not least <= number <= most:
+            raise typer.BadParameter(f"--measure {what}: give {name}=NUMBER, {least:g} to {most:g}")
+    return what, given
 
 
 def _write_calibrated(

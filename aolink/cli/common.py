@@ -29,6 +29,44 @@ _GONE = {
 }  # fmt: skip
 """What does the same as a command of the release before."""
 
+_IN_PYTHON = "set in Python: aolink.record(..., options=WriteOptions(...))"
+_FILMS = {
+    f"--{name.replace('_', '-')}": f"--film {name}{value}"
+    for name, value in (
+        ("invert", ""), ("gamma", "=2.2"), ("topic", "=NAME"), ("colour", "=red"), ("background", ""),
+        ("scale", "=COUNTS"), ("start", "=DATE"), ("row_time", "=S"),
+    )
+}  # fmt: skip
+_GONE_OPTIONS = {
+    "record": dict.fromkeys(("--compression", "--chunk-kib", "--flush-s", "--fsync-s", "--split-mib"), _IN_PYTHON),
+    "replay": {
+        "--to-rig": "aolink record --rig RIG.toml --input SESSION.mcap -o AGAIN.mcap", "--rate": "--speed X",
+        "--start": "aolink copy FILE --start S -o PART.mcap", "--end": "aolink copy FILE --end S -o PART.mcap",
+    },
+    "calibrate": {
+        "--frames": "--measure frames:count=100", "--interaction": "--measure interaction",
+        "--poke": "--measure interaction:poke=0.1", "--repeats": "--measure interaction:repeats=2",
+        "--hold": "--measure interaction:hold_s=1", "--row-time": "--measure row-time:blink_hz=HZ",
+        "--keep": "without an option: the recordings are kept",
+    },
+    "estimate": {"--only": "-o DIR/, whose side files have the new estimates alone"},
+    "import": _FILMS,
+    "look": _FILMS,
+    "rig": _FILMS,
+    "identify": {
+        "--noise": "--fit noise", "--kernel": "--fit kernel", "--plant": "--fit first-order, or --fit second-order",
+    },
+    "view": {
+        "--screenshot": "-o X.png", "--exposure": "--frame N", "--start": "aolink copy FILE --start S -o PART.mcap",
+        "--end": "aolink copy FILE --end S -o PART.mcap",
+    },
+    "slopes": {"--rrd": "-o X.rrd"},
+    "compare": {"--relative": "--tolerance RELATIVE", "--absolute": "--tolerance RELATIVE,ABSOLUTE"},
+    "report": {"--steps": "without an option: time is in seconds", "--exposure": "--frame N"},
+    "demo": {"--seed": "aolink sim RIG --seed N, with aolink record", "--real-time": "aolink sim RIG --real-time"},
+}  # fmt: skip
+"""What does the same as an option of the release before, by command."""
+
 
 _GROUPS = {
     "A session": ("record", "info", "view", "estimate", "report"),
@@ -50,7 +88,15 @@ class _Commands(TyperGroup):
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         if args and args[0] in _GONE:
             raise typer.BadParameter(f"{args[0]} is now: aolink {_GONE[args[0]]}")
-        return super().resolve_command(ctx, args)
+        gone = _GONE_OPTIONS.get(args[0], {}) if args else {}
+        for each in args[1:]:
+            if (name := each.partition("=")[0]) in gone:
+                raise typer.BadParameter(f"{name} is now {gone[name]}")
+        found = super().resolve_command(ctx, args)
+        for each in found[1].get_params(ctx) if found[1] is not None else ():
+            if getattr(each, "is_flag", False):
+                each.metavar = " "  # a switch takes no value, and its help names none
+        return found
 
 
 app = typer.Typer(

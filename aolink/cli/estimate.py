@@ -54,7 +54,6 @@ def estimate(
         Engine,
         typer.Option(help="Implementation of the filters; filterpy runs o1 to o3 on a plant of one axis, slowly."),
     ] = Engine.AOLINK,
-    only: Annotated[bool, typer.Option("--only", help="Leave the recording's own estimates out of the copy.")] = False,
     jobs: Annotated[int, typer.Option(min=1, help="How many recordings to estimate at once.")] = 1,
     side: Annotated[bool, typer.Option("--side", hidden=True)] = False,
     parquet: Annotated[bool, typer.Option("--parquet", hidden=True)] = False,
@@ -85,21 +84,15 @@ def estimate(
         raise typer.BadParameter("--table X.parquet writes the table as Parquet")
     if scheduler and jobs > 1:
         raise typer.BadParameter("--jobs is for this machine: with --scheduler its workers do the work")
-    if only and output is None:
-        raise typer.BadParameter("--only is for the copy that -o writes: give -o too")
     _check_names(estimator or [])
     models = batch_models(rig, settings)
     if not (side or is_folder or table or shard or scheduler) and len(files) == 1 and len(models) == 1:
         if jobs > 1:
             raise typer.BadParameter("--jobs is for many files or models, with -o DIR/")
-        _estimate_one(
-            files[0], models[0], estimator, output, engine, only=only, overwrite=overwrite, as_json=as_json
-        )  # fmt: skip
+        _estimate_one(files[0], models[0], estimator, output, engine, overwrite=overwrite, as_json=as_json)
         return
     if output is None or (output.suffix == ".mcap" and not is_folder and not side):
         raise typer.BadParameter("many files or models need -o DIR: a folder for the results")
-    if only:
-        raise typer.BadParameter("--only is for the copy of one recording: side files have the new estimates alone")
     from aolink.estimation.registry import DEFAULT_ESTIMATOR
     from aolink.jobs import batch
     from aolink.jobs.tables import parquet as load_parquet
@@ -225,7 +218,7 @@ def _draw(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
 
 def _estimate_one(
     file: str, model: "Model", estimator: Sequence[str] | None, output: Path | None, engine: Engine, *,
-    only: bool, overwrite: bool, as_json: bool,
+    overwrite: bool, as_json: bool,
 ) -> None:  # fmt: skip
     from aolink.cli.tables import scores as tables
     from aolink.estimation.registry import DEFAULT_ESTIMATOR
@@ -247,8 +240,7 @@ def _estimate_one(
         with progress("estimate", recording.n_frames) as tell:
             if output is not None:
                 scores, differences = write_reestimated(
-                    recording, names, output,
-                    only=only, overwrite=overwrite, progress=tell, engine=engine.value,
+                    recording, names, output, overwrite=overwrite, progress=tell, engine=engine.value,
                 )  # fmt: skip
             else:
                 scores, differences = scored_and_compared(recording, names, tell, engine.value)
@@ -266,7 +258,7 @@ def _estimate_one(
             text = difference + why if difference else "the same as recorded, bit for bit"
             stdout.print(f"{name}: {text}", markup=False)
         if output is not None:
-            there = ", ".join(kept_estimators(recording, names, only=only))
+            there = ", ".join(kept_estimators(recording, names))
             beside = f", beside the estimates of {there} that were there" if there else ""
             if recording.estimators and not recording.rig_is_recorded:
                 beside = "; the recording's own estimates were made with another rig file and are left out"

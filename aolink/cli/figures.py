@@ -38,11 +38,13 @@ def report(
     exposure: Annotated[
         int | None,
         typer.Option(
-            min=0, metavar="N", help="Exposure to draw, counted from 0; by default the one with the largest blur."
+            "--frame",
+            min=0,
+            metavar="N",
+            help="Exposure to draw, counted from 0; by default the one with the largest blur.",
         ),
     ] = None,
     lenslet: LensletOption = None,
-    steps: Annotated[bool, typer.Option("--steps", help="Count fast steps on time axes, not seconds.")] = False,
     width_mm: Annotated[float, typer.Option(min=30, max=1000, help="Width on paper; 88 fits a column.")] = 180.0,
     overwrite: OverwriteOption = False,
 ) -> None:
@@ -56,17 +58,18 @@ def report(
     from aolink.plotting.report import write_report
 
     if figure is not None:
-        _draw(files, output, figure, estimator, exposure, lenslet, steps=steps, width_mm=width_mm, overwrite=overwrite)
+        _draw(files, output, figure, estimator, exposure, lenslet, width_mm=width_mm, overwrite=overwrite)
         return
     for name in ("estimator", "exposure", "lenslet", "width_mm"):
         source = context.get_parameter_source(name)
         if source is not None and source.name == "COMMANDLINE":
-            raise typer.BadParameter(f"--{name.replace('_', '-')} goes with --figure NAME")
+            option = "frame" if name == "exposure" else name.replace("_", "-")
+            raise typer.BadParameter(f"--{option} goes with --figure NAME")
     check_target(output, overwrite=overwrite, suffix=".html", error=ExportError)
     recordings = _with_sides(_in_folders(files))
     with progress("read", None) as tell:
         write_report(
-            recordings, output, unit="steps" if steps else "s", overwrite=overwrite,
+            recordings, output, overwrite=overwrite,
             progress=lambda name, done: tell(done, name),
         )  # fmt: skip
     stdout.print(f"written: {output}", markup=False)
@@ -74,7 +77,7 @@ def report(
 
 def _draw(
     files: list[str], output: Path, figure: Figure, estimators: list[str] | None, exposure: int | None,
-    lenslet: str | None, *, steps: bool, width_mm: float, overwrite: bool,
+    lenslet: str | None, *, width_mm: float, overwrite: bool,
 ) -> None:  # fmt: skip
     """Draw one figure of a recording, of its side files' estimates where some are given."""
     from aolink.plotting.files import FORMATS, save_figure
@@ -90,7 +93,7 @@ def _draw(
     with progress("read", recording.n_frames) as tell:
         save_figure(
             recording, figure.value, output, estimators=estimators, exposure=exposure,
-            output=2 * spot, spot=spot, unit="steps" if steps else "s", width_mm=width_mm, overwrite=overwrite,
+            output=2 * spot, spot=spot, width_mm=width_mm, overwrite=overwrite,
             progress=tell,
         )  # fmt: skip
     stdout.print(f"written: {output}", markup=False)

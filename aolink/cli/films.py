@@ -4,7 +4,7 @@ import json
 import math
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
@@ -12,6 +12,7 @@ from aolink.cli.common import JsonOption, OutputOption, OverwriteOption, app, lo
 from aolink.errors import ImportingError
 
 if TYPE_CHECKING:
+    from aolink.films.film import Film
     from aolink.importing.frames import FilmSettings
 
 RateOption = Annotated[
@@ -30,39 +31,99 @@ AtOption = Annotated[
     list[str] | None,
     typer.Option("--at", metavar="X,Y", help="Where an object to follow is in the first frame, pixels; repeatable."),
 ]
-InvertOption = Annotated[
-    bool, typer.Option("--invert", help="Dark objects on a bright ground: light is how far a pixel is below it.")
-]
-GammaOption = Annotated[
-    float, typer.Option("--gamma", min=0.1, max=10.0, help="Undo a gamma curve; most JPEG and video have 2.2.")
-]
-TopicOption = Annotated[
-    str | None,
+FilmOption = Annotated[
+    list[str] | None,
     typer.Option(
-        "--topic",
-        help="Channel of an MCAP file or a bag that has several with pictures; wavefront sensor of AO telemetry.",
+        "--film",
+        metavar="NAME[=VALUE],...",
+        help="How the file is read. gamma=2.2: undo a gamma curve, which most JPEG and video have. invert: dark objects"
+        " on a bright ground. colour=red, green, blue or all (the mean of a mosaic's colours). topic=NAME: the channel"
+        " of an MCAP file or a bag with several; the wavefront sensor of AO telemetry. For import also: background:"
+        " subtract each frame's median. scale=COUNTS for a pixel value of one (without it 8 bits, or floats up to 1.0,"
+        " are the full range of the camera and 16 bits are counts), for slopes slope units. start=2026-11-22T09:30 in"
+        " UTC. row_time=S from the start of a row's exposure to the next row's, 0 for all at once.",
     ),
 ]
-
-ColourOption = Annotated[
-    str | None,
-    typer.Option(
-        "--colour",
-        metavar="red|green|blue|all",
-        help="One colour of pictures in colour or under a Bayer mosaic; all: the mean of a mosaic's colours.",
-    ),
-]
+_SWITCHES, _NUMBERS, _TEXTS = ("invert", "background"), ("gamma", "scale", "row_time"), ("topic", "colour", "start")
+_COLOURS = ("red", "green", "blue", "all")
 
 _DARK = 0.01
 """Share of the pixels below zero that is worth a word."""
 
 
+class FilmFile(NamedTuple):
+    """What --film says."""
+
+    settings: "dict[str, Any]"
+    """Fields of `FilmSettings`."""
+    topic: str | None
+    colour: str | None
+
+    def open(self, source: Path) -> "Film":
+        """The film, of one colour where one is asked for."""
+        from aolink.films.film import one_colour
+        from aolink.films.formats import open_film
+
+        film = open_film(source, self.topic)
+        return film if self.colour is None else one_colour(film, self.colour)
+
+
+def film_file(options: list[str] | None, *, importing: bool = False) -> FilmFile:
+    """What the options --film say. Raises ImportingError for what they cannot say."""
+    names = [
+        *_SWITCHES[: 1 + importing], *_NUMBERS[: 3 if importing else 1], *_TEXTS[: 3 if importing else 2]
+    ]  # fmt: skip
+    found: dict[str, Any] = {}
+    for each in (part for text in options or () for part in text.split(",")):
+        name, equals, value = each.partition("=")
+        if name not in names:
+            raise ImportingError(f"--film {name}: there is no such option, but {', '.join(names)}")
+        if bool(equals) == (name in _SWITCHES):
+            form = name if name in _SWITCHES else f"{name}=VALUE"
+            raise ImportingError(f"--film {each}: write --film {form}")
+        found[name] = _number(name, value) if name in _NUMBERS else value or True
+    topic, colour = found.pop("topic", None), found.pop("colour", None)
+    if colour not in (None, *_COLOURS):
+        raise ImportingError(f"--film colour={colour} is no colour: give {', '.join(_COLOURS[:3])} or {_COLOURS[3]}")
+    if "start" in found:
+        found["start_ns"] = _start_ns(found.pop("start"))
+    if "background" in found:
+        found["subtract_median"] = found.pop("background")
+    if "row_time" in found:
+        found["row_time_s"] = found.pop("row_time")
+    return FilmFile(found, topic, colour)
+
+
+def _number(name: str, text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if name == "gamma" and not 0.1 <= value <= 10:
+        raise ImportingError(f"--film gamma={text}: give a number from 0.1 to 10")
+    if name == "scale" and not 0 < abs(value) < math.inf:
+        raise ImportingError(f"--film scale={text} must be a finite number other than 0")
+    if not math.isfinite(value):
+        raise ImportingError(f"--film {name}={text} is no number")
+    return value
+
+
+def _start_ns(text: str) -> int:
+    try:
+        moment = datetime.fromisoformat(text)
+    except ValueError:
+        raise ImportingError(f"--film start={text} is no date: give one such as 2026-11-22T09:30:00") from None
+    return round((moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp() * 1e6) * 1000
+
+
 def film_settings(
-    rate: float | None, frames: int, track: int, at: list[str] | None, invert: bool, gamma: float, **more: object
+    rate: float | None, frames: int, track: int, at: list[str] | None, film: FilmFile, exposure: float | None = None
 ) -> "FilmSettings":
-    """The options of a command as settings. Raises ImportingError for an invalid place."""
+    """The options of a command as settings. Raises ImportingError for an invalid place, rate or time."""
     from aolink.importing.frames import FilmSettings
 
+    if exposure is not None and not 0 < exposure < math.inf:
+        raise ImportingError(f"--exposure {exposure:g} must be above 0{' and finite' if exposure > 0 else ''}")
     if rate is not None and not 0 < rate < math.inf:
         raise ImportingError(f"--rate {rate:g} must be above 0{' and finite' if rate > 0 else ''}")
     places = []
@@ -75,15 +136,15 @@ def film_settings(
             raise ImportingError(f"--at {text} is no place: give X,Y in pixels, such as --at 12.5,40")
         places.append((x, y))
     return FilmSettings(
-        rate_hz=rate, frames_per_exposure=frames, track=track or len(places), places=tuple(places), invert=invert,
-        gamma=gamma, **more,  # type: ignore[arg-type] # fields of FilmSettings
+        rate_hz=rate, frames_per_exposure=frames, track=track or len(places), places=tuple(places),
+        exposure_s=exposure, **film.settings,
     )  # fmt: skip
 
 
 @app.command(
     "import",
     epilog="Example: aolink import film.tif -o film.mcap --rig my.toml --rate 500"
-    "  |  aolink import film.npz -o film.mcap --rig spheres.toml --rate 24 --invert --track 6 --sum 8",
+    "  |  aolink import film.npz -o film.mcap --rig spheres.toml --rate 24 --film invert --track 6 --sum 8",
 )
 def import_(
     source: Annotated[
@@ -101,67 +162,22 @@ def import_(
     exposure: Annotated[
         float | None, typer.Option(metavar="S", help="Exposure time of a frame, s, where the film lacks it.")
     ] = None,
-    row_time: Annotated[
-        float | None,
-        typer.Option(
-            metavar="S", help="Time from the start of a row's exposure to the next row's, s; 0: all at once (global)."
-        ),
-    ] = None,
-    start: Annotated[
-        str | None, typer.Option(metavar="DATE", help="Start of the film, such as 2026-11-22T09:30, in UTC.")
-    ] = None,
     frames: SumOption = 1,
     track: TrackOption = 0,
     at: AtOption = None,
-    invert: InvertOption = False,
-    background: Annotated[
-        bool, typer.Option("--background", help="Subtract each frame's median, which is background.")
-    ] = False,
-    gamma: GammaOption = 1.0,
-    scale: Annotated[
-        float | None,
-        typer.Option(
-            metavar="COUNTS",
-            help="Counts for a pixel value of one. Without it 8 bits, or floats up to 1.0, are the full range of the"
-            " camera and 16 bits are counts; floats above 1.0 need it. For slopes: slope units for one of the file's"
-            " units.",
-        ),
-    ] = None,
-    topic: TopicOption = None,
-    colour: ColourOption = None,
+    film: FilmOption = None,
     overwrite: OverwriteOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """Make a recording of a film: then estimate, replay, compare, deblur and view it like any other."""
-    from aolink.films.film import one_colour
-    from aolink.films.formats import open_film
     from aolink.importing.recording import import_film
     from aolink.rig import load_rig
 
-    start_ns = None
-    if start is not None:
-        try:
-            moment = datetime.fromisoformat(start)
-        except ValueError:
-            raise ImportingError(f"--start {start} is no date: give one such as 2026-11-22T09:30:00") from None
-        start_ns = round((moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp() * 1e6) * 1000
-    if exposure is not None and not 0 < exposure < math.inf:
-        raise ImportingError(f"--exposure {exposure:g} must be above 0{' and finite' if exposure > 0 else ''}")
-    if scale is not None and not 0 < abs(scale) < math.inf:
-        raise ImportingError(f"--scale {scale:g} must be a finite number other than 0")
-    settings = film_settings(
-        rate, frames, track, at, invert, gamma, exposure_s=exposure, start_ns=start_ns,
-        subtract_median=background, scale=scale, row_time_s=row_time,
-    )  # fmt: skip
-    loaded = load_rig(rig)
-    film = open_film(source, topic)
-    if colour is not None:
-        if colour not in ("red", "green", "blue", "all"):
-            raise ImportingError(f"--colour {colour} is no colour: give red, green, blue or all")
-        film = one_colour(film, colour)
-    with progress("import", film.count // frames) as tell:
+    how = film_file(film, importing=True)
+    settings, loaded, shown = film_settings(rate, frames, track, at, how, exposure), load_rig(rig), how.open(source)
+    with progress("import", shown.count // frames) as tell:
         account = import_film(
-            film, loaded, settings, output, overwrite=overwrite, sources=[source, Path(rig)],
+            shown, loaded, settings, output, overwrite=overwrite, sources=[source, Path(rig)],
             progress=tell,
         )  # fmt: skip
     if as_json:
@@ -181,7 +197,7 @@ def import_(
     if account.below > account.pixels * _DARK:
         stdout.print(
             f"warning: {account.below / account.pixels:.0%} of the pixels are below zero, as in a film from which the"
-            " dark level was subtracted: --background puts the ground at the rig's black level",
+            " dark level was subtracted: --film background puts the ground at the rig's black level",
             markup=False,
         )
     missing = f", {account.missing} frames are missing" if account.missing else ""

@@ -24,10 +24,11 @@ _LOOK_S = 0.2
 """Time between two readings of a recording that is being written, s."""
 
 
-class PlantKind(StrEnum):
-    """The kinds of plants that can be fitted."""
+class Fitted(StrEnum):
+    """What can be fitted beside the disturbance: two quantities of the camera, and the kinds of plants."""
 
-    KNOWN = "known"
+    NOISE = "noise"
+    KERNEL = "kernel"
     FIRST_ORDER = "first-order"
     SECOND_ORDER = "second-order"
 
@@ -49,12 +50,13 @@ def identify(
             " rig file's own.",
         ),
     ] = None,
-    plant: Annotated[
-        PlantKind,
-        typer.Option(help="Whether the rig file's plant is right, or the kind of plant to fit to the inputs."),
-    ] = PlantKind.KNOWN,
-    noise: Annotated[bool, typer.Option("--noise", help="Fit the pixels' noise too.")] = False,
-    kernel: Annotated[bool, typer.Option("--kernel", help="Fit the kernel's width too, and its changes.")] = False,
+    fit: Annotated[
+        list[Fitted] | None,
+        typer.Option(
+            help="Fit this too; may be repeated: the pixels' noise, the kernel's width and its changes, or a plant of"
+            " that kind, by the inputs, instead of the rig file's."
+        ),
+    ] = None,
     highest: Annotated[
         float | None,
         typer.Option(metavar="HZ", min=0.0, help="Highest frequency to search; without it 4 / exposure time."),
@@ -86,18 +88,21 @@ def identify(
     places = [location(file) for file in files]
     sources = [*only_paths(places), *([Path(rig)] if rig else [])]
     check_target(output, overwrite=overwrite, sources=sources, suffix=".toml", error=IdentificationError)
-    kind = None if plant is PlantKind.KNOWN else plant.value
+    fitted = set(fit or ())
+    if len(kinds := [each.value for each in (Fitted.FIRST_ORDER, Fitted.SECOND_ORDER) if each in fitted]) > 1:
+        raise typer.BadParameter("--fit takes one kind of plant")
+    kind = kinds[0] if kinds else None
     wanted = job.Wanted(
-        models=tuple(model) if model else () if kind else CANDIDATES, plant=kind, noise=noise, kernel=kernel,
+        models=tuple(model) if model else () if kind else CANDIDATES, plant=kind,
+        noise=Fitted.NOISE in fitted, kernel=Fitted.KERNEL in fitted,
         highest_hz=highest or None,
     )  # fmt: skip
     if follow:
         if len(places) > 1:
             raise typer.BadParameter("--follow is for one recording")
-        if kind or noise or kernel or overwrite:
+        if fitted or overwrite:
             raise typer.BadParameter(
-                "--follow fits the disturbance alone and never overwrites: leave out --plant, --noise, --kernel and"
-                " --overwrite"
+                "--follow fits the disturbance alone and never overwrites: leave out --fit and --overwrite"
             )
         _follow(places[0], output, load_rig(rig) if rig else None, wanted, sources, as_json=as_json)
         return

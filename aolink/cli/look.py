@@ -1,8 +1,6 @@
 """Commands that show what a camera saw: view, slopes."""
 
 import json
-import math
-from bisect import bisect_left
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -22,33 +20,33 @@ _LOOK_S = 0.1
 
 
 @app.command(
-    epilog="Example: aolink view session.mcap --screenshot session.png"
-    "  |  aolink view session.mcap --exposure 7  |  aolink view session.mcap --start 10 --end 20 --compare again.mcap"
+    epilog="Example: aolink view session.mcap -o session.png"
+    "  |  aolink view session.mcap --frame 7  |  aolink view session.mcap --compare again.mcap"
 )
 def view(
     recorded: Annotated[
-        str, typer.Argument(metavar="FILE", help="A recording, or a Rerun file (.rrd) that --save has written.")
+        str, typer.Argument(metavar="FILE", help="A recording, or a Rerun file (.rrd) that -o has written.")
     ],
     side: Annotated[
         list[str] | None,
         typer.Argument(metavar="[SIDE...]", help="Its side files: their estimates instead of its own."),
     ] = None,
-    save: Annotated[
-        Path | None, typer.Option(metavar="X.rrd", help="Write a Rerun file instead of opening the viewer.")
-    ] = None,
-    screenshot: Annotated[
-        Path | None, typer.Option(metavar="X.png", help="Write a picture of the viewer; needs no screen.")
+    output: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--output",
+            "-o",
+            "--save",
+            metavar="X.rrd|X.png",
+            help="Write a Rerun file, or a picture of the viewer, instead of opening it; needs no screen.",
+        ),
     ] = None,
     web: Annotated[
         bool, typer.Option("--web", help="Serve the web viewer on this machine (127.0.0.1) until Ctrl-C.")
     ] = False,
     exposure: Annotated[
-        int | None, typer.Option(min=0, metavar="N", help="Show one exposure alone, counted from 0.")
+        int | None, typer.Option("--frame", min=0, metavar="N", help="Show one exposure alone, counted from 0.")
     ] = None,
-    start: Annotated[
-        float | None, typer.Option(metavar="S", help="Begin at this time, s from the first exposure.")
-    ] = None,
-    end: Annotated[float | None, typer.Option(metavar="S", help="End at this time.")] = None,
     lenslet: LensletOption = None,
     compare: Annotated[
         str | None, typer.Option(metavar="OTHER", help="Show another recording beside it, in fainter lines.")
@@ -67,9 +65,10 @@ def view(
     from aolink import viewing
     from aolink.recording.remote import location, only_paths
 
-    choices = (exposure, start, end, lenslet, compare)
+    choices = (exposure, lenslet, compare)
+    save, screenshot = _targets(output or [])
     if follow:
-        if side or save or screenshot or any(each is not None for each in choices):
+        if side or output or any(each is not None for each in choices):
             raise typer.BadParameter("--follow shows the whole session as it comes, alone or with --web")
         _follow(recorded, web=web)
         return
@@ -80,7 +79,7 @@ def view(
             check_target(target, overwrite=overwrite, sources=sources, suffix=suffix)
     recording = None if file.suffix == ".rrd" else open_recording(file, side=sides)
     if recording is None and (save is not None or side or any(each is not None for each in choices)):
-        raise typer.BadParameter(f"{file} is a Rerun file already: --save, side files and choices need a recording")
+        raise typer.BadParameter(f"{file} is a Rerun file already: -o X.rrd, side files and choices need a recording")
     if not (web or save or screenshot):
         viewing.check_display()
     if recording is None:
@@ -92,7 +91,7 @@ def view(
         elif screenshot is None:
             viewing.open_viewer(recorded)
         return
-    exposures = _numbers(recording, exposure, start, end)
+    exposures = None if exposure is None else _number(recording, exposure)
     look = viewing.Look(
         exposures=exposures, spot=common.spot_of(recording.rig.sensor, lenslet) if lenslet else 0,
         compared=open_recording(compare) if compare else None,
@@ -113,6 +112,16 @@ def view(
             viewing.show(recording, look, progress=tell)
 
 
+def _targets(output: list[Path]) -> tuple[Path | None, Path | None]:
+    """The Rerun file and the picture among what is to be written."""
+    named = {".rrd": [each for each in output if each.suffix.lower() != ".png"]}
+    named[".png"] = [each for each in output if each not in named[".rrd"]]
+    for suffix, found in named.items():
+        if len(found) > 1:
+            raise typer.BadParameter(f"one file {suffix} can be written, not {' and '.join(map(str, found))}")
+    return next(iter(named[".rrd"]), None), next(iter(named[".png"]), None)
+
+
 def _follow(file: str, *, web: bool) -> None:
     import time
 
@@ -131,34 +140,12 @@ def _address(address: str) -> None:
     stdout.print(f"{address}\nCtrl-C stops it.")
 
 
-def _numbers(recording: "Recording", exposure: int | None, start: float | None, end: float | None) -> range | None:
-    """The numbers of the exposures that are asked for; None for all. Raises ViewerError where there are none."""
-    count = recording.n_frames
-    if exposure is not None:
-        if start is not None or end is not None:
-            raise typer.BadParameter("give --exposure, or --start and --end")
-        if exposure >= count:
-            there = f"has {count}, counted from 0" if count else "holds none"
-            raise ViewerError(f"there is no exposure {exposure}: {recording.path} {there}")
-        return range(exposure, exposure + 1)
-    if start is None and end is None:
-        return None
-    low, high = start or 0.0, math.inf if end is None else end
-    steps = _first_steps(recording)
-    since = [(step - steps[0]) * recording.rig.timing.fast_step_s for step in steps]
-    numbers = range(bisect_left(since, low), bisect_left(since, high))
-    if not numbers:
-        length = f"{since[-1]:.3g} s after the first" if since else "nowhere: there is none"
-        raise ViewerError(f"no exposure begins between {low:g} s and {high:g} s: the last begins {length}")
-    return numbers
-
-
-def _first_steps(recording: "Recording") -> list[int]:
-    from aolink.recording import topics
-    from aolink.recording.schemas_pb2 import ExposureInfo
-
-    messages = (each.message for each in recording.messages(topics.EXPOSURE))
-    return [message.first_step for message in messages if isinstance(message, ExposureInfo)]
+def _number(recording: "Recording", exposure: int) -> range:
+    """The exposure with that number. Raises ViewerError where there is none."""
+    if exposure >= (count := recording.n_frames):
+        there = f"has {count}, counted from 0" if count else "holds none"
+        raise ViewerError(f"there is no exposure {exposure}: {recording.path} {there}")
+    return range(exposure, exposure + 1)
 
 
 @app.command(epilog="Example: aolink slopes frame.fits --reference flat.fits --pitch-m 600e-6 --focal-m 0.04 -o s.npz")
@@ -170,10 +157,10 @@ def slopes(
         ),
     ],
     reference: Annotated[Path, typer.Option(metavar="FILE", help="A frame of the same camera with a flat wavefront.")],
-    output: Annotated[
-        Path | None, typer.Option("--output", "-o", metavar="FILE.npz", help="Write all results.")
+    written: Annotated[
+        list[Path] | None,
+        typer.Option("--output", "-o", metavar="X.npz|X.rrd", help="Write all results, or what Rerun shows; or both."),
     ] = None,
-    rrd: Annotated[Path | None, typer.Option(metavar="FILE.rrd", help="Write the results for Rerun.")] = None,
     bad: Annotated[
         Path | None, typer.Option("--bad", metavar="FILE", help="A picture that is not zero where pixels are bad.")
     ] = None,
@@ -193,6 +180,8 @@ def slopes(
     if (pitch_m is None) != (focal_m is None):
         raise typer.BadParameter("give --pitch-m and --focal-m, or neither")
     inputs = [frame, reference]
+    rrd = next((each for each in written or () if each.suffix == ".rrd"), None)
+    output = next((each for each in written or () if each != rrd), None)
     if output is not None:
         check_target(output, overwrite=overwrite, sources=inputs, suffix=".npz", error=FrameError)
     if rrd is not None:

@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from aolink.cli.common import JsonOption, OverwriteOption, app, local_file, program, progress, stderr, stdout
-from aolink.cli.films import ColourOption, GammaOption, InvertOption, RateOption, TopicOption, film_settings
+from aolink.cli.films import FilmOption, RateOption, film_file, film_settings
 from aolink.errors import ExportError, ImportingError, RecordingError
 from aolink.files import writing
 from aolink.signals import Interrupted
@@ -17,7 +17,7 @@ from aolink.signals import Interrupted
 
 @app.command(
     epilog="Example: aolink look film.tif --rate 50 --exposure 0.018"
-    "  |  aolink look film.avi --exposure 0.02 --gamma 2.2"
+    "  |  aolink look film.avi --exposure 0.02 --film gamma=2.2"
 )
 def look(
     source: Annotated[
@@ -37,12 +37,9 @@ def look(
         typer.Option(metavar="PIXELS", help="Standard deviation of a resting spot; without it the frames tell."),
     ] = None,
     quick: Annotated[
-        bool, typer.Option("--quick", help="End with the first answer: one process moves a spot.")
+        bool, typer.Option("--quick", help="End before sums of processes are tried for blurred frames.")
     ] = False,
-    invert: InvertOption = False,
-    gamma: GammaOption = 1.0,
-    topic: TopicOption = None,
-    colour: ColourOption = None,
+    film: FilmOption = None,
     overwrite: OverwriteOption = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -51,8 +48,6 @@ def look(
     Writes a rig file to go on with, a recording with estimates, and a page with pictures. The first answer comes in
     about a minute; then sums of processes are tried. Ctrl-C keeps what there is.
     """
-    from aolink.films.film import one_colour
-    from aolink.films.formats import open_film
     from aolink.importing.recording import import_film
     from aolink.jobs.look import Looked
     from aolink.jobs.look import look as look_at
@@ -63,13 +58,10 @@ def look(
     from aolink.recording.reestimate import write_reestimated
     from aolink.rig import parse_rig
 
-    for name, value in (("--exposure", exposure), ("--kernel", kernel)):
-        if value is not None and not 0 < value < math.inf:
-            raise ImportingError(f"{name} {value:g} must be above 0{' and finite' if value > 0 else ''}")
-    settings = film_settings(rate, 1, 0, None, invert, gamma, exposure_s=exposure)
-    film = open_film(source, topic)
-    if colour is not None:
-        film = one_colour(film, colour)
+    if kernel is not None and not 0 < kernel < math.inf:
+        raise ImportingError(f"--kernel {kernel:g} must be above 0{' and finite' if kernel > 0 else ''}")
+    how = film_file(film)
+    settings, shown = film_settings(rate, 1, 0, None, how, exposure), how.open(source)
     folder = output or Path(f"{source.stem}-look")
     rig_file, recording, page = folder / "rig.toml", folder / "film.mcap", folder / "page.html"
     if not overwrite and (there := [each for each in (rig_file, recording, page) if each.exists()]):
@@ -80,7 +72,7 @@ def look(
         try:
             with progress("look", None) as tell:
                 said = look_at(
-                    film, settings, source.stem, kernel=kernel, thorough=thorough, before=looked,
+                    shown, settings, source.stem, kernel=kernel, thorough=thorough, before=looked,
                     tell=lambda what, done, of: tell(done, f"{what}: {done} of {of}"),
                 )  # fmt: skip
         except Interrupted as stopped:
@@ -105,7 +97,7 @@ def look(
         with progress("estimate", len(looked.spots.light)) as tell:
             if looked.moves:
                 source_of = Recording(imported)
-                write_reestimated(source_of, ["moments"], recording, only=False, overwrite=overwrite, progress=tell)
+                write_reestimated(source_of, ["moments"], recording, overwrite=overwrite, progress=tell)
             else:
                 imported.replace(recording)
     commands = [

@@ -60,8 +60,9 @@ def compare(
         list[str] | None,
         typer.Option("--topic", "-t", help="Only this topic, or with a / at its end all below it; may be repeated."),
     ] = None,
-    relative: Annotated[float, typer.Option(min=0, help="Relative tolerance of numbers.")] = 1e-9,
-    absolute: Annotated[float, typer.Option(min=0, help="Tolerance in a number's own unit, added.")] = 1e-12,
+    tolerance: Annotated[
+        str, typer.Option(metavar="RELATIVE[,ABSOLUTE]", help="Of numbers; the absolute one, in their unit, is added.")
+    ] = "1e-9,1e-12",
     as_json: JsonOption = False,
 ) -> None:
     """List field by field how two recordings differ. Exit code 1 if they do.
@@ -75,6 +76,7 @@ def compare(
     from aolink.recording.reestimate import Reestimated, own_estimators
     from aolink.recording.side_files import check_is_side_of
 
+    relative, absolute = _tolerances(tolerance)
     one = open_recording(first)
     if second is None:
         two: Recording = Reestimated(one, own_estimators(one, warn))
@@ -100,6 +102,18 @@ def compare(
         stdout.print("the same" if same else f"they part in {parting}" if parting else "they differ")
     if not same:
         raise typer.Exit(1)
+
+
+def _tolerances(text: str) -> tuple[float, float]:
+    try:
+        relative, absolute = (float(each) for each in (*text.split(","), "0")[:2])
+    except ValueError:
+        relative = absolute = math.nan
+    if not (relative >= 0 and absolute >= 0 and text.count(",") <= 1):
+        raise typer.BadParameter(
+            f"--tolerance {text}: give a relative and, after a comma, an absolute one, both from 0"
+        )
+    return relative, absolute
 
 
 @app.command(

@@ -41,15 +41,22 @@ class _NamingMethods(TyperCommand):
 @app.command(
     cls=_NamingMethods,
     epilog="Example: aolink deblur session.mcap -e moments -o sharp.mcap"
-    "  |  aolink deblur --image moved.png --psf psf.csv -o sharp.png",
+    "  |  aolink deblur moved.png --psf psf.csv -o sharp.png",
 )
 def deblur(
     out: Annotated[
-        Path, typer.Option("--out", "-o", metavar="OUT", help="File to write: a recording, or a picture of its type.")
+        Path,
+        typer.Option("--output", "-o", "--out", metavar="FILE", help="The recording to write, or the picture."),
     ],
     file: Annotated[
         Path | None,
-        typer.Argument(metavar="FILE", help="A recording, all of whose exposures are restored.", parser=local_file),
+        typer.Argument(
+            metavar="FILE",
+            help="A recording, all of whose exposures are restored; or with --psf or --path a blurred picture, or a"
+            " stack of them, of any kind that `aolink import` reads. Pixels that are not numbers, or saturated, are"
+            " left out.",
+            parser=local_file,
+        ),
     ] = None,
     estimator: Annotated[
         str | None,
@@ -57,22 +64,14 @@ def deblur(
             "--estimator", "-e", help="The estimator whose path is used, by default moments; it is run if it was not."
         ),
     ] = None,
-    image: Annotated[
-        Path | None,
-        typer.Option(
-            "--image",
-            metavar="IN.png",
-            help="A blurred picture, or a stack of them, of any kind that `aolink import` reads. Pixels that are not"
-            " numbers, or saturated, are left out.",
-        ),
-    ] = None,
+    image: Annotated[Path | None, typer.Option("--image", hidden=True)] = None,
     psf: Annotated[
         Path | None,
         typer.Option(
             "--psf",
             metavar="PSF.csv",
-            help="Its PSF: a picture, .npy, or rows of numbers; one row of n taps lies along the picture's rows, one"
-            " column along its columns. Tap n // 2 is where the scene stays in place.",
+            help="The picture's PSF: a picture, .npy, or rows of numbers; one row of n taps lies along the picture's"
+            " rows, one column along its columns. Tap n // 2 is where the scene stays in place.",
         ),
     ] = None,
     path: Annotated[
@@ -87,11 +86,13 @@ def deblur(
         float, typer.Option(metavar="S", help="Seconds by which the log's clock is behind that of the pictures.")
     ] = 0.0,
     exposure: Annotated[
-        float | None, typer.Option(metavar="S", help="Exposure time of --image with --path, where its file lacks it.")
+        float | None,
+        typer.Option(metavar="S", help="With --path: exposure time of the pictures, where their file lacks it."),
     ] = None,
     method: Annotated[str | None, typer.Option(help="The restoration method.")] = None,
     noise_sd: Annotated[
-        float | None, typer.Option(help="Noise of --image, in its own counts; estimated from it by default.")
+        float | None,
+        typer.Option(help="With --psf or --path: noise of the picture, in its counts; without it, estimated."),
     ] = None,
     overwrite: OverwriteOption = False,
     as_json: JsonOption = False,
@@ -102,13 +103,14 @@ def deblur(
     from aolink.restoration.registry import DEFAULT_METHOD
 
     method = method or DEFAULT_METHOD
-    if file is not None and not (image or psf or path or noise_sd):
-        _deblur_recording(file, out, estimator or DEFAULT_ESTIMATOR, method, overwrite=overwrite, as_json=as_json)
-    elif file is None and image is not None and (blur := psf or path) is not None and None in (psf, path):
-        clock = PathClock(offset, exposure) if psf is None else None
-        _deblur_pictures(image, blur, clock, out, method, noise_sd, overwrite=overwrite, as_json=as_json)
+    source, blur = image or file, psf or path
+    if source is None or (image and file) or (psf and path) or ((image or noise_sd) and not blur):
+        raise typer.BadParameter("give a recording alone, or a picture with --psf or --path (--noise-sd is for these)")
+    if blur is None:
+        _deblur_recording(source, out, estimator or DEFAULT_ESTIMATOR, method, overwrite=overwrite, as_json=as_json)
     else:
-        raise typer.BadParameter("give a recording alone, or --image with --psf or --path (and --noise-sd with these)")
+        clock = PathClock(offset, exposure) if psf is None else None
+        _deblur_pictures(source, blur, clock, out, method, noise_sd, overwrite=overwrite, as_json=as_json)
 
 
 def _deblur_recording(

@@ -13,7 +13,7 @@ from rich.markup import escape
 
 from aolink.cli import common, films
 from aolink.cli.common import JsonOption, KeyOption, OverwriteOption, RigArgument, app, load_checked, program, stdout
-from aolink.cli.films import AtOption, GammaOption, InvertOption, RateOption, SumOption, TopicOption, TrackOption
+from aolink.cli.films import AtOption, FilmOption, RateOption, SumOption, TrackOption
 from aolink.cli.terminal import input_ended
 from aolink.errors import AolinkError, RigError
 from aolink.files import check_target, writing
@@ -36,7 +36,7 @@ def rig(
     exposure_scan: Annotated[
         bool, typer.Option("--exposure-scan", help="Print the error of o1 to expect at other exposure times, and end.")
     ] = False,
-    film: Annotated[
+    source: Annotated[
         Path | None,
         typer.Option(
             "--from",
@@ -49,9 +49,7 @@ def rig(
     frames: SumOption = 1,
     track: TrackOption = 0,
     at: AtOption = None,
-    invert: InvertOption = False,
-    gamma: GammaOption = 1.0,
-    topic: TopicOption = None,
+    film: FilmOption = None,
     overwrite: OverwriteOption = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -62,10 +60,10 @@ def rig(
         for name in builtin_rigs():
             stdout.print(f"{name:<18}{load_rig(name).summary.split('. ')[0].rstrip('.')}.", markup=False)
         return
-    _check_goes_with(context, film)
-    if film is not None:
-        path = Path(rig or f"{film.stem}.toml")
-        _write_first_rig(path, film, topic, films.film_settings(rate, frames, track, at, invert, gamma), overwrite)
+    _check_goes_with(context, source)
+    if source is not None:
+        path, how = Path(rig or f"{source.stem}.toml"), films.film_file(film)
+        _write_first_rig(path, source, how, films.film_settings(rate, frames, track, at, how), overwrite)
         return
     if not rig:
         raise typer.BadParameter("name a rig file, or a rig that comes with aolink")
@@ -78,7 +76,7 @@ def rig(
     raise typer.BadParameter(f"say what of {rig}: --check it, or serve it with `aolink sim {rig}`")
 
 
-_OF_FILMS = frozenset(("rate", "frames", "track", "at", "invert", "gamma", "topic", "overwrite"))
+_OF_FILMS = frozenset(("rate", "frames", "track", "at", "film", "overwrite"))
 """Parameters of `rig` that go with --from only, where no others but the rig's name go with it."""
 
 
@@ -86,19 +84,18 @@ def _check_goes_with(context: typer.Context, film: Path | None) -> None:
     for each in context.command.params:
         name = each.name or ""
         source = context.get_parameter_source(name)
-        if source is None or source.name != "COMMANDLINE" or name in ("rig", "film"):
+        if source is None or source.name != "COMMANDLINE" or name in ("rig", "source"):
             continue
         if (name in _OF_FILMS) != (film is not None):
             without = "needs --from FILM" if film is None else "makes no sense with --from, which writes a rig file"
             raise typer.BadParameter(f"{each.opts[0]} {without}")
 
 
-def _write_first_rig(path: Path, source: Path, topic: str | None, settings: "FilmSettings", overwrite: bool) -> None:
-    from aolink.films.formats import open_film
+def _write_first_rig(path: Path, source: Path, how: films.FilmFile, settings: "FilmSettings", overwrite: bool) -> None:
     from aolink.importing.first_rig import first_rig
 
     check_target(path, overwrite=overwrite, suffix=".toml", error=RigError)
-    film = open_film(source, topic)
+    film = how.open(source)
     with common.progress("follow", film.count) as tell:
         made = first_rig(film, settings, path.stem, tell)
     with writing(path, overwrite=overwrite, error=RigError) as partial:
@@ -158,7 +155,7 @@ def sim(
         list[str] | None,
         typer.Option(metavar="NAME=VALUE", help="A fault of the line or the devices: bitflip=1e-6, stall=0.01, ..."),
     ] = None,
-    tied: Annotated[bool, typer.Option("--tied", help="End when standard input ends, for a parent process.")] = False,
+    tied: Annotated[bool, typer.Option("--tied", hidden=True)] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Run a simulated rig: print its two ports and serve them until stopped (Ctrl-C)."""

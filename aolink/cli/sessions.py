@@ -13,7 +13,7 @@ import typer
 from aolink.cli import common
 from aolink.cli.common import EstimatorOption, JsonOption, KeyOption, app, get_ready, program, progress, stdout, warn
 from aolink.cli.terminal import progress_bar
-from aolink.errors import EstimatorError, RecordingError
+from aolink.errors import EstimatorError
 from aolink.signals import Interrupted, StopRequest
 
 if TYPE_CHECKING:
@@ -89,18 +89,9 @@ def record(
             min=0, metavar="S", help="Wait this long for a native device's port that has vanished, then go on with it."
         ),
     ] = 0.0,
-    split_mib: Annotated[
-        float, typer.Option(min=0, max=2**30, metavar="MIB", help="Begin another file at this size; 0 for one file.")
-    ] = 0.0,
     split_s: Annotated[
         float, typer.Option(min=0, metavar="S", help="Begin another file after this time; 0 for one file.")
     ] = 0.0,
-    compression: Annotated[str, typer.Option(help="lz4, zstd or none.")] = "lz4",
-    chunk_kib: Annotated[int, typer.Option(metavar="KIB", help="Write a chunk to the file at this size.")] = 128,
-    flush_s: Annotated[
-        float, typer.Option(metavar="S", help="Write a chunk to the file at this age; a kill loses at most twice this.")
-    ] = 0.1,
-    fsync_s: Annotated[float, typer.Option(metavar="S", help="How often the file is synchronised to the disk.")] = 1.0,
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Check everything, with the devices, but send the mirror no input.")
     ] = False,
@@ -116,10 +107,7 @@ def record(
     from aolink.recording.mcap_file import WriteOptions
     from aolink.session.controlling import served
 
-    options = WriteOptions(
-        compression=compression, chunk_bytes=chunk_kib << 10, flush_s=flush_s, fsync_s=fsync_s,
-        split_bytes=round(split_mib * 2**20), split_s=split_s,
-    )  # fmt: skip
+    options = WriteOptions(split_s=split_s)
     loaded = common.load_checked(rig)
     if force and not control:
         raise typer.BadParameter("--force is for --control")
@@ -211,17 +199,15 @@ def _live_view(
 
 
 @app.command(
-    epilog="Example: aolink replay session.mcap --rate 1 --estimator moments --view"
-    "  |  aolink replay session.mcap --to-rig --camera /dev/pts/3 --mirror /dev/pts/4 -o again.mcap"
+    epilog="Example: aolink replay session.mcap --speed 1 --estimator moments --view"
+    "  |  aolink replay session.mcap -e moments --control integrator"
 )
 def replay(
     file: common.FileArgument,
     estimator: EstimatorOption = None,
-    rate: Annotated[
+    speed: Annotated[
         float, typer.Option(min=0, metavar="X", help="Pace relative to the recording's; 0 for as fast as possible.")
     ] = 0.0,
-    start: Annotated[float, typer.Option(metavar="S", help="Begin at this time, s from the first exposure.")] = 0.0,
-    end: Annotated[float | None, typer.Option(metavar="S", help="End at this time.")] = None,
     control: Annotated[
         str | None,
         typer.Option(
@@ -231,19 +217,9 @@ def replay(
         ),
     ] = None,
     view: Annotated[bool, typer.Option("--view", help="Show it live in Rerun.")] = False,
-    to_rig: Annotated[
-        bool, typer.Option("--to-rig", help="Send its commands to a rig, and record a new session.")
-    ] = False,
-    camera: Annotated[str | None, typer.Option(metavar="PORT", help="Port of the camera, with --to-rig.")] = None,
-    mirror: Annotated[str | None, typer.Option(metavar="PORT", help="Port of the mirror, with --to-rig.")] = None,
-    key: KeyOption = None,
-    output: Annotated[
-        Path | None, typer.Option("--output", "-o", metavar="FILE", help="The new recording, with --to-rig.")
-    ] = None,
-    overwrite: common.OverwriteOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Replay a recording through the estimators as if it were live, or send its commands to a rig.
+    """Replay a recording through the estimators as if it were live.
 
     Exposures that an estimator skipped in the session are skipped again; `aolink estimate` skips none.
     """
@@ -253,21 +229,9 @@ def replay(
     recording = common.open_recording(file)
     names = list(dict.fromkeys(estimator or own_estimators(recording, common.warn) or [DEFAULT_ESTIMATOR]))
     get_ready(recording.rig, names)
-    if to_rig:
-        if control:
-            raise typer.BadParameter("--to-rig sends the recorded commands: `aolink record --control` closes a loop")
-        if not (output and camera and mirror):
-            raise typer.BadParameter(
-                "--to-rig needs -o FILE, --camera PORT and --mirror PORT, because no device that a recording names is"
-                f" opened; with drivers use `aolink record --rig RIG.toml --input {file} -o FILE`"
-            )
-        _replay_to_rig(recording, names, camera, mirror, output, overwrite=overwrite, as_json=as_json)
-        return
-    if camera or mirror or output:
-        raise typer.BadParameter("--camera, --mirror and -o are for --to-rig")
     if control:
-        if view or rate or start or end is not None:
-            raise typer.BadParameter("--control takes the whole recording at once: leave out --view, --rate and times")
+        if view or speed:
+            raise typer.BadParameter("--control takes the whole recording at once: leave out --view and --speed")
         _replay_control(recording, control, names[0], as_json=as_json)
         return
     from aolink.cli.tables import scores as tables
@@ -278,10 +242,8 @@ def replay(
     live_view = _live_view(recording.rig, names, recording.true_scene, shown=view)
     with live_view as live, StopRequest().installed() as stop:
         total = recording.n_frames
-        with progress("replay", total if end is None and not start else None) as tell:
-            series = replay_recording(
-                recording, names, rate=rate, start_s=start, end_s=math.inf if end is None else end, stop=stop
-            )
+        with progress("replay", total) as tell:
+            series = replay_recording(recording, names, rate=speed, stop=stop)
             for number, (exposure, estimates) in enumerate(series, 1):
                 for estimate in estimates:
                     scorers[estimate.estimator].add(exposure, estimate)
@@ -310,52 +272,17 @@ def _replay_control(recording: "Recording", controller: str, estimator: str, *, 
         stdout.print(tables.replayed(result))
 
 
-def _replay_to_rig(
-    recording: "Recording", names: list[str], camera: str | None, mirror: str | None, output: Path, *, overwrite: bool,
-    as_json: bool,
-) -> None:  # fmt: skip
-    from aolink import session
-    from aolink.cli.tables import recordings as tables
-    from aolink.cli.tables import sessions
-    from aolink.recording.compare import compare
-    from aolink.recording.reader import Recording
-    from aolink.recording.topics import TOPICS
-    from aolink.session.replay import RecordedCommands
-
-    commands = RecordedCommands(recording)
-    with StopRequest().installed() as stop, progress("exposures", commands.exposures) as tell:
-        report = session.record(
-            recording.rig, camera, mirror, output, estimators=names, exposures=commands.exposures,
-            inputs=commands.inputs, note=f"commands of {recording.path.name}", overwrite=overwrite, stop=stop,
-            progress=tell,
-        )  # fmt: skip
-    for warning in report.warnings:
-        warn(warning)
-    if not report.files:
-        stop.raise_if_asked()
-        raise RecordingError(f"{output}: nothing is written, there is nothing to compare")
-    only = [row.name for row in TOPICS if row.repeatable]
-    found = compare(recording, Recording(output), only=only, relative_to_start=True)
-    if as_json:
-        print(json.dumps(tables.comparison_as_json(found, same_rig=True), allow_nan=False))
-    else:
-        stdout.print(sessions.session(report))
-        stdout.print(tables.comparison(found))
-        stdout.print(f"{output}: {report.exposures} exposures, {report.ended}", markup=False)
-    stop.raise_if_asked()
-
-
-@app.command(epilog="Example: aolink demo  |  aolink demo --rig section-vi-lively -e o1 -e o3 -e profile --out /tmp")
+@app.command(epilog="Example: aolink demo  |  aolink demo --rig section-vi-lively -e o1 -e o3 -e profile -o /tmp")
 def demo(
     rig: Annotated[str, typer.Option(help="Rig file or name.")] = "moving-scene",
-    out: Annotated[Path, typer.Option(metavar="DIR", help="The folder in which to make a new, dated one.")] = Path(),
+    out: Annotated[
+        Path, typer.Option("--output", "-o", "--out", metavar="DIR", help="The folder in which to make a new one.")
+    ] = Path(),
     estimator: Annotated[
         list[str] | None,
         typer.Option("--estimator", "-e", help="Estimator to run; by default open-loop, o1 and moments."),
     ] = None,
     exposures: Annotated[int, typer.Option(min=2, help="How many exposures.")] = 40,
-    seed: Annotated[int | None, typer.Option(min=0, help="Instead of the rig file's seed.")] = None,
-    real_time: Annotated[bool, typer.Option("--real-time", help="Run in real time and measure latencies.")] = False,
     control: Annotated[
         str | None,
         typer.Option(
@@ -376,7 +303,7 @@ def demo(
     try:
         with progress_bar(common.stderr, exposures) as tell:
             result = run_demo(
-                loaded, rig, folder, estimators=names, exposures=exposures, seed=seed, real_time=real_time,
+                loaded, rig, folder, estimators=names, exposures=exposures,
                 control=control or "", stoppable=stop.installed, progress=tell,
             )  # fmt: skip
     except Interrupted as interrupted:

@@ -53,7 +53,7 @@ class MirrorModes:
     @classmethod
     def of(cls, response: FloatArray) -> MirrorModes:
         """Mirror modes of a response (n_outputs, n_inputs), that of a plant or one measured by `aolink calibrate
-        --interaction`."""
+        --measure interaction`."""
         U, gains, V = np.linalg.svd(response, full_matrices=False)
         return cls(slopes=U, gains=gains, inputs=V.T)
 

@@ -50,7 +50,7 @@ def hdf5_film(path: Path, topic: str | None) -> Film:
         file.visititems(lambda name, each: found.update({f"/{name}": each}) if hasattr(each, "dtype") else None)
         frames = [name for name, each in found.items() if each.ndim >= 3 and each.dtype.kind in "biuf"]
         wanted = frames if topic is None else [name for name in found if name == f"/{topic.strip('/')}"]
-        chosen = found[_only(path, wanted, found, "say with --topic which one has the frames")]
+        chosen = found[_only(path, wanted, found, "say with --film topic=NAME which one has the frames")]
         beside = {name.rpartition("/")[2]: each for name, each in found.items() if each.parent == chosen.parent}
         known = _known(path, {key: np.asarray(each) for key, each in (*beside.items(), *chosen.attrs.items())
                               if key in _FACTS})  # fmt: skip

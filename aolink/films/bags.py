@@ -134,7 +134,7 @@ def _chosen(types: dict[str, str], topic: str | None, path: Path) -> str:
         where = "that can be read on any topic" if topic is None else f"on {topic or 'a topic without a name'}"
         raise ImportingError(f"{path} has no pictures {where}: it has {have}")
     if len(pictures) > 1:
-        raise ImportingError(f"{path} has pictures on {', '.join(sorted(pictures))}: say which with --topic")
+        raise ImportingError(f"{path} has pictures on {', '.join(sorted(pictures))}: say which with --film topic=NAME")
     return pictures[0]
 
 

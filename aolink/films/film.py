@@ -178,7 +178,7 @@ def one_colour(film: Film, colour: str) -> Film:
     def changed(picture: FilmFrame) -> FilmFrame:
         if not film.mosaic:
             if picture.ndim != 3 or picture.shape[2] < 3:
-                raise ImportingError(f"{film.name} has no colours: leave --colour out")
+                raise ImportingError(f"{film.name} has no colours: leave --film colour out")
             return picture if colour == "all" else picture[..., "RGB".index(letter)]
         rows, columns = (n // 2 * 2 for n in picture.shape)
         cells = [picture[k // 2 : rows : 2, k % 2 : columns : 2] for k in range(4)]

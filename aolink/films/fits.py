@@ -92,8 +92,8 @@ def fits_film(path: Path, topic: str | None) -> Film:
 def no_topic(path: Path, topic: str) -> str:
     """The error for a topic of a source that has one film only."""
     return (
-        f"{path} has no topics: --topic {topic} says which channel of an MCAP file or a bag, which dataset of an HDF5"
-        " file, or which wavefront sensor of AO telemetry, is imported; leave it out"
+        f"{path} has no topics: --film topic={topic} says which channel of an MCAP file or a bag, which dataset of an"
+        " HDF5 file, or which wavefront sensor of AO telemetry, is imported; leave it out"
     )
 
 

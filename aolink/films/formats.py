@@ -70,7 +70,9 @@ def open_film(source: str | Path, topic: str | None = None) -> Film:
         else:
             raise ImportingError(fits.no_topic(path, topic))
     if film.mosaic:
-        note = f"its pixels are under a Bayer mosaic, {film.mosaic}: --colour green (or red, blue) takes one colour"
+        note = (
+            f"its pixels are under a Bayer mosaic, {film.mosaic}: --film colour=green (or red, blue) takes one colour"
+        )
         film = replace(film, notes=(*film.notes, note))
     return replace(film, pictures=lambda: _checked(film, path))
 

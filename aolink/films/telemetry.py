@@ -46,7 +46,7 @@ def aot_film(path: Path, uid: str | None = None) -> Film:
         raise ImportingError(f"{path} has neither pictures nor slopes of {_which(uid)}")
     detector = sensor.detector
     others = [str(each.uid) for each in usable[1:]]
-    more = [f"{path.name} has those of {', '.join(others)} too: say which with --topic"] if others else []
+    more = [f"{path.name} has those of {', '.join(others)} too: say which with --film topic=NAME"] if others else []
     if pictured:
         series, what = detector.pixel_intensities, f"pictures of the wavefront sensor {sensor.uid}"
         frames = np.asarray(series.data)
@@ -61,7 +61,7 @@ def aot_film(path: Path, uid: str | None = None) -> Film:
         what = (
             f"{path.name} holds slopes of the wavefront sensor {sensor.uid} and no pictures: only o1 and open-loop can"
             " use them. Their noise is taken to be that of a centroid by the rig file, their unit"
-            f" ({series.unit or 'not said'}) the slope unit; --scale makes one of the other"
+            f" ({series.unit or 'not said'}) the slope unit; --film scale makes one of the other"
         )
         frames = _slopes(np.asarray(series.data, dtype=np.float64), path)
     known: dict[str, Any] = {"slopes": not pictured}

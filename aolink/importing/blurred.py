@@ -165,7 +165,7 @@ def _boxes(film: Film, brightest: FloatArray, noise: float) -> tuple[list[tuple[
     if not height > _SIGNIFICANT * smoothed:
         raise ImportingError(
             f"{film.name} shows no spot: nothing is {_SIGNIFICANT:g} times as bright as the noise; is it darker than"
-            " the ground? then add --invert"
+            " the ground? then add --film invert"
         )
     least = ground + max(_SIGNIFICANT * smoothed, _FAINTEST * height / 2)
     labels, _ = ndimage.label(brightest > least, structure=np.ones((3, 3)))

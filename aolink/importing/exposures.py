@@ -57,13 +57,15 @@ def imported(film: Film, rig: Rig, settings: FilmSettings, account: FilmAccount)
     account.missing = times.missing
     account.notes = (*film.notes, *times.notes, *(() if settings.invert else film.saturation_notes))
     if film.start_ns is None and settings.start_ns is None:
-        account.notes += ("when the film was taken is not known: its times count from 1970 unless --start is given",)
+        account.notes += (
+            "when the film was taken is not known: its times count from 1970 unless --film start=DATE is given",
+        )
     if film.nonlinear and settings.gamma == 1.0:
         account.notes += (nonlinear_note(film),)
     if rig.sensor.row_time_s is None and film.shape[0] > 1 and not film.slopes:
         account.notes += (
-            "it is not known whether the film's rows were exposed one after the other: say so with --row-time S,"
-            " or --row-time 0",
+            "it is not known whether the film's rows were exposed one after the other: say so with --film row_time=S,"
+            " or row_time=0",
         )
     if film.slopes:
         yield from _of_slopes(film, rig, settings, times, account)
@@ -74,7 +76,9 @@ def imported(film: Film, rig: Rig, settings: FilmSettings, account: FilmAccount)
         yield from tracked(film, rig, settings, times, account)
         return
     if settings.scale is not None and settings.scale < 0:
-        raise ImportingError(f"--scale {settings.scale:g} must be above 0 for pictures: dark objects need --invert")
+        raise ImportingError(
+            f"--film scale={settings.scale:g} must be above 0 for pictures: dark objects need --film invert"
+        )
     if film.shape != rig.sensor.shape:
         rows, columns = rig.sensor.shape
         raise ImportingError(
@@ -104,7 +108,7 @@ def imported(film: Film, rig: Rig, settings: FilmSettings, account: FilmAccount)
         if settings.scale is None and film.dtype.kind == "f" and mean.max() > 1.0:
             raise ImportingError(
                 f"{film.name} has floating-point values up to {mean.max():.6g}, where 1.0 would be full scale: say with"
-                " --scale how many counts a value of one is"
+                " --film scale=COUNTS how many counts a value of one is"
             )
         counts = offset + scale * mean
         if bright != 1.0:
@@ -160,7 +164,7 @@ def _of_slopes(
     """The exposures of a film without pictures: all of their pixels are missing."""
     if settings.track or settings.invert or settings.subtract_median or settings.gamma != 1.0:
         raise ImportingError(
-            f"{film.name} has slopes and no pictures: --track, --invert, --background and --gamma need pixels"
+            f"{film.name} has slopes and no pictures: --track, and --film invert, background and gamma, need pixels"
         )
     if film.shape[1] != rig.n_outputs:
         raise ImportingError(

@@ -159,7 +159,9 @@ def film_times(film: Film, settings: FilmSettings) -> FrameTimes:
         notes.append(f"the film says that it starts at {_date(film.start_ns)}; {_date(settings.start_ns)} is taken")
     lasts = film.count * 1e9 / (rate or 1.0) if film.times_ns is None else int(film.times_ns[-1] - film.times_ns[0])
     if not 0 <= start < _LATEST_NS - lasts - _DAY_NS:
-        raise ImportingError(f"{film.name} has a start or an end that is not from 1970 to 2262: give the right --start")
+        raise ImportingError(
+            f"{film.name} has a start or an end that is not from 1970 to 2262: give the right --film start=DATE"
+        )
     periods = np.arange(film.count, dtype=np.int64)
     if film.times_ns is None or film.count < 2:
         since = np.rint(periods * (1e9 / rate if rate else 0.0)).astype(np.int64)
@@ -255,7 +257,7 @@ def _date(time_ns: int | None) -> str:
 
 def nonlinear_note(film: Film) -> str:
     """A note for the user on a film that is `Film.nonlinear`, where no gamma curve is undone."""
-    return f"light may not be linear: {film.nonlinear}; --gamma 2.2 undoes the usual curve"
+    return f"light may not be linear: {film.nonlinear}; --film gamma=2.2 undoes the usual curve"
 
 
 def counts_of(

@@ -261,7 +261,7 @@ def _found(film: Film, settings: FilmSettings, light: FilmLight) -> Objects:
         if len(apart) >= settings.track:
             chosen = apart[: settings.track]
             return Objects(chosen, spot_sd(flat, chosen, _pitch(chosen, film.shape)))
-    dark = "" if settings.invert else "; are they darker than the ground? then add --invert"
+    dark = "" if settings.invert else "; are they darker than the ground? then add --film invert"
     raise ImportingError(f"{film.name} shows {most} objects, {settings.track} are asked for with --track{dark}")
 
 

@@ -56,13 +56,15 @@ def tracked(
         )
     if rig.sensor.row_starts_s.any():
         raise ImportingError(
-            "with --track the rows of the rig's sensor are not the film's: leave out --row-time and sensor.row_time_s."
+            "with --track the rows of the rig's sensor are not the film's: leave out row_time and sensor.row_time_s."
             " An object's steps are then those of its own interval, later by its row in the film times the row time"
         )
     known = survey(film, settings, find_objects(film, settings))
     account.notes += tuple(known.notes())
     if settings.scale is not None:
-        account.notes += ("--scale is not used: with --track the objects have the light that the rig file gives them",)
+        account.notes += (
+            "--film scale is not used: with --track the objects have the light that the rig file gives them",
+        )
     windows = _Windows(rig, sensor, known)
     far, spread = windows.reach, spread_in(known, settings.frames_per_exposure)
     light, step, area = FilmLight(film, settings, known.defects), 0, sensor.pixel_size

@@ -125,7 +125,7 @@ def record_frames(
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise AolinkError(f"cannot create {folder}: {(error.strerror or '').lower()}; give another --keep") from None
+        raise AolinkError(f"cannot create {folder}: {(error.strerror or '').lower()}; give another -o") from None
     for name, _, _ in _ASKED:
         check_target(folder / f"{name}.mcap", overwrite=overwrite)
     with open_devices(rig, camera, mirror):
@@ -252,7 +252,7 @@ def film_row_time(rig: Rig, path: Path, blink_hz: float) -> RowTime:
     from aolink.importing.frames import FilmSettings, film_times
 
     if not 0 < blink_hz < math.inf:
-        raise CalibrationError(f"--row-time {blink_hz:g} must be the light's blinks in a second, above 0")
+        raise CalibrationError(f"blink_hz={blink_hz:g} must be the light's blinks in a second, above 0")
     film = open_film(path, None)
     if film.slopes:
         raise CalibrationError(f"{film.name} has slopes and no pictures")

@@ -115,8 +115,7 @@ def new_folder(parent: Path) -> Path:
 
 
 def run_demo(
-    rig: Rig, source: str | Path, folder: Path, *, estimators: Sequence[str], exposures: int, seed: int | None = None,
-    real_time: bool = False, control: str = "",
+    rig: Rig, source: str | Path, folder: Path, *, estimators: Sequence[str], exposures: int, control: str = "",
     stoppable: Callable[[], AbstractContextManager[Callable[[], bool]]] = lambda: contextlib.nullcontext(lambda: False),
     progress: Callable[[str, int], None] = lambda part, done: None,
 ) -> DemoResult:  # fmt: skip
@@ -142,8 +141,6 @@ def run_demo(
         yield lambda done: progress(name, done)
         seconds[name] = time.monotonic() - start
 
-    options = ["--real-time"] if real_time else []
-    options += ["--seed", str(seed)] if seed is not None else []
     sessions: list[tuple[str, Path, Sequence[str]]] = [(control, path, estimators)]
     if control:
         others = [each for each in ("", INTEGRATOR.name) if each != control]
@@ -151,7 +148,7 @@ def run_demo(
     residuals: dict[str, float] = {}
     for of, where, names in sessions:
         what = f"record {of or 'open'}" if control else "record"
-        with part(what) as tell, stoppable() as stop, simulated_rig(source, *options) as (camera, mirror):
+        with part(what) as tell, stoppable() as stop, simulated_rig(source) as (camera, mirror):
             report = record(
                 rig, camera, mirror, where, estimators=names, exposures=exposures, note="aolink demo", control=of,
                 stop=stop, progress=tell,

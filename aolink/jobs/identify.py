@@ -138,7 +138,7 @@ def _check_plant(rig: Rig, wanted: Wanted) -> None:
     if wanted.plant and 1 < rig.plant.n_outputs <= _APART:
         raise IdentificationError(
             f"a plant is identified where one input moves one output of a copy of it: this rig's has"
-            f" {rig.plant.n_inputs} inputs and {rig.plant.n_outputs} outputs; leave --plant out"
+            f" {rig.plant.n_inputs} inputs and {rig.plant.n_outputs} outputs; leave --fit of a plant out"
         )
 
 

@@ -184,13 +184,13 @@ def check_has_exposures(recording: Recording) -> None:
 
 
 def write_reestimated(
-    recording: Recording, names: Sequence[str], path: str | Path, *, only: bool = False, overwrite: bool = False,
+    recording: Recording, names: Sequence[str], path: str | Path, *, overwrite: bool = False,
     progress: Progress = no_progress, engine: Engine = "aolink",
 ) -> tuple[dict[str, Score], dict[str, str | None]]:  # fmt: skip
     """Copy a recording with new estimates; gives what `scored_and_compared` gives, from the same pass.
 
-    Estimates by other names, and pictures restored with them, stay in the copy, unless ``only``; those that were made
-    with another rig than ``recording.rig`` could not be read in it and are left out. Messages of other software are
+    Estimates by other names, and pictures restored with them, stay in the copy; those that were made with another rig
+    than ``recording.rig`` could not be read in it and are left out. Messages of other software are
     copied unchanged. The same recording and the same version of aolink give the same bytes.
 
     Raises
@@ -199,36 +199,27 @@ def write_reestimated(
         ``path`` exists and not ``overwrite``, or cannot be written.
     """
     with writing(Path(path), overwrite=overwrite, sources=recording.files, error=RecordingError) as partial:
-        return fill_reestimated(recording, names, partial, only, progress, engine)
+        kept = kept_estimators(recording, names)
+        notes = recording.metadata | {
+            "aolink_version": version("aolink"),
+            "estimators": " ".join([*kept, *names]),
+            "estimated_from": recording.path.name,
+            "recorded_with": recording.metadata.get("aolink_version", "unknown"),
+        }
+        if engine != "aolink":
+            notes["engine"] = engine
+        outcome = Outcome(recording, names)
+        with RecordingCopy(recording, partial, notes) as copy:
+            for some in _with_estimates(recording, Driver(recording.rig, names, engine), kept, outcome):
+                copy.add(some)
+                progress(copy.exposures)
+            copy.finish(recording.losses)
+        return outcome.result()
 
 
-def fill_reestimated(
-    recording: Recording, names: Sequence[str], path: Path, only: bool = False, progress: Progress = no_progress,
-    engine: Engine = "aolink",
-) -> tuple[dict[str, Score], dict[str, str | None]]:  # fmt: skip
-    """Write the content of `write_reestimated` into an empty file that is there already. Raises OSError for errors of
-    the disk."""
-    kept = kept_estimators(recording, names, only=only)
-    notes = recording.metadata | {
-        "aolink_version": version("aolink"),
-        "estimators": " ".join([*kept, *names]),
-        "estimated_from": recording.path.name,
-        "recorded_with": recording.metadata.get("aolink_version", "unknown"),
-    }
-    if engine != "aolink":
-        notes["engine"] = engine
-    outcome = Outcome(recording, names)
-    with RecordingCopy(recording, path, notes) as copy:
-        for some in _with_estimates(recording, Driver(recording.rig, names, engine), kept, outcome):
-            copy.add(some)
-            progress(copy.exposures)
-        copy.finish(recording.losses)
-    return outcome.result()
-
-
-def kept_estimators(recording: Recording, names: Sequence[str], *, only: bool) -> list[str]:
+def kept_estimators(recording: Recording, names: Sequence[str]) -> list[str]:
     """The estimators whose estimates stay in a copy of a recording with new estimates by ``names``."""
-    if only or not recording.rig_is_recorded:
+    if not recording.rig_is_recorded:
         return []
     return [name for name in recording.estimators if name not in names]
 

@@ -15,7 +15,6 @@ from aolink.errors import RecordingError
 from aolink.estimation import Driver, Estimate
 from aolink.exposure import Exposure
 from aolink.recording import topics
-from aolink.recording.editing import between
 from aolink.recording.reader import Recording
 from aolink.recording.reestimate import Skipped
 from aolink.wire import messages_pb2 as wire
@@ -25,7 +24,7 @@ _NAP_S = 0.1
 
 
 def replay(
-    recording: Recording, names: Sequence[str], *, rate: float = 0.0, start_s: float = 0.0, end_s: float = float("inf"),
+    recording: Recording, names: Sequence[str], *, rate: float = 0.0,
     stop: Callable[[], bool] = lambda: False, now_s: Callable[[], float] = time.monotonic, sleep: Callable[[float],
     None] = time.sleep,
 ) -> Iterator[tuple[Exposure, list[Estimate]]]:  # fmt: skip
@@ -35,15 +34,8 @@ def replay(
     ----------
     rate:
         Pace relative to that of the recording; 0 for as fast as possible.
-    start_s, end_s:
-        Exposures that began before or after these times, in s from the first one, are left out.
     now_s, sleep:
         The clock for the pace, in s, and a function that waits for some seconds.
-
-    Raises
-    ------
-    RecordingError
-        There is no exposure between the two times.
     """
     skipped = Skipped(recording, names)
     driver = Driver(recording.rig, names, skipped=skipped.frames)
@@ -54,9 +46,7 @@ def replay(
         if first_step is None:
             first_step = exposure.first_step
         at_s = (exposure.first_step - first_step) * step_s
-        if not start_s <= at_s:
-            continue
-        if at_s >= end_s or stop():
+        if stop():
             break
         if began is None:
             began = (at_s, now_s())
@@ -68,7 +58,7 @@ def replay(
                 break
         yield exposure, driver.step(exposure)
     if began is None and not stop():
-        raise RecordingError(f"{recording.path} has no exposure {between(start_s, end_s)}")
+        raise RecordingError(f"{recording.path} has no exposure")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -47,7 +47,7 @@ _NO_DRIVER = (
 
 
 def check_display(
-    instead: str = "there is no display: use `aolink view --web` for a browser, or --screenshot for a picture",
+    instead: str = "there is no display: use `aolink view --web` for a browser, or -o X.png for a picture",
 ) -> None:
     """Raise `ViewerError` where a window cannot be opened."""
     if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
@@ -217,12 +217,12 @@ def is_free(port: int) -> bool:
 def existing(path: str | Path) -> Path:
     path = Path(path)
     if not path.is_file():
-        raise ViewerError(f"there is no file {path}: `aolink view RECORDING --save FILE.rrd` writes one")
+        raise ViewerError(f"there is no file {path}: `aolink view RECORDING -o FILE.rrd` writes one")
     try:
         with path.open("rb") as file:
             magic = file.read(len(_MAGIC))
     except OSError as error:
         raise ViewerError(f"cannot read {path}: {(error.strerror or str(error)).lower()}") from None
     if magic != _MAGIC:
-        raise ViewerError(f"{path} is not a Rerun file: `aolink view RECORDING --save FILE.rrd` writes one")
+        raise ViewerError(f"{path} is not a Rerun file: `aolink view RECORDING -o FILE.rrd` writes one")
     return path.resolve()

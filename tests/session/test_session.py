@@ -91,7 +91,7 @@ def test_a_copy_keeps_the_estimates_that_were_there(recorded: Session, tmp_path:
     assert all(each.same for each in found.values()), found
     write_reestimated(source, ["moments"], copy, overwrite=True)
     assert sorted(Recording(copy).estimators) == sorted([*ESTIMATORS, "moments"])
-    write_reestimated(source, ["o1"], copy, only=True, overwrite=True)
+    write_reestimated(source, ["o1"], copy, overwrite=True)
     assert Recording(copy).estimators == ["o1"]
     other = Recording(recorded.path, rig=parse_rig(source.rig.toml.replace("process_noise = 10", "process_noise = 3")))
     write_reestimated(other, ["o1"], copy, overwrite=True)

@@ -39,7 +39,7 @@ def test_the_same_file_is_one_recording_under_any_name_and_another_file_another(
 ) -> None:
     copy, other = tmp_path / "copy.mcap", tmp_path / "other.mcap"
     shutil.copy(recording.path, copy)
-    write_reestimated(recording, ["o1"], other, only=True)
+    write_reestimated(recording, ["o1"], other)
     assert identity(save_rrd(Recording(copy), tmp_path / "copy.rrd")) == identity(saved)
     application, recording_id = identity(save_rrd(Recording(other), tmp_path / "other.rrd"))
     assert application == identity(saved)[0] == "aolink"

@@ -102,7 +102,7 @@ def test_two_estimates_and_two_recordings_are_drawn_in_the_same_plots(tmp_path: 
     """The second in fainter lines, from its own first exposure on."""
     recording = Recording(LIVELY)
     again = tmp_path / "again.mcap"
-    write_reestimated(recording, ["o1"], again, only=True)
+    write_reestimated(recording, ["o1"], again)
     path = save_rrd(recording, tmp_path / "both.rrd", look=Look(compared=Recording(again)))
     entities = read_rrd(path)
     first, second = (entities[f"{root}/path/o1/mean"] for root in ("", "/compared"))
