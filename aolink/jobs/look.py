@@ -344,10 +344,11 @@ def _line_left(seen: Sequence[Readings], model: ProcessSum, rate_hz: float) -> f
     left = [one for each in seen for one in Likelihood(each, 1).whitened_means(model)]
     count = max(map(len, left))
     power = np.mean([np.abs(np.fft.rfft(each - each.mean())) ** 2 for each in left if len(each) == count], axis=0)
-    power = power[1 : (count + 1) // 2]
+    first = max(1, -(-count // _SLOWEST))  # what is slower is a drift
+    power = power[first : (count + 1) // 2]
     top = int(power.argmax())
     chance = len(power) * (1 - power[top] / power.sum()) ** (len(power) - 1)
-    return (top + 1) / count * rate_hz if chance < _CHANCE else None
+    return (top + first) / count * rate_hz if chance < _CHANCE else None
 
 
 def _with_aliases(found: IdentifiedModel, scene: _Scene, most_blur: float) -> IdentifiedModel:

@@ -108,13 +108,26 @@ def _path(looked: Looked, direction: int, number: int) -> FloatArray:
     return np.full(steps, float(light @ np.arange(len(light)) / light.sum()))
 
 
+def summary(looked: Looked) -> Figure:
+    """Three exposures with the path in them, and the spectrum along the direction of more motion: in a paper's size."""
+    figure = new_figure(180, 48)
+    *three, last = figure.subplots(1, len(_SHOWN) + 1, width_ratios=[1, 1, 1, 2.2])
+    _show_exposures(looked, three)
+    _spectrum(looked, looked.directions[_main(looked)], last)
+    return figure
+
+
 def _exposures(looked: Looked) -> Figure:
     figure = new_figure(140, 55)
-    for axes, number in zip(figure.subplots(1, len(_SHOWN)), _chosen(looked), strict=True):
+    _show_exposures(looked, figure.subplots(1, len(_SHOWN)))
+    return figure
+
+
+def _show_exposures(looked: Looked, each_axes: Sequence[Axes]) -> None:
+    for axes, number in zip(each_axes, _chosen(looked), strict=True):
         axes.imshow(looked.spots.light[number, 0], cmap="gray")
         axes.plot(_path(looked, 0, number), _path(looked, 1, number), color="tab:orange", linewidth=1.0)
         axes.set(title=f"exposure {number}", xticks=[], yticks=[])
-    return figure
 
 
 def _main(looked: Looked) -> int:
