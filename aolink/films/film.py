@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import mmap
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -20,6 +21,8 @@ _CONVERTERS = (8, 10, 12, 14)
 """Bits of cameras whose pixels are stored in 16, at the lower end or at the upper one."""
 _READ_FRAMES = 2000
 """Frames that are read, at most, to find out where a film saturates."""
+_KEPT = 16
+"""Frames of a mapped file that stay in memory."""
 _LEAST_PIXELS = 3
 """A film saturates at its largest value if that is a converter's last, and so many pixels have it at least, and no
 fewer than are within a hundredth below it."""
@@ -162,8 +165,17 @@ def array_film(frames: Any, name: str, **known: Any) -> Film:
         raise ImportingError(f"{name} has {shape[0]} frames and times of shape {times.shape}: give one for each")
     return Film(
         name=name, shape=(int(shape[1]), int(shape[2])), dtype=dtype, count=int(shape[0]), **known,
-        pictures=lambda: (np.asarray(frames[k]) for k in range(shape[0])),
+        pictures=lambda: frame_by_frame(frames),
     )  # fmt: skip
+
+
+def frame_by_frame(frames: Any) -> Iterator[FilmFrame]:
+    """The frames of an array. Where it is mapped from a file, the memory of those that were seen is given back."""
+    mapped = getattr(frames, "_mmap", None)
+    for k in range(len(frames)):
+        yield np.asarray(frames[k])
+        if mapped is not None and k % _KEPT == _KEPT - 1:
+            mapped.madvise(mmap.MADV_DONTNEED)
 
 
 def one_colour(film: Film, colour: str) -> Film:

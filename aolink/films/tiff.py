@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from aolink.errors import ImportingError
 from aolink.extensions import needs_extra
-from aolink.films.film import Film, FilmFrame
+from aolink.films.film import Film, FilmFrame, frame_by_frame
 from aolink.films.stills import COMPRESSED
 
 _LOSSY = (6, 7)  # JPEG
@@ -55,8 +55,7 @@ def tiff_film(path: Path) -> Film:
         with _complaints(path), tifffile.TiffFile(path) as file:
             pages = [page for each in file.series for page in each.pages] if one_by_one else file.series[0].pages
             if len(pages) != size[0]:  # ImageJ keeps a large stack as one page
-                for frame in tifffile.memmap(path, mode="r").reshape(size[0], *shape[1:]):
-                    yield np.asarray(frame)
+                yield from frame_by_frame(tifffile.memmap(path, mode="r").reshape(size[0], *shape[1:]))
                 return
             for page in pages:
                 if page is None or math.prod(page.chunked) > len(page.dataoffsets):  # it would count them all

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import struct
+import subprocess
+import sys
 from collections.abc import Callable
 from fractions import Fraction
 from pathlib import Path
@@ -265,3 +267,20 @@ def test_one_picture_among_many_jpegs_is_not_taken_for_the_film(tmp_path):
         Image.fromarray(EIGHT[k]).save(tmp_path / f"{k}.jpg")
     Image.fromarray(EIGHT[0]).save(tmp_path / "plot.png")
     assert "holds 3 JPEG files and 1 others: which are the frames?" in refused(tmp_path)
+
+
+def test_a_long_film_in_a_file_is_read_in_little_memory(tmp_path: Path) -> None:
+    """Pages of a mapped file count as a process's memory until they are given back."""
+    path = tmp_path / "long.npy"
+    frames = np.lib.format.open_memmap(path, "w+", np.uint16, (400, 512, 512))
+    frames[:] = np.arange(400, dtype=np.uint16)[:, None, None]
+    del frames
+    program = (
+        "import resource, sys; from pathlib import Path; from aolink.films.formats import open_film\n"
+        "used = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_maxrss\n"
+        "film = open_film(Path(sys.argv[1])); next(film.frames()); before = used()\n"
+        "last = [int(each[3, 4]) for each in film.frames()]\n"
+        "assert last == list(range(400)); print(used() - before)"
+    )
+    done = subprocess.run([sys.executable, "-c", program, path], capture_output=True, text=True, check=True)
+    assert int(done.stdout) < 60_000, "of 210 MB"
