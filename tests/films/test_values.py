@@ -278,9 +278,9 @@ def test_a_long_film_in_a_file_is_read_in_little_memory(tmp_path: Path) -> None:
     program = (
         "import resource, sys; from pathlib import Path; from aolink.films.formats import open_film\n"
         "used = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_maxrss\n"
-        "film = open_film(Path(sys.argv[1])); next(film.frames()); before = used()\n"
-        "last = [int(each[3, 4]) for each in film.frames()]\n"
+        "before = used(); film = open_film(Path(sys.argv[1]))\n"
+        "last = [int(each.max()) for each in film.frames()]\n"
         "assert last == list(range(400)); print(used() - before)"
     )
     done = subprocess.run([sys.executable, "-c", program, path], capture_output=True, text=True, check=True)
-    assert int(done.stdout) < 60_000, "of 210 MB"
+    assert int(done.stdout) < 120_000, "of 210 MB"
