@@ -207,7 +207,9 @@ def test_a_block_of_commands_works(block: CodeBlock, laboratory: Path, tmp_path:
                 options = LIGHTS if command.startswith("aolink calibrate") else ()
                 if "--reconnect" in command:
                     options += ("--real-time",)
-                camera, mirror = stack.enter_context(simulated_rig(folder / "my.toml", *options))
+                named = re.search(r"--rig ([\w-]+)(?: |$)", command)  # a rig that comes along, or the laboratory's
+                served = named[1] if named else folder / "my.toml"
+                camera, mirror = stack.enter_context(simulated_rig(served, *options))
                 command = command.replace("/dev/ttyACM0", camera).replace("/dev/ttyACM1", mirror)
             done = run(command, folder, answers="\n" * 8)
         expected = next((code for start, code in EXIT_CODES.items() if command.startswith(start)), 0)
@@ -236,7 +238,7 @@ def test_the_block_of_a_tunnel_works(tmp_path: Path) -> None:
 @pytest.mark.parametrize("block", PYTHON, ids=str)
 def test_a_block_of_python_works(block: CodeBlock, laboratory: Path, tmp_path: Path) -> None:
     """As a program of its own, in a folder that has a recording; a file that it writes is one that aolink takes."""
-    for module in re.findall(r"^import (hcipy|pyrtc)$", block.text, re.MULTILINE):
+    for module in re.findall(r"^import (hcipy|pyrtc|skimage)$", block.text, re.MULTILINE):
         needed(module)
     folder = tmp_path / "here"
     shutil.copytree(laboratory, folder)

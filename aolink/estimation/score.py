@@ -144,6 +144,8 @@ class Scorer:
             return
         self._exposures += 1
         self._path.add(np.mean((estimate.path - truth.path)[truth.known] ** 2, keepdims=True))
+        if estimate.end_state.shape != truth.end_state.shape:
+            return  # states of another rig file's plant
         at_start, at_end = estimate.start_state - truth.start_state, estimate.end_state - truth.end_state
         known = np.isfinite(at_start).all(axis=1) & np.isfinite(at_end).all(axis=1)
         if not known.any():

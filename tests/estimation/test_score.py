@@ -100,3 +100,18 @@ def test_a_long_sum_loses_nothing():
         total.add(np.array([1.0]))
         total.add(np.array([-1e16]))
     assert total.mean == 1 / 3
+
+
+def test_states_of_another_rig_file_are_not_compared_with_the_truth(scored):
+    exposures, estimates = scored
+    others = []
+    for each in exposures:
+        truth = each.truth
+        longer = dataclasses.replace(
+            truth, start_state=np.pad(truth.start_state, ((0, 0), (0, 1))),
+            end_state=np.pad(truth.end_state, ((0, 0), (0, 1))),
+        )  # fmt: skip
+        others.append(dataclasses.replace(each, truth=longer))
+    result, own = score(others, estimates["o3"]), score(exposures, estimates["o3"])
+    assert result.path_rmse == own.path_rmse
+    assert np.isnan([result.end_rmse, result.end_nees.mean]).all()
