@@ -45,7 +45,9 @@ def report(
         ),
     ] = None,
     lenslet: LensletOption = None,
-    width_mm: Annotated[float, typer.Option(min=30, max=1000, help="Width on paper; 88 fits a column.")] = 180.0,
+    width_mm: Annotated[
+        float, typer.Option(min=30, max=1000, metavar="MM", help="Width on paper; 88 fits a column.")
+    ] = 180.0,
     overwrite: OverwriteOption = False,
 ) -> None:
     """Write a page about a session: how good the estimates are, the most telling exposures, what was lost.

@@ -36,7 +36,6 @@ def view(
         typer.Option(
             "--output",
             "-o",
-            "--save",
             metavar="X.rrd|X.png",
             help="Write a Rerun file, or a picture of the viewer, instead of opening it; needs no screen.",
         ),
@@ -164,8 +163,10 @@ def slopes(
     bad: Annotated[
         Path | None, typer.Option("--bad", metavar="FILE", help="A picture that is not zero where pixels are bad.")
     ] = None,
-    pitch_m: Annotated[float | None, typer.Option(min=1e-9, help="Distance between neighbouring lenslets, m.")] = None,
-    focal_m: Annotated[float | None, typer.Option(min=1e-9, help="Focal length of a lenslet, m.")] = None,
+    pitch_m: Annotated[
+        float | None, typer.Option(min=1e-9, metavar="M", help="Distance between neighbouring lenslets, m.")
+    ] = None,
+    focal_m: Annotated[float | None, typer.Option(min=1e-9, metavar="M", help="Focal length of a lenslet, m.")] = None,
     overwrite: OverwriteOption = False,
     as_json: JsonOption = False,
 ) -> None:

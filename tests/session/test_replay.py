@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from aolink.errors import RecordingError
 from aolink.recording import topics
 from aolink.recording.compare import compare
 from aolink.recording.reader import Recording
