@@ -258,4 +258,4 @@ def test_the_commands_of_a_session_by_hand_work_one_after_the_other(
     assert "/camera/image 3" in info.stdout
     estimated = aolink("estimate", "a.mcap", "--estimator", "o3", "--estimator", "o1", "-o", "b.mcap")
     assert "o3: the same as recorded, bit for bit" in estimated.stdout
-    assert aolink("view", "b.mcap", "--save", "b.rrd").returncode == 0
+    assert aolink("view", "b.mcap", "-o", "b.rrd").returncode == 0
