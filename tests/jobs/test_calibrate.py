@@ -605,3 +605,19 @@ def test_a_film_of_blinking_light_gives_the_row_time(aolink: Run, tmp_path: Path
     assert again.returncode != 0
     assert "in step" in again.stderr
     assert not (tmp_path / "b.toml").exists()
+
+
+@pytest.mark.parametrize(
+    ("measure", "says"),
+    [
+        ("light", "--measure light is none of frames, interaction, row-time"),
+        ("frames:poke=1", "--measure frames has no option poke: it has count"),
+        ("frames:count=2.5", "--measure frames: give count a whole number from 1 to 1e+06"),
+        ("interaction:poke=x", "--measure interaction: poke=x is no number"),
+        ("row-time", "--measure row-time: give blink_hz a number from 0.001 to 1e+06"),
+    ],
+)
+def test_what_cannot_be_measured_is_said(aolink: Run, measure: str, says: str) -> None:
+    refused = aolink("calibrate", "film.npz", "--measure", measure, "--rig", "sh-4x4", "-o", "out.toml")
+    assert refused.returncode == 2
+    assert says in " ".join(refused.stderr.replace("│", " ").split())
