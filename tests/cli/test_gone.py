@@ -11,7 +11,8 @@ from typer.testing import CliRunner
 
 from aolink.cli import app
 from aolink.cli.common import _BEFORE, _GONE, _GONE_OPTIONS
-from aolink.cli.films import _FILM, _TAKEN
+from aolink.cli.films import _FILM, _TAKEN, film_file
+from aolink.errors import ImportingError
 from tests.kinds import must_be
 
 OPTIONS = [(command, option, now) for command, gone in _GONE_OPTIONS.items() for option, now in gone.items()]
@@ -50,6 +51,21 @@ def test_an_option_that_is_there_is_none_that_is_gone() -> None:
         for command, names in table.items():
             assert not names.keys() & options_of(command)
     assert all({*names.values()} <= options_of(command) for command, names in _BEFORE.items())
+
+
+@pytest.mark.parametrize("command", _TAKEN)
+def test_a_command_takes_the_film_options_that_its_help_names_and_no_other(command: str) -> None:
+    values = {"gamma": "2.2", "topic": "/a", "colour": "red", "sum": "8", "scale": "300", "start": "2026-11-22"}
+    values["row_time"] = "1e-5"
+    forms = [f"{name}={values[name]}" if "=" in form else name for form in _FILM for name in [form.partition("=")[0]]]
+    taken, others = forms[: _TAKEN[command]], forms[_TAKEN[command] :]
+    assert film_file([",".join(taken)], command) == film_file(taken, command)
+    said = CliRunner().invoke(app, [command, "--help"], env={"COLUMNS": "200"}).stdout
+    for form in taken:
+        assert form.partition("=")[0] in said
+    for form in others:
+        with pytest.raises(ImportingError, match="there is no such option"):
+            film_file([form], command)
 
 
 @pytest.mark.parametrize("command", must_be(TyperGroup, typer.main.get_command(app)).commands)

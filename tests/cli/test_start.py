@@ -32,7 +32,7 @@ def test_help_and_the_package_itself_load_nothing_heavy(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("part", [("--frame", "3"), ("--lenslet", "0,0")])
+@pytest.mark.parametrize("part", [("--frame", "3"), ()])
 def test_looking_at_a_recording_that_holds_its_estimates_loads_rerun_and_no_estimator(
     tmp_path: Path, part: tuple[str, ...]
 ) -> None:

@@ -478,6 +478,9 @@ def test_kinds_can_be_skipped_and_nobody_there_is_an_error(aolink: Run, tmp_path
         )
         assert (few.returncode, "3 frames of a light are too few: at least 10" in few.stderr) == (8, True)
         unlit = aolink("calibrate", *devices, *common, "-o", "b.toml", input="\n\n\n\n", env=own_tmp)
+        assert (unlit.returncode, "b-frames/dark.mcap exists" in unlit.stderr) == (1, True)
+        common += ["--overwrite"]
+        unlit = aolink("calibrate", *devices, *common, "-o", "b.toml", input="\n\n\n\n", env=own_tmp)
         assert unlit.returncode == 8
         refused, _, kept = unlit.stderr.rpartition("; `aolink calibrate` takes what was recorded: ")
         assert refused.endswith(

@@ -74,7 +74,7 @@ def test_played_to_the_same_simulated_rig_a_recording_comes_out_the_same(
     with simulated_rig("section-vi-lively") as (camera, mirror):
         result = aolink(
             "record", "--rig", "section-vi-lively", "--input", recorded.path, "--camera", camera, "--mirror", mirror,
-            "-e", "o3", "-o", "again.mcap",
+            *(word for name in ESTIMATORS for word in ("-e", name)), "-o", "again.mcap",
         )  # fmt: skip
     assert result.returncode == 0, result.stderr
     found = compare(Recording(recorded.path), Recording(tmp_path / "again.mcap"))
