@@ -45,9 +45,9 @@ def run(decoys: Path, *command: str | Path) -> None:
     [
         "info s.mcap",
         pytest.param(BATCH, marks=pytest.mark.slow),
-        pytest.param("view s.mcap --save v.rrd", marks=pytest.mark.slow),
+        pytest.param("view s.mcap -o v.rrd", marks=pytest.mark.slow),
         pytest.param("report s.mcap -o r.html", marks=pytest.mark.slow),
-        pytest.param("demo --exposures 3 --real-time", marks=pytest.mark.rare),  # each estimator in a process
+        pytest.param("demo --exposures 3", marks=pytest.mark.rare),  # each estimator in a process
     ],
 )
 def test_a_command_runs_nothing_of_the_folder_that_it_is_started_in(decoys: Path, words: str) -> None:

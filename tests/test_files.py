@@ -274,12 +274,12 @@ WRITING = {
     "join": "copy {first} {second} -o {target}.mcap",
     "estimate": "estimate {session} -e o1 -o {target}.mcap",
     "deblur": "deblur {session} -e o1 -o {target}.mcap",
-    "deblur --image": "deblur --image {picture} --psf {psf} --noise-sd 0.1 -o {target}.npy",
-    "view": "view {session} --save {target}.rrd",
+    "deblur --psf": "deblur {picture} --psf {psf} --noise-sd 0.1 -o {target}.npy",
+    "view": "view {session} -o {target}.rrd",
     "import": "import {session} --rig section-vi-lively -o {target}.mcap",
     "export": "export {session} -o {target}.npz",
     "slopes -o": "slopes {frame} --reference {reference} -o {target}.npz",
-    "slopes --rrd": "slopes {frame} --reference {reference} --rrd {target}.rrd",
+    "slopes of Rerun": "slopes {frame} --reference {reference} -o {target}.rrd",
 }
 """Commands that write a file, by what they do."""
 
@@ -344,7 +344,7 @@ def test_a_read_only_file_system_is_one_clear_line(
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "words", [["demo", "--rig", "tip-tilt", "--out", "ro"], ["estimate", "{0}", "-e", "o1", "-o", "ro/out/"]]
+    "words", [["demo", "--rig", "tip-tilt", "-o", "ro"], ["estimate", "{0}", "-e", "o1", "-o", "ro/out/"]]
 )
 def test_a_folder_that_cannot_be_made_is_one_clear_line(
     in_read_only_folder: Run, recorded: Session, words: list[str]
@@ -358,10 +358,11 @@ def test_a_folder_that_cannot_be_made_is_one_clear_line(
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        ("view {session} --screenshot a.jpg", "cannot write a.jpg: what is written is a .png file"),
+        ("view {session} -o a.mcap", "cannot write a.mcap: what is written is a .rrd file"),
         ("view {session} --save a.mcap", "cannot write a.mcap: what is written is a .rrd file"),
+        ("view {session} --save=a.rrd -o b.rrd", "one file of a kind can be written: a.rrd, b.rrd"),
+        ("view {session} -o a.png -o b.png", "one file of a kind can be written: a.png, b.png"),
         ("slopes {frame} --reference {reference} -o a.txt", "cannot write a.txt: what is written is a .npz file"),
-        ("slopes {frame} --reference {reference} --rrd a.png", "cannot write a.png: what is written is a .rrd file"),
     ],
 )
 def test_a_name_that_says_another_kind_of_file_is_refused(

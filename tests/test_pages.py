@@ -124,8 +124,8 @@ def commands(block: CodeBlock) -> Iterator[str]:
         command = re.sub(r"\s+#.*", "", line)
         for whole, shorter in SHORTER.items():
             command = command.replace(whole, shorter)
-        if command.startswith("aolink view ") and not re.search(r" (-o|--save) ", command):
-            command += " --save view.rrd"  # nor has it here
+        if command.startswith("aolink view ") and not re.search(r" -o ", command):
+            command += " -o view.rrd"  # nor has it here
         bare, full = re.sub(r"\[.*?\]", "", command), re.sub(r"[\[\]]", "", command)
         yield from dict.fromkeys(" ".join(each.split()) for each in (bare, full))
 

@@ -136,9 +136,10 @@ def _measured(text: str) -> tuple[str, dict[str, float]]:
         except ValueError:
             raise typer.BadParameter(f"--measure {what}: {each} is no number") from None
     for name, number in given.items():
-        _, least, most = _MEASURES[what][name]
-        if not least <= number <= most:
-            raise typer.BadParameter(f"--measure {what}: give {name}=NUMBER, {least:g} to {most:g}")
+        default, least, most = _MEASURES[what][name]
+        if not least <= number <= most or (isinstance(default, int) and number % 1):
+            kind = "a whole number" if isinstance(default, int) else "a number"
+            raise typer.BadParameter(f"--measure {what}: give {name} {kind} from {least:g} to {most:g}")
     return what, given
 
 

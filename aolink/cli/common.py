@@ -30,13 +30,12 @@ _GONE = {
 """What does the same as a command of the release before."""
 
 _IN_PYTHON = "set in Python: aolink.record(..., options=WriteOptions(...))"
-_FILMS = {
-    f"--{name.replace('_', '-')}": f"--film {name}{value}"
-    for name, value in (
-        ("invert", ""), ("gamma", "=2.2"), ("topic", "=NAME"), ("colour", "=red"), ("background", ""),
-        ("scale", "=COUNTS"), ("start", "=DATE"), ("row_time", "=S"),
-    )
-}  # fmt: skip
+
+
+def _films(*forms: str) -> dict[str, str]:
+    return {f"--{form.partition('=')[0].replace('_', '-')}": f"--film {form}" for form in forms}
+
+
 _GONE_OPTIONS = {
     "record": dict.fromkeys(("--compression", "--chunk-kib", "--flush-s", "--fsync-s", "--split-mib"), _IN_PYTHON),
     "replay": {
@@ -49,10 +48,14 @@ _GONE_OPTIONS = {
         "--hold": "--measure interaction:hold_s=1", "--row-time": "--measure row-time:blink_hz=HZ",
         "--keep": "without an option: the recordings are kept",
     },
-    "estimate": {"--only": "-o DIR/, whose side files have the new estimates alone"},
-    "import": _FILMS,
-    "look": _FILMS,
-    "rig": _FILMS,
+    "estimate": {
+        "--engine": "-e o1:engine=filterpy", "--only": "-o DIR/, whose side files have the new estimates alone",
+    },
+    "look": _films("invert", "gamma=2.2", "topic=NAME", "colour=red"),
+    "import": _films(
+        "invert", "gamma=2.2", "topic=NAME", "colour=red", "background", "scale=COUNTS", "start=DATE", "row_time=S"
+    ),
+    "rig": _films("invert", "gamma=2.2", "topic=NAME"),
     "identify": {
         "--noise": "--fit noise", "--kernel": "--fit kernel", "--plant": "--fit first-order, or --fit second-order",
     },
@@ -66,6 +69,8 @@ _GONE_OPTIONS = {
     "demo": {"--seed": "aolink sim RIG --seed N, with aolink record", "--real-time": "aolink sim RIG --real-time"},
 }  # fmt: skip
 """What does the same as an option of the release before, by command."""
+_BEFORE = {"view": {"--save": "--output"}, "deblur": {"--out": "--output"}, "demo": {"--out": "--output"}}
+"""Names of the release before that options still have, by command; their help has one."""
 
 
 _GROUPS = {
@@ -88,14 +93,20 @@ class _Commands(TyperGroup):
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         if args and args[0] in _GONE:
             raise typer.BadParameter(f"{args[0]} is now: aolink {_GONE[args[0]]}")
-        gone = _GONE_OPTIONS.get(args[0], {}) if args else {}
-        for each in args[1:]:
-            if (name := each.partition("=")[0]) in gone:
+        gone, before = (table.get(args[0], {}) if args else {} for table in (_GONE_OPTIONS, _BEFORE))
+        for at, each in enumerate(args[1:], 1):
+            name, equals, value = each.partition("=")
+            if name in gone:
                 raise typer.BadParameter(f"{name} is now {gone[name]}")
+            if name in before:
+                args[at] = f"{before[name]}{equals}{value}"
         found = super().resolve_command(ctx, args)
-        for each in found[1].get_params(ctx) if found[1] is not None else ():
-            if getattr(each, "is_flag", False):
-                each.metavar = " "  # a switch takes no value, and its help names none
+        parameters: list[Any] = found[1].get_params(ctx) if found[1] is not None else []
+        for parameter in parameters:
+            if getattr(parameter, "is_flag", False):
+                parameter.metavar = " "  # a switch takes no value, and its help names none
+            elif parameter.param_type_name == "argument":
+                parameter.display_type = lambda _: ""  # its name tells more than a type of Python
         return found
 
 
@@ -131,6 +142,7 @@ EstimatorOption = Annotated[
     typer.Option(
         "--estimator",
         "-e",
+        metavar="NAME",
         help="Estimator to run, such as moments, o1 or, with options, o3:second_order; may be given several times.",
     ),
 ]

@@ -4,7 +4,6 @@ import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import AbstractContextManager
-from enum import StrEnum
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -20,10 +19,6 @@ from aolink.signals import StopRequest
 if TYPE_CHECKING:
     from aolink.jobs.batch import Done, Job
     from aolink.jobs.unit import Model
-
-
-Engine = StrEnum("Engine", {"AOLINK": "aolink", "FILTERPY": "filterpy"})
-"""The implementation of o1 to o3."""
 
 
 @app.command(
@@ -50,11 +45,7 @@ def estimate(
         list[str] | None,
         typer.Option("--set", metavar="KEY=VALUE,...", help="Change a key of the rig file; each value makes a model."),
     ] = None,
-    engine: Annotated[
-        Engine,
-        typer.Option(help="Implementation of the filters; filterpy runs o1 to o3 on a plant of one axis, slowly."),
-    ] = Engine.AOLINK,
-    jobs: Annotated[int, typer.Option(min=1, help="How many recordings to estimate at once.")] = 1,
+    jobs: Annotated[int, typer.Option(min=1, metavar="N", help="How many recordings to estimate at once.")] = 1,
     side: Annotated[bool, typer.Option("--side", hidden=True)] = False,
     parquet: Annotated[bool, typer.Option("--parquet", hidden=True)] = False,
     table: Annotated[
@@ -89,7 +80,7 @@ def estimate(
     if not (side or is_folder or table or shard or scheduler) and len(files) == 1 and len(models) == 1:
         if jobs > 1:
             raise typer.BadParameter("--jobs is for many files or models, with -o DIR/")
-        _estimate_one(files[0], models[0], estimator, output, engine, overwrite=overwrite, as_json=as_json)
+        _estimate_one(files[0], models[0], estimator, output, overwrite=overwrite, as_json=as_json)
         return
     if output is None or (output.suffix == ".mcap" and not is_folder and not side):
         raise typer.BadParameter("many files or models need -o DIR: a folder for the results")
@@ -108,7 +99,7 @@ def estimate(
         sources = [each if isinstance(location(each), Url) else str(Path(each).absolute()) for each in sources]
         output = output.absolute()
     todo = batch.jobs(
-        sources, models, estimator or [DEFAULT_ESTIMATOR], output, engine.value,
+        sources, models, estimator or [DEFAULT_ESTIMATOR], output,
         table=table is not None, overwrite=overwrite,
     )  # fmt: skip
     part = f"-{shard.replace('/', '-of-')}" if shard else ""
@@ -217,7 +208,7 @@ def _draw(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
 
 
 def _estimate_one(
-    file: str, model: "Model", estimator: Sequence[str] | None, output: Path | None, engine: Engine, *,
+    file: str, model: "Model", estimator: Sequence[str] | None, output: Path | None, *,
     overwrite: bool, as_json: bool,
 ) -> None:  # fmt: skip
     from aolink.cli.tables import scores as tables
@@ -240,10 +231,10 @@ def _estimate_one(
         with progress("estimate", recording.n_frames) as tell:
             if output is not None:
                 scores, differences = write_reestimated(
-                    recording, names, output, overwrite=overwrite, progress=tell, engine=engine.value,
+                    recording, names, output, overwrite=overwrite, progress=tell,
                 )  # fmt: skip
             else:
-                scores, differences = scored_and_compared(recording, names, tell, engine.value)
+                scores, differences = scored_and_compared(recording, names, tell)
     except (ArithmeticError, ValueError) as error:
         if recording.rig_is_recorded:
             raise

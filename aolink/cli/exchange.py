@@ -22,6 +22,7 @@ def export(
         typer.Option(
             "--estimator",
             "-e",
+            metavar="NAME",
             help="Estimators whose estimates are written; may be given several times; all by default.",
         ),
     ] = None,

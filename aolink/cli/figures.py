@@ -35,17 +35,16 @@ def report(
     ],
     figure: Annotated[Figure | None, typer.Option(help="Draw this figure alone, in a paper's size.")] = None,
     estimator: EstimatorOption = None,
-    exposure: Annotated[
+    frame: Annotated[
         int | None,
         typer.Option(
-            "--frame",
-            min=0,
-            metavar="N",
-            help="Exposure to draw, counted from 0; by default the one with the largest blur.",
+            min=0, metavar="N", help="Exposure to draw, counted from 0; by default the one with the largest blur."
         ),
     ] = None,
     lenslet: LensletOption = None,
-    width_mm: Annotated[float, typer.Option(min=30, max=1000, help="Width on paper; 88 fits a column.")] = 180.0,
+    width_mm: Annotated[
+        float, typer.Option(min=30, max=1000, metavar="MM", help="Width on paper; 88 fits a column.")
+    ] = 180.0,
     overwrite: OverwriteOption = False,
 ) -> None:
     """Write a page about a session: how good the estimates are, the most telling exposures, what was lost.
@@ -58,13 +57,12 @@ def report(
     from aolink.plotting.report import write_report
 
     if figure is not None:
-        _draw(files, output, figure, estimator, exposure, lenslet, width_mm=width_mm, overwrite=overwrite)
+        _draw(files, output, figure, estimator, frame, lenslet, width_mm=width_mm, overwrite=overwrite)
         return
-    for name in ("estimator", "exposure", "lenslet", "width_mm"):
+    for name in ("estimator", "frame", "lenslet", "width_mm"):
         source = context.get_parameter_source(name)
         if source is not None and source.name == "COMMANDLINE":
-            option = "frame" if name == "exposure" else name.replace("_", "-")
-            raise typer.BadParameter(f"--{option} goes with --figure NAME")
+            raise typer.BadParameter(f"--{name.replace('_', '-')} goes with --figure NAME")
     check_target(output, overwrite=overwrite, suffix=".html", error=ExportError)
     recordings = _with_sides(_in_folders(files))
     with progress("read", None) as tell:

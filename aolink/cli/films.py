@@ -18,9 +18,7 @@ if TYPE_CHECKING:
 RateOption = Annotated[
     float | None, typer.Option("--rate", metavar="HZ", help="Frames a second, where the film does not state them.")
 ]
-SumOption = Annotated[
-    int, typer.Option("--sum", metavar="K", min=1, help="Make one exposure of K frames: the mean of their light.")
-]
+SumOption = Annotated[int | None, typer.Option("--sum", metavar="K", min=1, hidden=True)]
 TrackOption = Annotated[
     int,
     typer.Option(
@@ -31,21 +29,34 @@ AtOption = Annotated[
     list[str] | None,
     typer.Option("--at", metavar="X,Y", help="Where an object to follow is in the first frame, pixels; repeatable."),
 ]
-FilmOption = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--film",
-        metavar="NAME[=VALUE],...",
-        help="How the file is read. gamma=2.2: undo a gamma curve, which most JPEG and video have. invert: dark objects"
-        " on a bright ground. colour=red, green, blue or all (the mean of a mosaic's colours). topic=NAME: the channel"
-        " of an MCAP file or a bag with several; the wavefront sensor of AO telemetry. For import also: background:"
-        " subtract each frame's median. scale=COUNTS for a pixel value of one (without it 8 bits, or floats up to 1.0,"
-        " are the full range of the camera and 16 bits are counts), for slopes slope units. start=2026-11-22T09:30 in"
-        " UTC. row_time=S from the start of a row's exposure to the next row's, 0 for all at once.",
+_FILM = {
+    "gamma=2.2": ("gamma", "undo a gamma curve, which most JPEG and video have"),
+    "invert": ("invert", "dark objects on a bright ground"),
+    "topic=NAME": ("topic", "channel of an MCAP file or a bag, wavefront sensor of AO telemetry"),
+    "colour=red": ("colour", "or green, blue, all, which is the mean of a mosaic's colours"),
+    "sum=8": ("frames_per_exposure", "make one exposure of this many frames, the mean of their light"),
+    "background": ("subtract_median", "subtract each frame's median"),
+    "scale=COUNTS": (
+        "scale", "for a pixel value of one, for slopes slope units; without it 8 bits, or floats up to 1.0, are the"
+        " full range of the camera and 16 bits are counts",
     ),
-]
-_SWITCHES, _NUMBERS, _TEXTS = ("invert", "background"), ("gamma", "scale", "row_time"), ("topic", "colour", "start")
+    "start=DATE": ("start_ns", "when the film begins, such as 2026-11-22T09:30, in UTC"),
+    "row_time=S": ("row_time_s", "from the start of a row's exposure to the next row's, 0 for all at once"),
+}  # fmt: skip
+"""The options of --film: the field of `FilmSettings` or `FilmFile` where each goes, and its help."""
+_TAKEN = {"look": 4, "rig": 5, "import": len(_FILM)}
+"""How many of them, from the first on, a command takes."""
 _COLOURS = ("red", "green", "blue", "all")
+
+
+def _film_option(command: str) -> Any:
+    said = "; ".join(f"{form}: {text}" for form, (_, text) in list(_FILM.items())[: _TAKEN[command]])
+    return typer.Option("--film", metavar="NAME[=VALUE],...", help=f"How the file is read. {said}.")
+
+
+FilmOfLook = Annotated[list[str] | None, _film_option("look")]
+FilmOfRig = Annotated[list[str] | None, _film_option("rig")]
+FilmOfImport = Annotated[list[str] | None, _film_option("import")]
 
 _DARK = 0.01
 """Share of the pixels below zero that is worth a word."""
@@ -68,44 +79,40 @@ class FilmFile(NamedTuple):
         return film if self.colour is None else one_colour(film, self.colour)
 
 
-def film_file(options: list[str] | None, *, importing: bool = False) -> FilmFile:
-    """What the options --film say. Raises ImportingError for what they cannot say."""
-    names = [
-        *_SWITCHES[: 1 + importing], *_NUMBERS[: 3 if importing else 1], *_TEXTS[: 3 if importing else 2]
-    ]  # fmt: skip
-    found: dict[str, Any] = {}
+def film_file(options: list[str] | None, command: str, frames: int | None = None) -> FilmFile:
+    """What the options --film of a command say, and its --sum. Raises ImportingError for what they cannot say."""
+    forms = {form.partition("=")[0]: form for form in list(_FILM)[: _TAKEN[command]]}
+    found: dict[str, Any] = {"frames_per_exposure": frames or 1}
     for each in (part for text in options or () for part in text.split(",")):
         name, equals, value = each.partition("=")
-        if name not in names:
-            raise ImportingError(f"--film {name}: there is no such option, but {', '.join(names)}")
-        if bool(equals) == (name in _SWITCHES):
-            form = name if name in _SWITCHES else f"{name}=VALUE"
-            raise ImportingError(f"--film {each}: write --film {form}")
-        found[name] = _number(name, value) if name in _NUMBERS else value or True
-    topic, colour = found.pop("topic", None), found.pop("colour", None)
-    if colour not in (None, *_COLOURS):
-        raise ImportingError(f"--film colour={colour} is no colour: give {', '.join(_COLOURS[:3])} or {_COLOURS[3]}")
-    if "start" in found:
-        found["start_ns"] = _start_ns(found.pop("start"))
-    if "background" in found:
-        found["subtract_median"] = found.pop("background")
-    if "row_time" in found:
-        found["row_time_s"] = found.pop("row_time")
-    return FilmFile(found, topic, colour)
+        if name not in forms:
+            raise ImportingError(f"--film {name}: there is no such option, but {', '.join(forms)}")
+        if bool(equals) != ("=" in forms[name]):
+            raise ImportingError(f"--film {each}: write --film {forms[name]}")
+        found[_FILM[forms[name]][0]] = _value(name, value) if equals else True
+    return FilmFile(found, found.pop("topic", None), found.pop("colour", None))
 
 
-def _number(name: str, text: str) -> float:
+def _value(name: str, text: str) -> Any:
+    if name == "start":
+        return _start_ns(text)
+    if name == "colour" and text not in _COLOURS:
+        raise ImportingError(f"--film colour={text} is no colour: give {', '.join(_COLOURS[:3])} or {_COLOURS[3]}")
+    if name in ("topic", "colour"):
+        return text
     try:
         value = float(text)
     except ValueError:
         value = math.nan
     if name == "gamma" and not 0.1 <= value <= 10:
         raise ImportingError(f"--film gamma={text}: give a number from 0.1 to 10")
+    if name == "sum" and not (value >= 1 and value.is_integer()):
+        raise ImportingError(f"--film sum={text}: give a whole number from 1")
     if name == "scale" and not 0 < abs(value) < math.inf:
         raise ImportingError(f"--film scale={text} must be a finite number other than 0")
     if not math.isfinite(value):
         raise ImportingError(f"--film {name}={text} is no number")
-    return value
+    return int(value) if name == "sum" else value
 
 
 def _start_ns(text: str) -> int:
@@ -117,7 +124,7 @@ def _start_ns(text: str) -> int:
 
 
 def film_settings(
-    rate: float | None, frames: int, track: int, at: list[str] | None, film: FilmFile, exposure: float | None = None
+    rate: float | None, track: int, at: list[str] | None, film: FilmFile, exposure: float | None = None
 ) -> "FilmSettings":
     """The options of a command as settings. Raises ImportingError for an invalid place, rate or time."""
     from aolink.importing.frames import FilmSettings
@@ -136,15 +143,14 @@ def film_settings(
             raise ImportingError(f"--at {text} is no place: give X,Y in pixels, such as --at 12.5,40")
         places.append((x, y))
     return FilmSettings(
-        rate_hz=rate, frames_per_exposure=frames, track=track or len(places), places=tuple(places),
-        exposure_s=exposure, **film.settings,
+        rate_hz=rate, track=track or len(places), places=tuple(places), exposure_s=exposure, **film.settings,
     )  # fmt: skip
 
 
 @app.command(
     "import",
     epilog="Example: aolink import film.tif -o film.mcap --rig my.toml --rate 500"
-    "  |  aolink import film.npz -o film.mcap --rig spheres.toml --rate 24 --film invert --track 6 --sum 8",
+    "  |  aolink import film.npz -o film.mcap --rig spheres.toml --rate 24 --film invert,sum=8 --track 6",
 )
 def import_(
     source: Annotated[
@@ -162,10 +168,10 @@ def import_(
     exposure: Annotated[
         float | None, typer.Option(metavar="S", help="Exposure time of a frame, s, where the film lacks it.")
     ] = None,
-    frames: SumOption = 1,
+    frames: SumOption = None,
     track: TrackOption = 0,
     at: AtOption = None,
-    film: FilmOption = None,
+    film: FilmOfImport = None,
     overwrite: OverwriteOption = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -173,9 +179,9 @@ def import_(
     from aolink.importing.recording import import_film
     from aolink.rig import load_rig
 
-    how = film_file(film, importing=True)
-    settings, loaded, shown = film_settings(rate, frames, track, at, how, exposure), load_rig(rig), how.open(source)
-    with progress("import", shown.count // frames) as tell:
+    how = film_file(film, "import", frames)
+    settings, loaded, shown = film_settings(rate, track, at, how, exposure), load_rig(rig), how.open(source)
+    with progress("import", shown.count // settings.frames_per_exposure) as tell:
         account = import_film(
             shown, loaded, settings, output, overwrite=overwrite, sources=[source, Path(rig)],
             progress=tell,

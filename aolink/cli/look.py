@@ -36,7 +36,6 @@ def view(
         typer.Option(
             "--output",
             "-o",
-            "--save",
             metavar="X.rrd|X.png",
             help="Write a Rerun file, or a picture of the viewer, instead of opening it; needs no screen.",
         ),
@@ -44,8 +43,8 @@ def view(
     web: Annotated[
         bool, typer.Option("--web", help="Serve the web viewer on this machine (127.0.0.1) until Ctrl-C.")
     ] = False,
-    exposure: Annotated[
-        int | None, typer.Option("--frame", min=0, metavar="N", help="Show one exposure alone, counted from 0.")
+    frame: Annotated[
+        int | None, typer.Option(min=0, metavar="N", help="Show one exposure alone, counted from 0.")
     ] = None,
     lenslet: LensletOption = None,
     compare: Annotated[
@@ -65,8 +64,8 @@ def view(
     from aolink import viewing
     from aolink.recording.remote import location, only_paths
 
-    choices = (exposure, lenslet, compare)
-    save, screenshot = _targets(output or [])
+    choices = (frame, lenslet, compare)
+    save, screenshot = _targets(output, ".png")
     if follow:
         if side or output or any(each is not None for each in choices):
             raise typer.BadParameter("--follow shows the whole session as it comes, alone or with --web")
@@ -91,7 +90,7 @@ def view(
         elif screenshot is None:
             viewing.open_viewer(recorded)
         return
-    exposures = None if exposure is None else _number(recording, exposure)
+    exposures = None if frame is None else _number(recording, frame)
     look = viewing.Look(
         exposures=exposures, spot=common.spot_of(recording.rig.sensor, lenslet) if lenslet else 0,
         compared=open_recording(compare) if compare else None,
@@ -112,14 +111,13 @@ def view(
             viewing.show(recording, look, progress=tell)
 
 
-def _targets(output: list[Path]) -> tuple[Path | None, Path | None]:
-    """The Rerun file and the picture among what is to be written."""
-    named = {".rrd": [each for each in output if each.suffix.lower() != ".png"]}
-    named[".png"] = [each for each in output if each not in named[".rrd"]]
-    for suffix, found in named.items():
-        if len(found) > 1:
-            raise typer.BadParameter(f"one file {suffix} can be written, not {' and '.join(map(str, found))}")
-    return next(iter(named[".rrd"]), None), next(iter(named[".png"]), None)
+def _targets(output: list[Path] | None, other: str) -> tuple[Path | None, Path | None]:
+    """What is to be written: a file of the usual kind, and one with the other suffix."""
+    others = [each for each in output or () if each.suffix.lower() == other]
+    usual = [each for each in output or () if each not in others]
+    if len(usual) > 1 or len(others) > 1:
+        raise typer.BadParameter(f"one file of a kind can be written: {', '.join(map(str, output or ()))}")
+    return next(iter(usual), None), next(iter(others), None)
 
 
 def _follow(file: str, *, web: bool) -> None:
@@ -164,8 +162,10 @@ def slopes(
     bad: Annotated[
         Path | None, typer.Option("--bad", metavar="FILE", help="A picture that is not zero where pixels are bad.")
     ] = None,
-    pitch_m: Annotated[float | None, typer.Option(min=1e-9, help="Distance between neighbouring lenslets, m.")] = None,
-    focal_m: Annotated[float | None, typer.Option(min=1e-9, help="Focal length of a lenslet, m.")] = None,
+    pitch_m: Annotated[
+        float | None, typer.Option(min=1e-9, metavar="M", help="Distance between neighbouring lenslets, m.")
+    ] = None,
+    focal_m: Annotated[float | None, typer.Option(min=1e-9, metavar="M", help="Focal length of a lenslet, m.")] = None,
     overwrite: OverwriteOption = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -180,8 +180,7 @@ def slopes(
     if (pitch_m is None) != (focal_m is None):
         raise typer.BadParameter("give --pitch-m and --focal-m, or neither")
     inputs = [frame, reference]
-    rrd = next((each for each in written or () if each.suffix == ".rrd"), None)
-    output = next((each for each in written or () if each != rrd), None)
+    output, rrd = _targets(written, ".rrd")
     if output is not None:
         check_target(output, overwrite=overwrite, sources=inputs, suffix=".npz", error=FrameError)
     if rrd is not None:

@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from aolink.cli.common import JsonOption, OverwriteOption, app, local_file, program, progress, stderr, stdout
-from aolink.cli.films import FilmOption, RateOption, film_file, film_settings
+from aolink.cli.films import FilmOfLook, RateOption, film_file, film_settings
 from aolink.errors import ExportError, ImportingError, RecordingError
 from aolink.files import writing
 from aolink.signals import Interrupted
@@ -39,7 +39,7 @@ def look(
     quick: Annotated[
         bool, typer.Option("--quick", help="End before sums of processes are tried for blurred frames.")
     ] = False,
-    film: FilmOption = None,
+    film: FilmOfLook = None,
     overwrite: OverwriteOption = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -60,8 +60,8 @@ def look(
 
     if kernel is not None and not 0 < kernel < math.inf:
         raise ImportingError(f"--kernel {kernel:g} must be above 0{' and finite' if kernel > 0 else ''}")
-    how = film_file(film)
-    settings, shown = film_settings(rate, 1, 0, None, how, exposure), how.open(source)
+    how = film_file(film, "look")
+    settings, shown = film_settings(rate, 0, None, how, exposure), how.open(source)
     folder = output or Path(f"{source.stem}-look")
     rig_file, recording, page = folder / "rig.toml", folder / "film.mcap", folder / "page.html"
     if not overwrite and (there := [each for each in (rig_file, recording, page) if each.exists()]):

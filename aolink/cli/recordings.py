@@ -58,11 +58,20 @@ def compare(
     ] = None,
     topic: Annotated[
         list[str] | None,
-        typer.Option("--topic", "-t", help="Only this topic, or with a / at its end all below it; may be repeated."),
+        typer.Option(
+            "--topic",
+            "-t",
+            metavar="NAME",
+            help="Only this topic, or with a / at its end all below it; may be repeated.",
+        ),
     ] = None,
     tolerance: Annotated[
-        str, typer.Option(metavar="RELATIVE[,ABSOLUTE]", help="Of numbers; the absolute one, in their unit, is added.")
-    ] = "1e-9,1e-12",
+        str,
+        typer.Option(
+            metavar="RELATIVE[,ABSOLUTE]",
+            help="Of numbers; the absolute one, by default 1e-12 of their unit, is added.",
+        ),
+    ] = "1e-9",
     as_json: JsonOption = False,
 ) -> None:
     """List field by field how two recordings differ. Exit code 1 if they do.
@@ -106,7 +115,7 @@ def compare(
 
 def _tolerances(text: str) -> tuple[float, float]:
     try:
-        relative, absolute = (float(each) for each in (*text.split(","), "0")[:2])
+        relative, absolute = (float(each) for each in (*text.split(","), "1e-12")[:2])
     except ValueError:
         relative = absolute = math.nan
     if not (relative >= 0 and absolute >= 0 and text.count(",") <= 1):

@@ -46,7 +46,7 @@ class _NamingMethods(TyperCommand):
 def deblur(
     out: Annotated[
         Path,
-        typer.Option("--output", "-o", "--out", metavar="FILE", help="The recording to write, or the picture."),
+        typer.Option("--output", "-o", metavar="FILE", help="The recording to write, or the picture."),
     ],
     file: Annotated[
         Path | None,
@@ -61,7 +61,10 @@ def deblur(
     estimator: Annotated[
         str | None,
         typer.Option(
-            "--estimator", "-e", help="The estimator whose path is used, by default moments; it is run if it was not."
+            "--estimator",
+            "-e",
+            metavar="NAME",
+            help="The estimator whose path is used, by default moments; it is run if it was not.",
         ),
     ] = None,
     image: Annotated[Path | None, typer.Option("--image", hidden=True)] = None,
@@ -89,10 +92,12 @@ def deblur(
         float | None,
         typer.Option(metavar="S", help="With --path: exposure time of the pictures, where their file lacks it."),
     ] = None,
-    method: Annotated[str | None, typer.Option(help="The restoration method.")] = None,
+    method: Annotated[str | None, typer.Option(metavar="NAME", help="The restoration method.")] = None,
     noise_sd: Annotated[
         float | None,
-        typer.Option(help="With --psf or --path: noise of the picture, in its counts; without it, estimated."),
+        typer.Option(
+            metavar="COUNTS", help="With --psf or --path: noise of the picture, in its counts; without it, estimated."
+        ),
     ] = None,
     overwrite: OverwriteOption = False,
     as_json: JsonOption = False,

@@ -13,7 +13,7 @@ from rich.markup import escape
 
 from aolink.cli import common, films
 from aolink.cli.common import JsonOption, KeyOption, OverwriteOption, RigArgument, app, load_checked, program, stdout
-from aolink.cli.films import AtOption, FilmOption, RateOption, SumOption, TrackOption
+from aolink.cli.films import AtOption, FilmOfRig, RateOption, SumOption, TrackOption
 from aolink.cli.terminal import input_ended
 from aolink.errors import AolinkError, RigError
 from aolink.files import check_target, writing
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 @app.command(
     epilog="Example: aolink rig section-vi --check"
-    "  |  aolink rig my.toml --from film.tif --rate 500 --track 3 --sum 8 (writes my.toml)"
+    "  |  aolink rig my.toml --from film.tif --rate 500 --track 3 --film sum=8 (writes my.toml)"
 )
 def rig(
     context: typer.Context,
@@ -46,10 +46,10 @@ def rig(
         ),
     ] = None,
     rate: RateOption = None,
-    frames: SumOption = 1,
+    frames: SumOption = None,
     track: TrackOption = 0,
     at: AtOption = None,
-    film: FilmOption = None,
+    film: FilmOfRig = None,
     overwrite: OverwriteOption = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -62,8 +62,8 @@ def rig(
         return
     _check_goes_with(context, source)
     if source is not None:
-        path, how = Path(rig or f"{source.stem}.toml"), films.film_file(film)
-        _write_first_rig(path, source, how, films.film_settings(rate, frames, track, at, how), overwrite)
+        path, how = Path(rig or f"{source.stem}.toml"), films.film_file(film, "rig", frames)
+        _write_first_rig(path, source, how, films.film_settings(rate, track, at, how), overwrite)
         return
     if not rig:
         raise typer.BadParameter("name a rig file, or a rig that comes with aolink")
@@ -138,7 +138,7 @@ def _print_findings(loaded: "Rig", as_json: bool) -> None:
 def sim(
     rig: RigArgument,
     real_time: Annotated[bool, typer.Option("--real-time", help="Run in real time, not on virtual time.")] = False,
-    seed: Annotated[int | None, typer.Option(help="Instead of the rig file's seed.", min=0)] = None,
+    seed: Annotated[int | None, typer.Option(metavar="N", help="Instead of the rig file's seed.", min=0)] = None,
     listen: Annotated[
         str | None, typer.Option(metavar="HOST:PORT", help="Serve TCP ports, to this machine only, not terminals.")
     ] = None,

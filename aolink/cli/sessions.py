@@ -52,7 +52,9 @@ def record(
     mirror: Annotated[str | None, typer.Option(metavar="PORT", help="Port of the mirror, likewise.")] = None,
     key: KeyOption = None,
     estimator: EstimatorOption = None,
-    exposures: Annotated[int | None, typer.Option(min=1, max=MOST_EXPOSURES, help="How many exposures.")] = None,
+    exposures: Annotated[
+        int | None, typer.Option(min=1, max=MOST_EXPOSURES, metavar="N", help="How many exposures.")
+    ] = None,
     duration: Annotated[float | None, typer.Option(metavar="S", help="How long to record, s of device time.")] = None,
     note: Annotated[str, typer.Option(metavar="TEXT", help="A text to keep in the recording.")] = "",
     calibration: Annotated[
@@ -274,15 +276,17 @@ def _replay_control(recording: "Recording", controller: str, estimator: str, *, 
 
 @app.command(epilog="Example: aolink demo  |  aolink demo --rig section-vi-lively -e o1 -e o3 -e profile -o /tmp")
 def demo(
-    rig: Annotated[str, typer.Option(help="Rig file or name.")] = "moving-scene",
+    rig: Annotated[str, typer.Option(metavar="RIG.toml", help="Rig file or name.")] = "moving-scene",
     out: Annotated[
-        Path, typer.Option("--output", "-o", "--out", metavar="DIR", help="The folder in which to make a new one.")
+        Path, typer.Option("--output", "-o", metavar="DIR", help="The folder in which to make a new one.")
     ] = Path(),
     estimator: Annotated[
         list[str] | None,
-        typer.Option("--estimator", "-e", help="Estimator to run; by default open-loop, o1 and moments."),
+        typer.Option(
+            "--estimator", "-e", metavar="NAME", help="Estimator to run; by default open-loop, o1 and moments."
+        ),
     ] = None,
-    exposures: Annotated[int, typer.Option(min=2, help="How many exposures.")] = 40,
+    exposures: Annotated[int, typer.Option(min=2, metavar="N", help="How many exposures.")] = 40,
     control: Annotated[
         str | None,
         typer.Option(

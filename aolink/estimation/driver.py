@@ -11,7 +11,6 @@ import numpy as np
 from aolink.estimation.batch import Batch, batches
 from aolink.estimation.estimate import Estimate
 from aolink.estimation.estimator import Estimator
-from aolink.estimation.options import Engine
 from aolink.estimation.registry import make_estimator
 from aolink.exposure import Exposure
 from aolink.numerics.arrays import FloatArray
@@ -56,14 +55,12 @@ class SkippedInputs:
 
 
 class Driver:
-    """Several estimators side by side, exposure by exposure, on one engine.
+    """Several estimators side by side, exposure by exposure.
 
     Parameters
     ----------
     names:
         Names of the estimators, among `ESTIMATOR_NAMES`.
-    engine:
-        As in `Options`.
     skipped:
         Frame ids of the exposures that an estimator does not get, by its name: those that it had no time for in a
         session. Its estimates of the others are those of that session, bit for bit. An exposure's id may be added
@@ -75,12 +72,9 @@ class Driver:
         There is no such estimator, or it cannot work on this rig.
     """
 
-    def __init__(
-        self, rig: Rig, names: Sequence[str], engine: Engine = "aolink",
-        skipped: Mapping[str, Container[int]] | None = None,
-    ) -> None:  # fmt: skip
+    def __init__(self, rig: Rig, names: Sequence[str], skipped: Mapping[str, Container[int]] | None = None) -> None:
         self.rig = rig
-        self.estimators = [make_estimator(rig, name, engine=engine) for name in names]
+        self.estimators = [make_estimator(rig, name) for name in names]
         self._skipped = skipped or {}
         self._inputs = {name: SkippedInputs() for name in self._skipped}
 

@@ -215,7 +215,7 @@ def frame_times(film: Film, rig: Rig, settings: FilmSettings) -> FrameTimes:
     elif abs(rate / own - 1) > _CLOSE:
         each = f"{K} frames" if K > 1 else "a frame"
         whole = round(rate / own)
-        summed = f"give --sum {whole} as the rig file has it, " if K == 1 < whole == timing.exposure_steps else ""
+        summed = f"give --film sum={whole} as the rig file has it, " if K == 1 < whole == timing.exposure_steps else ""
         raise ImportingError(
             f"{film.name} has {rate:.6g} frames/s, and the rig file {rig.name} wants {each} every"
             f" {timing.frame_period_steps * timing.fast_step_s:.6g} s, {own:.6g} frames/s: {summed}change its"
@@ -228,12 +228,12 @@ def frame_times(film: Film, rig: Rig, settings: FilmSettings) -> FrameTimes:
         )
     if K > 1 and settings.exposure_s is not None:
         raise ImportingError(
-            f"--exposure {settings.exposure_s:g} is not used with --sum {K}, where each frame is a whole fast step:"
-            " leave it out"
+            f"--exposure {settings.exposure_s:g} is not used with --film sum={K}, where each frame is a whole fast"
+            " step: leave it out"
         )
     if K > 1 and (timing.exposure_steps, timing.frame_period_steps) != (K, K):
         raise ImportingError(
-            f"--sum {K} makes exposures of {K} fast steps without dead time: set timing.exposure_steps = {K} and"
+            f"--film sum={K} makes exposures of {K} fast steps without dead time: set timing.exposure_steps = {K} and"
             f" frame_period_steps = {K} in the rig file {rig.name}"
         )
     exposure_s = film.exposure_s

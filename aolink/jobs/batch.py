@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any
 
 from aolink.errors import AolinkError, RecordingError, RigError
-from aolink.estimation import Engine
 from aolink.exporting.common import Progress, no_progress
 from aolink.files import remove_unfinished
 from aolink.jobs.tables import COLUMNS
@@ -94,8 +93,8 @@ def models(rig_text: str | None, settings: Sequence[str], rig_name: str = "") ->
 
 
 def jobs(
-    sources: Sequence[str], each: Sequence[Model], estimators: Sequence[str], folder: Path, engine: Engine = "aolink",
-    *, table: bool = False, overwrite: bool = False,
+    sources: Sequence[str], each: Sequence[Model], estimators: Sequence[str], folder: Path, *,
+    table: bool = False, overwrite: bool = False,
 ) -> list[Job]:  # fmt: skip
     """Every recording with every model and every estimator; parameters as for `Settings`.
 
@@ -117,7 +116,7 @@ def jobs(
         output = folder / f"{'-'.join(filter(None, [location(source).stem, suffix]))}.{name}.mcap"
         if output in made:
             raise RigError(f"two recordings would be written as {output.name}: give them different names")
-        settings = Settings(estimator=name, model=model, engine=engine, table=table, overwrite=overwrite)
+        settings = Settings(estimator=name, model=model, table=table, overwrite=overwrite)
         made[output] = Job(source, output, settings)
     return list(made.values())
 

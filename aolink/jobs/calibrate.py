@@ -121,7 +121,9 @@ def record_frames(
     """
     line_sensor(rig)
     if frames < LEAST_FRAMES:
-        raise CalibrationError(f"--frames {frames} is too few: at least {LEAST_FRAMES} are needed, better 100")
+        raise CalibrationError(
+            f"{frames} frames of a light are too few: at least {LEAST_FRAMES} are needed, better 100"
+        )
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:

@@ -109,9 +109,9 @@ def new_folder(parent: Path) -> Path:
         except FileExistsError:
             continue
         except OSError as error:
-            raise AolinkError(f"cannot create {folder}: {error.strerror}; give another --out") from None
+            raise AolinkError(f"cannot create {folder}: {error.strerror}; give another -o") from None
         return folder
-    raise AolinkError(f"{parent} is full of folders named {name}: give another --out")
+    raise AolinkError(f"{parent} is full of folders named {name}: give another -o")
 
 
 def run_demo(

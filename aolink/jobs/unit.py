@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from aolink.errors import AolinkError, EstimatorError, RecordingError, RigError
-from aolink.estimation import Driver, Engine, Estimate, Score, Scorer
+from aolink.estimation import Driver, Estimate, Score, Scorer
 from aolink.estimation.registry import DEFAULT_ESTIMATOR
 from aolink.exposure import Exposure
 from aolink.files import check_target, writing
@@ -66,7 +66,6 @@ class Settings:
     """The estimator, one of `aolink.estimation.ESTIMATOR_NAMES`."""
     model: Model = Model()
     """The model, by default the recording's own rig."""
-    engine: Engine = "aolink"
     table: bool = False
     """Whether to write a table in Parquet too, with a row for each exposure: a file of the side file's name that ends
     with ``.parquet``. Its columns are those of `exposure_row`."""
@@ -116,8 +115,6 @@ def estimated(url: str | Path, out: Path, settings: Settings) -> tuple[dict[str,
         return {**before, "recording": str(recording.path), "output": out.name}, True
     check_has_exposures(recording)
     notes = {"aolink_version": aolink_version(), "estimators": settings.estimator, "job": digest}
-    if settings.engine != "aolink":
-        notes["engine"] = settings.engine
     scorer = Scorer()
     row: dict[str, Any] = dict.fromkeys(COLUMNS)
     row |= {
@@ -177,7 +174,7 @@ def _estimates(recording: Recording, settings: Settings) -> Iterator[tuple[int, 
             yield step.exposure
 
     try:
-        for exposure, (estimate,) in Driver(recording.rig, [settings.estimator], settings.engine).steps(exposures()):
+        for exposure, (estimate,) in Driver(recording.rig, [settings.estimator]).steps(exposures()):
             yield waiting.popleft().time_ns, exposure, estimate
     except (ArithmeticError, ValueError) as error:
         if settings.model == Model():
@@ -195,7 +192,7 @@ def aolink_version() -> str:
 
 def _digest(recording: Recording, settings: Settings) -> str:
     facts = [
-        recording.digest, aolink_version(), settings.estimator, settings.engine, settings.model.rig_text,
+        recording.digest, aolink_version(), settings.estimator, settings.model.rig_text,
         [[key, str(value)] for key, value in settings.model.changes],
     ]  # fmt: skip
     return hashlib.sha256(json.dumps(facts).encode()).hexdigest()

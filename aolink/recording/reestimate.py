@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from aolink.errors import RecordingError
-from aolink.estimation import Driver, Engine, Estimate, Score, Scorer
+from aolink.estimation import Driver, Estimate, Score, Scorer
 from aolink.estimation.estimate import COMPARED
 from aolink.estimation.registry import retired
 from aolink.exporting.common import Progress, no_progress
@@ -51,12 +51,11 @@ def reestimate(
 
 
 def reestimated(
-    recording: Recording, names: Sequence[str], progress: Progress = no_progress, engine: Engine = "aolink", *,
-    as_recorded: bool = False,
-) -> Iterator[tuple[Exposure, list[Estimate]]]:  # fmt: skip
+    recording: Recording, names: Sequence[str], progress: Progress = no_progress, *, as_recorded: bool = False
+) -> Iterator[tuple[Exposure, list[Estimate]]]:
     """The estimates of `reestimate`, exposure by exposure, in the order of ``names``; nothing stays in memory."""
     skipped = Skipped(recording, names if as_recorded else ())
-    driver = Driver(recording.rig, names, engine, skipped.frames)
+    driver = Driver(recording.rig, names, skipped.frames)
     for number, done in enumerate(driver.steps(skipped.exposures()), 1):
         yield done
         progress(number)
@@ -157,7 +156,7 @@ class Outcome:
 
 
 def scored_and_compared(
-    recording: Recording, names: Sequence[str], progress: Progress = no_progress, engine: Engine = "aolink"
+    recording: Recording, names: Sequence[str], progress: Progress = no_progress
 ) -> tuple[dict[str, Score], dict[str, str | None]]:
     """Run estimators over a recording, in one pass: the result of `Outcome`."""
     outcome, waiting = Outcome(recording, names), deque[Step]()
@@ -167,7 +166,7 @@ def scored_and_compared(
             waiting.append(step)
             yield step.exposure
 
-    for number, (_, made) in enumerate(Driver(recording.rig, names, engine).steps(exposures()), 1):
+    for number, (_, made) in enumerate(Driver(recording.rig, names).steps(exposures()), 1):
         outcome.add(waiting.popleft(), made)
         progress(number)
     return outcome.result()
@@ -185,7 +184,7 @@ def check_has_exposures(recording: Recording) -> None:
 
 def write_reestimated(
     recording: Recording, names: Sequence[str], path: str | Path, *, overwrite: bool = False,
-    progress: Progress = no_progress, engine: Engine = "aolink",
+    progress: Progress = no_progress,
 ) -> tuple[dict[str, Score], dict[str, str | None]]:  # fmt: skip
     """Copy a recording with new estimates; gives what `scored_and_compared` gives, from the same pass.
 
@@ -206,11 +205,9 @@ def write_reestimated(
             "estimated_from": recording.path.name,
             "recorded_with": recording.metadata.get("aolink_version", "unknown"),
         }
-        if engine != "aolink":
-            notes["engine"] = engine
         outcome = Outcome(recording, names)
         with RecordingCopy(recording, partial, notes) as copy:
-            for some in _with_estimates(recording, Driver(recording.rig, names, engine), kept, outcome):
+            for some in _with_estimates(recording, Driver(recording.rig, names), kept, outcome):
                 copy.add(some)
                 progress(copy.exposures)
             copy.finish(recording.losses)

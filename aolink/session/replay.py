@@ -1,4 +1,4 @@
-"""Replay of a recording: its exposures go through estimators at any pace, or its commands are sent to a rig."""
+"""Replay of a recording: its exposures go through estimators at any pace."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ _NAP_S = 0.1
 
 def replay(
     recording: Recording, names: Sequence[str], *, rate: float = 0.0,
-    stop: Callable[[], bool] = lambda: False, now_s: Callable[[], float] = time.monotonic, sleep: Callable[[float],
-    None] = time.sleep,
+    stop: Callable[[], bool] = lambda: False, now_s: Callable[[], float] = time.monotonic,
+    sleep: Callable[[float], None] = time.sleep,
 ) -> Iterator[tuple[Exposure, list[Estimate]]]:  # fmt: skip
     """Run estimators over a recording, exposure by exposure; each skips the exposures that it skipped in the session.
 
@@ -41,23 +41,20 @@ def replay(
     driver = Driver(recording.rig, names, skipped=skipped.frames)
     step_s = recording.rig.timing.fast_step_s
     first_step: int | None = None
-    began: tuple[float, float] | None = None
+    began_s = 0.0
     for exposure in skipped.exposures():
-        if first_step is None:
-            first_step = exposure.first_step
-        at_s = (exposure.first_step - first_step) * step_s
         if stop():
             break
-        if began is None:
-            began = (at_s, now_s())
+        if first_step is None:
+            first_step, began_s = exposure.first_step, now_s()
         elif rate > 0:
-            due_s = began[1] + (at_s - began[0]) / rate
+            due_s = began_s + (exposure.first_step - first_step) * step_s / rate
             while (left_s := due_s - now_s()) > 0 and not stop():
                 sleep(min(left_s, _NAP_S))
             if stop():
                 break
         yield exposure, driver.step(exposure)
-    if began is None and not stop():
+    if first_step is None and not stop():
         raise RecordingError(f"{recording.path} has no exposure")
 
 

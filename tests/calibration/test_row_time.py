@@ -71,7 +71,7 @@ def test_lost_frames_are_gaps():
         (1000 + np.random.default_rng(0).standard_normal((30, 100)), 197.0, "do not blink"),
         (np.ones((30, 100)), 210.0, "in step"),
         (np.zeros((30, 100)), 197.0, "no light"),
-        (blinking(2e-4, 197.0, 1), 203.0, "check --row-time HZ"),
+        (blinking(2e-4, 197.0, 1), 203.0, "check blink_hz"),
     ],
 )
 def test_what_cannot_give_it_is_refused(light, blink, says):

@@ -134,7 +134,7 @@ def test_too_short_a_recording_is_one_line(aolink, tmp_path):
         (["steady", "-o", "new.mcap"], 14, "what is written is a .toml file"),
         (["steady", "-o", "new.toml", "--model", "wobble"], 14, "no kind of process"),
         (["steady", "steady", "-o", "new.toml"], 2, "--follow is for one recording"),
-        (["steady", "-o", "new.toml", "--plant", "first-order"], 2, "leave out --plant"),
+        (["steady", "-o", "new.toml", "--fit", "first-order"], 2, "leave out --fit"),
         (["steady", "-o", "there.toml", "--overwrite"], 2, "never overwrites"),
     ],
 )

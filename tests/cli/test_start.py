@@ -32,11 +32,11 @@ def test_help_and_the_package_itself_load_nothing_heavy(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("part", [("--exposure", "3"), ("--start", "0", "--end", "5")])
+@pytest.mark.parametrize("part", [("--frame", "3"), ()])
 def test_looking_at_a_recording_that_holds_its_estimates_loads_rerun_and_no_estimator(
     tmp_path: Path, part: tuple[str, ...]
 ) -> None:
-    loaded = loaded_by_command(tmp_path, "view", SESSION, *part, "--save", "part.rrd")
+    loaded = loaded_by_command(tmp_path, "view", SESSION, *part, "-o", "part.rrd")
     assert loaded - {"pandas"} == {"numpy", "rerun"}  # pyarrow looks for pandas with the first array that it makes
     assert (tmp_path / "part.rrd").stat().st_size > 100_000
 

@@ -76,9 +76,6 @@ def test_a_session_with_devices_of_another_package(aolink: Run, installed: dict[
     for exposure, estimate in zip(exposures, found, strict=True):
         assert exposure.truth is not None
         assert np.abs(estimate.path - exposure.truth.path).max() < 0.02  # its frames have no noise
-    refused = aolink("replay", "a.mcap", "--to-rig", "-o", "b.mcap", env=installed)
-    assert refused.returncode == 2
-    assert not (tmp_path / "b.mcap").exists()
     again = aolink("record", "--rig", rig, "--input", "a.mcap", "-o", "b.mcap", env=installed)
     assert again.returncode == 0, again.stderr
     assert "b.mcap: 6 exposures, complete" in again.stdout

@@ -88,7 +88,7 @@ def test_options_of_a_session_go_with_the_recording(aolink, tmp_path):
     again = aolink("estimate", "a.mcap", "--json")
     assert again.returncode == 0, again.stderr
     assert json.loads(again.stdout)["differs_from_recorded"] == {"o3:second_order": None, "o3": None}
-    for command in (("view", "--save", "a.rrd"), ("export", "-o", "a.npz"), ("report", "-o", "a.html")):
+    for command in (("view", "-o", "a.rrd"), ("export", "-o", "a.npz"), ("report", "-o", "a.html")):
         made = aolink(command[0], "a.mcap", *command[1:])
         assert made.returncode == 0, made.stderr
 

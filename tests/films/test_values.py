@@ -204,7 +204,7 @@ def test_hdf5(attributes, tmp_path):
     np.testing.assert_array_equal(film.times_ns, facts["times_ns"])
     with h5py.File(tmp_path / "b.h5", "w") as file:
         file["entry/data"], file["entry/dark"] = TWELVE, TWELVE + 1
-    assert "say with --topic which one has the frames" in refused(tmp_path / "b.h5")
+    assert "say with --film topic=NAME which one has the frames" in refused(tmp_path / "b.h5")
     np.testing.assert_array_equal(list(open_film(tmp_path / "b.h5", "/entry/dark").frames()), TWELVE + 1)
 
 
@@ -238,7 +238,7 @@ def test_one_colour_of_a_mosaic_and_of_colours(tmp_path):
     tifffile.imwrite(tmp_path / "a.tif", COLOURS, photometric="rgb")
     np.testing.assert_array_equal(list(one_colour(open_film(tmp_path / "a.tif"), "blue").frames()), COLOURS[..., 2])
     tifffile.imwrite(tmp_path / "b.tif", TWELVE, photometric="minisblack")
-    with pytest.raises(Exception, match="has no colours: leave --colour out"):
+    with pytest.raises(Exception, match="has no colours: leave --film colour out"):
         list(one_colour(open_film(tmp_path / "b.tif"), "red").frames())
 
 

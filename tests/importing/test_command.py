@@ -38,7 +38,7 @@ def test_a_film_of_every_kind_becomes_a_recording(kind, aolink, rig, tmp_path):
 @pytest.mark.slow
 def test_the_recording_is_one_like_any_other(aolink, rig, tmp_path):
     source = others.written_npy(tmp_path, FRAMES)
-    start = ["--start", "2026-09-21T10:30:00.25"]
+    start = ["--film", "start=2026-09-21T10:30:00.25"]
     assert aolink("import", source, "-o", "a.mcap", "--rig", rig, "--rate", "50", *start).returncode == 0
     recording = Recording(tmp_path / "a.mcap")
     assert recording.complete
@@ -55,14 +55,14 @@ def test_notes_and_warnings_are_printed(aolink, rig, tmp_path):
     made = aolink("import", source, "-o", "a.mcap", "--rig", rig)
     assert made.stdout.splitlines() == [
         "note: the film does not state its frame rate: that of the rig file is assumed, 50 frames/s",
-        "note: when the film was taken is not known: its times count from 1970 unless --start is given",
-        "note: it is not known whether the film's rows were exposed one after the other: say so with --row-time S, or"
-        " --row-time 0",
+        "note: when the film was taken is not known: its times count from 1970 unless --film start=DATE is given",
+        "note: it is not known whether the film's rows were exposed one after the other: say so with --film"
+        " row_time=S, or row_time=0",
         "warning: 4 pixels (0.89%) are saturated in the film, hot or dead, no numbers, or shared by two objects: they"
         " are masked",
         "a.mcap: 7 exposures of 7 frames",
     ]
-    made = aolink("import", source, "-o", "b.mcap", "--rig", rig, "--scale", "300", "--json")
+    made = aolink("import", source, "-o", "b.mcap", "--rig", rig, "--film", "scale=300", "--json")
     said = json.loads(made.stdout)
     assert said["out"] == "b.mcap"
     assert (said["frames"], said["exposures"], said["pixels"], said["saturated"]) == (7, 7, 448, 4)
@@ -74,8 +74,8 @@ def test_a_film_without_its_dark_level_is_told_of_the_option(aolink, rig, tmp_pa
     source = others.written_npy(tmp_path, frames)
     made = aolink("import", source, "-o", "a.mcap", "--rig", rig, "--rate", "50")
     assert "of the pixels are below zero" in made.stdout
-    assert "--background" in made.stdout
-    made = aolink("import", source, "-o", "b.mcap", "--rig", rig, "--rate", "50", "--background")
+    assert "--film background" in made.stdout
+    made = aolink("import", source, "-o", "b.mcap", "--rig", rig, "--rate", "50", "--film", "background")
     assert "below zero" not in made.stdout
 
 
@@ -89,8 +89,8 @@ def test_frames_are_summed(aolink, tmp_path):
     (tmp_path / "rig.toml").write_text(small_rig(3, 3).toml)
     source = others.written_npy(tmp_path, FRAMES)
     made = aolink(
-        "import", source, "-o", "a.mcap", "--rig", "rig.toml", "--sum", "3", "--rate", "1000", "--start", "2026-11-22",
-        "--row-time", "0",
+        "import", source, "-o", "a.mcap", "--rig", "rig.toml", "--film", "sum=3,start=2026-11-22", "--rate", "1000",
+        "--film", "row_time=0",
     )  # fmt: skip
     assert made.stdout == "a.mcap: 2 exposures of 6 frames\n"
     first = next(iter(Recording(tmp_path / "a.mcap")))
@@ -102,8 +102,8 @@ def test_one_of_two_topics_is_imported(aolink, rig, tmp_path):
     source = others.write_mcap(tmp_path / "two.mcap", topics)
     refused = aolink("import", source, "-o", "a.mcap", "--rig", rig)
     assert refused.returncode == 11
-    assert "say which with --topic" in refused.stderr
-    assert aolink("import", source, "-o", "a.mcap", "--rig", rig, "--topic", "/b").returncode == 0
+    assert "say which with --film topic=NAME" in refused.stderr
+    assert aolink("import", source, "-o", "a.mcap", "--rig", rig, "--film", "topic=/b").returncode == 0
 
 
 @pytest.mark.slow
@@ -174,19 +174,31 @@ def missing(folder: Path) -> Path:
         (mixed, [], 11, "frame99.png has 6 x 9 pixels of uint8, those before it have 8 x 8 pixels"),
         (timed, [], 11, "50 frames/s contradict its times, which say 40"),
         (good, ["--rate", "60"], 11, "change its [timing], or give the right --rate"),
-        (bright, ["--rate", "50"], 11, "where 1.0 would be full scale: say with --scale how many counts"),
+        (bright, ["--rate", "50"], 11, "where 1.0 would be full scale: say with --film scale=COUNTS how many counts"),
         (good, ["--rate", "0"], 11, "--rate 0 must be above 0"),
         (good, ["--rate", "inf"], 11, "--rate inf must be above 0 and finite"),
         (good, ["--rate", "nan"], 11, "--rate nan must be above 0"),
-        (good, ["--rate", "50", "--scale", "0"], 11, "--scale 0 must be a finite number other than 0"),
-        (good, ["--rate", "50", "--scale", "-2"], 11, "--scale -2 must be above 0 for pictures"),
-        (good, ["--topic", "/camera"], 11, "has no topics: --topic /camera says which"),
+        (good, ["--rate", "50", "--film", "scale=0"], 11, "--film scale=0 must be a finite number other than 0"),
+        (good, ["--rate", "50", "--film", "scale=-2"], 11, "--film scale=-2 must be above 0 for pictures"),
+        (good, ["--film", "topic=/camera"], 11, "has no topics: --film topic=/camera says which"),
         (good, ["--exposure", "0"], 11, "--exposure 0 must be above 0"),
         (good, ["--exposure", "nan"], 11, "--exposure nan must be above 0"),
-        (good, ["--exposure", "0.01", "--rate", "100", "--sum", "2"], 11, "--exposure 0.01 is not used with --sum 2"),
-        (good, ["--start", "yesterday"], 11, "--start yesterday is no date: give one such as"),
-        (good, ["--rate", "50", "--start", "2500-01-01"], 11, "a start or an end that is not from 1970 to 2262"),
-        (good, ["--rate", "50", "--start", "1600-01-01"], 11, "a start or an end that is not from 1970 to 2262"),
+        (
+            good,
+            ["--exposure", "0.01", "--rate", "100", "--sum", "2"],
+            11,
+            "0.01 is not used with --film sum=2",
+        ),
+        (good, ["--film", "start=yesterday"], 11, "--film start=yesterday is no date: give one such as"),
+        (good, ["--rate", "50", "--film", "start=2500-01-01"], 11, "a start or an end that is not from 1970 to 2262"),
+        (good, ["--rate", "50", "--film", "start=1600-01-01"], 11, "a start or an end that is not from 1970 to 2262"),
+        (good, ["--film", "gama=2"], 11, "--film gama: there is no such option, but gamma, invert, "),
+        (good, ["--film", "invert=1"], 11, "--film invert=1: write --film invert"),
+        (good, ["--film", "invert,gamma"], 11, "--film gamma: write --film gamma=2.2"),
+        (good, ["--film", "gamma=20"], 11, "--film gamma=20: give a number from 0.1 to 10"),
+        (good, ["--film", "sum=1.5"], 11, "--film sum=1.5: give a whole number from 1"),
+        (good, ["--film", "row_time=x"], 11, "--film row_time=x is no number"),
+        (good, ["--film", "colour=pink"], 11, "--film colour=pink is no colour: give red, green, blue or all"),
         (good, ["--at", "here"], 11, "--at here is no place: give X,Y in pixels"),
         (good, ["--at", "nan,3"], 11, "--at nan,3 is no place: give X,Y in pixels"),
         (good, ["--track", "3"], 11, "--track 3 needs a rig file with 3 spots"),
@@ -212,7 +224,7 @@ def test_a_first_rig_file_has_the_films_name_where_none_is_given(aolink, tmp_pat
     done = aolink("rig", "--from", "bead.npy", "--rate", "50", "--track", "1")
     assert (done.returncode, done.stdout) == (11, "")
     assert "`aolink look bead.npy`" in done.stderr  # single frames are exposures whose blur tells more
-    done = aolink("rig", "--from", "bead.npy", "--rate", "50", "--track", "1", "--sum", "4")
+    done = aolink("rig", "--from", "bead.npy", "--rate", "50", "--track", "1", "--film", "sum=4")
     assert (done.returncode, done.stderr) == (0, "")
     assert "bead.toml: written from bead.npy" in done.stdout
     assert aolink("rig", "bead.toml", "--check").returncode == 0
@@ -249,7 +261,7 @@ def test_a_first_rig_file_of_a_url_is_refused(aolink):
 
 def test_a_start_other_than_the_films_is_noted(aolink, rig, tmp_path):
     source = others.write_fits(tmp_path / "a.fits", FRAMES, DATE_OBS="2026-09-21T10:30:00")
-    made = aolink("import", source, "-o", "a.mcap", "--rig", rig, "--rate", "50", "--start", "2026-09-22")
+    made = aolink("import", source, "-o", "a.mcap", "--rig", rig, "--rate", "50", "--film", "start=2026-09-22")
     assert "starts at 2026-09-21T10:30:00.000000000; 2026-09-22T00:00:00.000000000 is taken" in made.stdout
 
 
@@ -257,7 +269,7 @@ def test_a_start_other_than_the_films_is_noted(aolink, rig, tmp_path):
     ("options", "says"),
     [
         (["rig.toml", "--track", "2"], "--track needs --from FILM"),
-        (["rig.toml", "--check", "--topic", "/camera"], "--topic needs --from FILM"),
+        (["rig.toml", "--check", "--film", "topic=/camera"], "--film needs --from FILM"),
         (["a.toml", "--from", "film.npy", "--track", "1", "--check"], "--check makes no sense with --from"),
         (["a.toml", "--from", "film.npy", "--track", "1", "--json"], "--json makes no sense with --from"),
     ],

@@ -161,7 +161,7 @@ def test_rates_and_times_that_contradict_each_other_are_refused(tmp_path):
     text = refused(tmp_path, film(), None, FilmSettings(rate_hz=60), rate_hz=50.0)
     assert "60 frames/s, and the rig file single-lenslet wants a frame every 0.02 s, 50 frames/s" in text
     text = refused(tmp_path, film(), small_rig(10, 10), rate_hz=1000.0)
-    assert "give --sum 10 as the rig file has it, change its [timing], or give the right --rate" in text
+    assert "give --film sum=10 as the rig file has it, change its [timing], or give the right --rate" in text
     assert "50 frames/s" in refused(tmp_path, film(), times_ns=times * 2)
     text = refused(tmp_path, film(), exposure_s=0.02)
     assert "exposed for 0.02 s a frame, the rig file single-lenslet says 0.01 s" in text
@@ -354,7 +354,7 @@ def test_colours_keep_the_scale_of_their_type(tmp_path):
 
 def test_light_that_may_not_be_linear_is_said_unless_gamma_is_given(tmp_path):
     _, account = made(tmp_path, film(np.uint8), nonlinear="a JPEG")
-    assert any("light may not be linear: a JPEG; --gamma 2.2" in note for note in account.notes)
+    assert any("light may not be linear: a JPEG; --film gamma=2.2" in note for note in account.notes)
     _, account = made(tmp_path, film(np.uint8), None, FilmSettings(gamma=2.2), nonlinear="a JPEG")
     assert not any("linear" in note for note in account.notes)
 
@@ -399,7 +399,7 @@ def test_the_row_time_of_a_film_is_known_or_said(tmp_path):
     inputs = np.random.default_rng(0).uniform(-0.01, 0.01, (200, rig.n_inputs))
     recording, account = made(tmp_path, frames, rig, FilmSettings(row_time_s=1e-3), inputs=inputs)
     assert recording.rig.sensor.row_time_s == 1e-3
-    assert not any("--row-time" in note for note in account.notes)
+    assert not any("row_time=S" in note for note in account.notes)
     late, first = recording.rig.axis_delays[0], next(iter(recording.exposures()))
     assert late > 0
     assert first.row_sigma_ns is None
@@ -407,7 +407,7 @@ def test_the_row_time_of_a_film_is_known_or_said(tmp_path):
     quantised = inputs[late : late + n, 0]
     np.testing.assert_array_equal(first.inputs[:, 0], quantised)
     recording, account = made(tmp_path, frames, rig, inputs=inputs)
-    assert any("--row-time" in note for note in account.notes)
+    assert any("row_time=S" in note for note in account.notes)
     assert "row_time_s" in recording.metadata["camera_lacks"]
     first = next(iter(recording.exposures()))
     assert first.row_sigma_ns is not None

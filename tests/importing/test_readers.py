@@ -483,7 +483,7 @@ def test_of_two_topics_with_pictures_one_is_chosen(kind, tmp_path):
         store, name, write = WRITERS[kind]
         both = {"/a": others.ros_images(store, first, "mono8"), "/b": others.ros_images(store, second, "mono8")}
         path = write(tmp_path / name, both)
-    assert "has pictures on /a, /b: say which with --topic" in refused(path)
+    assert "has pictures on /a, /b: say which with --film topic=NAME" in refused(path)
     check(open_film(path, "/b"), second)
     assert "no pictures on /c: it has /a (" in refused(path, "/c")
 
@@ -538,7 +538,7 @@ def test_telemetry_with_neither_pictures_nor_slopes_is_refused(tmp_path):
 @pytest.mark.parametrize("kind", ["npy", "npz", "TIFF", "pictures", "FITS", "packed FITS"])
 def test_a_topic_of_a_file_without_topics_is_refused(kind, tmp_path):
     text = refused(KINDS[kind](tmp_path, numbers(np.uint8)), "/camera")
-    assert "has no topics: --topic /camera says which channel of an MCAP file or a bag" in text
+    assert "has no topics: --film topic=/camera says which channel of an MCAP file or a bag" in text
 
 
 @pytest.mark.parametrize(
@@ -636,7 +636,7 @@ def test_of_two_wavefront_sensors_one_is_chosen(two_sensors):
     path, (low, high) = two_sensors
     first = open_film(path)
     check(first, low)
-    assert "a.fits has those of high too: say which with --topic" in first.notes
+    assert "a.fits has those of high too: say which with --film topic=NAME" in first.notes
     assert "not applied to the pictures: the detector's dark" in first.notes
     check(open_film(path, "low"), low)
     second = open_film(path, "high")

@@ -111,7 +111,11 @@ def test_scale_makes_slopes_of_another_unit(tmp_path: Path) -> None:
     ("rig", "settings", "says"),
     [
         ("sh-4x4", {}, "has 2 slopes in each frame, the rig file sh-4x4 32"),
-        ("single-lenslet", {"track": 1}, "has slopes and no pictures: --track, --invert, --background and --gamma"),
+        (
+            "single-lenslet",
+            {"track": 1},
+            "no pictures: --track, and --film invert, background and gamma",
+        ),
     ],
 )
 def test_slopes_that_are_not_the_rigs_are_refused(
@@ -137,7 +141,7 @@ def test_slopes_go_through_every_command_and_back_to_aot(aolink, tmp_path):
     assert "holds slopes only, no pixels" in refused.stderr.replace("\n", " ")
     assert not (tmp_path / "b.mcap").exists()
     assert aolink("estimate", "a.mcap", "-e", "o1", "-o", "b.mcap").returncode == 0
-    assert aolink("view", "b.mcap", "--save", "b.rrd").returncode == 0
+    assert aolink("view", "b.mcap", "-o", "b.rrd").returncode == 0
     for suffix in ("fits", "npz", "csv"):
         done = aolink("export", "b.mcap", "-o", f"b.{suffix}")
         assert done.returncode == 0, done.stderr

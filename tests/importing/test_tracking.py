@@ -494,7 +494,7 @@ def test_a_rig_whose_inputs_do_not_shift_its_spots_keeps_its_windows(walkers: Sp
     rig = parse_rig(text)
     settings = replace(SETTINGS, scale=2.0)
     account = import_film(array_film(walkers.frames, "film"), rig, settings, tmp_path / "a.mcap")
-    assert "--scale is not used" in account.notes[-1]
+    assert "--film scale is not used" in account.notes[-1]
     assert not any(each.inputs.any() for each in Recording(tmp_path / "a.mcap").exposures())
 
 

@@ -433,7 +433,7 @@ def assert_calibrated(path: Path) -> None:
 def test_the_device_form_asks_records_and_writes_the_rig_file(aolink: Run, tmp_path: Path) -> None:
     (tmp_path / "true.toml").write_text(TRUE)
     (tmp_path / "my.toml").write_text(WRONG)
-    arguments = ["--rig", "my.toml", "-o", "out.toml", "--frames", "60", "--keep", "kept"]
+    arguments = ["--rig", "my.toml", "-o", "out.toml", "--measure", "frames:count=60"]
     with simulated_rig(tmp_path / "true.toml", "--light", "dark,flat:4,flat:8,still") as (camera_port, mirror_port):
         devices = ["--camera", camera_port, "--mirror", mirror_port]
         result = aolink("calibrate", *devices, *arguments, input="\n\n\n\n")
@@ -443,7 +443,7 @@ def test_the_device_form_asks_records_and_writes_the_rig_file(aolink: Run, tmp_p
     assert_calibrated(tmp_path / "out.toml")
     assert (tmp_path / "my.toml").read_text() == WRONG
 
-    files = [tmp_path / "kept" / f"{name}.mcap" for name in ("dark", "flat-1", "flat-2", "still")]
+    files = [tmp_path / "out-frames" / f"{name}.mcap" for name in ("dark", "flat-1", "flat-2", "still")]
     assert [Recording(path).metadata["calibration"] for path in files] == ["dark", "flat", "flat", "still"]
     inputs = np.concatenate([exposure.inputs for exposure in Recording(files[3]).exposures()])
     assert np.ptp(inputs) == 0
@@ -463,7 +463,7 @@ def test_the_device_form_asks_records_and_writes_the_rig_file(aolink: Run, tmp_p
 @pytest.mark.slow
 def test_kinds_can_be_skipped_and_nobody_there_is_an_error(aolink: Run, tmp_path: Path) -> None:
     (tmp_path / "true.toml").write_text(TRUE)
-    common = ["--rig", "true.toml", "--frames", "40"]
+    common = ["--rig", "true.toml", "--measure", "frames:count=40"]
     with simulated_rig(tmp_path / "true.toml", "--light", "dark,still,dark") as (camera_port, mirror_port):
         devices = ["--camera", camera_port, "--mirror", mirror_port]
         result = aolink("calibrate", *devices, *common, "-o", "out.toml", input="\ns\n\n")
@@ -473,8 +473,13 @@ def test_kinds_can_be_skipped_and_nobody_there_is_an_error(aolink: Run, tmp_path
         own_tmp = {**os.environ, "TMPDIR": str(tmp_path / "tmp")}
         alone = aolink("calibrate", *devices, *common, "-o", "b.toml", input="\n", env=own_tmp)
         assert (alone.returncode, "nobody answers: run `aolink calibrate` on a terminal" in alone.stderr) == (8, True)
-        few = aolink("calibrate", *devices, *common[:2], "-o", "b.toml", "--frames", "3", input="\n\n\n\n")
-        assert (few.returncode, "--frames 3 is too few: at least 10" in few.stderr) == (8, True)
+        few = aolink(
+            "calibrate", *devices, *common[:2], "-o", "b.toml", "--measure", "frames:count=3", input="\n\n\n\n"
+        )
+        assert (few.returncode, "3 frames of a light are too few: at least 10" in few.stderr) == (8, True)
+        unlit = aolink("calibrate", *devices, *common, "-o", "b.toml", input="\n\n\n\n", env=own_tmp)
+        assert (unlit.returncode, "b-frames/dark.mcap exists" in unlit.stderr) == (1, True)
+        common += ["--overwrite"]
         unlit = aolink("calibrate", *devices, *common, "-o", "b.toml", input="\n\n\n\n", env=own_tmp)
         assert unlit.returncode == 8
         refused, _, kept = unlit.stderr.rpartition("; `aolink calibrate` takes what was recorded: ")
@@ -545,17 +550,16 @@ def test_a_mirror_is_poked_no_faster_than_its_rig_file_allows(aolink: Run, tmp_p
         assert old in toml
         toml = toml.replace(old, new)
     (tmp_path / "slow.toml").write_text(toml)
-    arguments = ("calibrate", "--interaction", "--rig", "slow.toml", "--repeats", "2", "-o", "matrix.npz", "--json")
+    how = "interaction:poke=0.25,repeats=2,hold_s=0.1"
+    arguments = ("calibrate", "--measure", how, "--rig", "slow.toml", "-o", "matrix.npz", "--json")
     with simulated_rig(tmp_path / "slow.toml") as (camera, mirror):
-        done = aolink(
-            *arguments, "--camera", camera, "--mirror", mirror, "--poke", "0.25", "--hold", "0.1", "--keep", "pokes"
-        )
+        done = aolink(*arguments, "--camera", camera, "--mirror", mirror)
     assert done.returncode == 0, done.stderr
     facts = json.loads(done.stdout)
     assert facts["exposures"] == 8  # of two that each of eight pokes has rested for, the second
     assert facts["difference_from_plant"] < 0.08
     rig = load_rig(tmp_path / "slow.toml")
-    held = np.concatenate([each.inputs for each in Recording(tmp_path / "pokes" / "pokes.mcap").exposures()])
+    held = np.concatenate([each.inputs for each in Recording(tmp_path / "matrix-frames" / "pokes.mcap").exposures()])
     step = (rig.mirror.input_max - rig.mirror.input_min) / 65535
     assert (np.abs(np.diff(held, axis=0)) <= 20.0 * rig.timing.fast_step_s + step).all()
     assert held.max() == pytest.approx(0.5, abs=1e-4)
@@ -564,11 +568,9 @@ def test_a_mirror_is_poked_no_faster_than_its_rig_file_allows(aolink: Run, tmp_p
 @pytest.mark.slow
 def test_a_mirror_is_poked_for_its_interaction_matrix(aolink: Run, tmp_path: Path) -> None:
     """Recorded over the wire, and compared with the plant of the rig file, which is that of the simulated rig."""
-    arguments = ("calibrate", "--interaction", "--rig", "tip-tilt", "--poke", "0.25", "--repeats", "6")
+    arguments = ("calibrate", "--measure", "interaction:poke=0.25,repeats=6", "--rig", "tip-tilt")
     with simulated_rig("tip-tilt") as (camera, mirror):
-        done = aolink(
-            *arguments, "--camera", camera, "--mirror", mirror, "-o", "matrix.npz", "--keep", "pokes", "--json"
-        )
+        done = aolink(*arguments, "--camera", camera, "--mirror", mirror, "-o", "matrix.npz", "--json")
     assert done.returncode == 0, done.stderr
     facts = json.loads(done.stdout)
     rig = load_rig("tip-tilt")
@@ -578,14 +580,14 @@ def test_a_mirror_is_poked_for_its_interaction_matrix(aolink: Run, tmp_path: Pat
         assert found["matrix"].shape == (rig.n_outputs, rig.n_inputs)
         apart = np.linalg.norm(found["matrix"] - found["plant_matrix"]) / np.linalg.norm(found["matrix"])
     assert apart == pytest.approx(facts["difference_from_plant"])
-    again = aolink(*arguments, "pokes/pokes.mcap", "-o", "again.npz")
+    again = aolink(*arguments, "matrix-frames/pokes.mcap", "-o", "again.npz")
     assert again.returncode == 0, again.stderr
     assert "written: again.npz" in again.stdout
     for wrong, what in (
-        (("--rig", "section-vi", "pokes/pokes.mcap", "-o", "b.npz"), "needs a sensor of kind 'spots'"),
-        (("--rig", "tip-tilt", "pokes/pokes.mcap", "-o", "b.toml"), ".npz"),
+        (("--rig", "section-vi", "matrix-frames/pokes.mcap", "-o", "b.npz"), "needs a sensor of kind 'spots'"),
+        (("--rig", "tip-tilt", "matrix-frames/pokes.mcap", "-o", "b.toml"), ".npz"),
     ):
-        refused = aolink("calibrate", "--interaction", *wrong)
+        refused = aolink("calibrate", "--measure", "interaction", *wrong)
         assert refused.returncode == 8
         assert what in refused.stderr
 
@@ -594,7 +596,7 @@ def test_a_film_of_blinking_light_gives_the_row_time(aolink: Run, tmp_path: Path
     """Its value and its standard deviation are written into the rig file, comments and all else stay."""
     film = np.maximum(blinking(-1.7e-4, 197.0, 5), 0)[:, :, None].repeat(40, axis=2)
     np.savez(tmp_path / "film.npz", frames=film.astype(np.uint16), rate_hz=1 / PERIOD_S)
-    made = aolink("calibrate", "film.npz", "--row-time", "197", "--rig", "sh-4x4", "-o", "out.toml")
+    made = aolink("calibrate", "film.npz", "--measure", "row-time:blink_hz=197", "--rig", "sh-4x4", "-o", "out.toml")
     assert (made.returncode, made.stderr) == (0, "")
     text = (tmp_path / "out.toml").read_text()
     assert parse_rig(text).sensor.row_time_s == pytest.approx(-1.7e-4, rel=5e-3)
@@ -602,7 +604,23 @@ def test_a_film_of_blinking_light_gives_the_row_time(aolink: Run, tmp_path: Path
     assert "# +- " in line
     assert "30 frames of film.npz" in line
     assert [each for each in text.splitlines() if each != line] == load_rig("sh-4x4").toml.splitlines()
-    again = aolink("calibrate", "film.npz", "--row-time", "210", "--rig", "sh-4x4", "-o", "b.toml")
+    again = aolink("calibrate", "film.npz", "--measure", "row-time:blink_hz=210", "--rig", "sh-4x4", "-o", "b.toml")
     assert again.returncode != 0
     assert "in step" in again.stderr
     assert not (tmp_path / "b.toml").exists()
+
+
+@pytest.mark.parametrize(
+    ("measure", "says"),
+    [
+        ("light", "--measure light is none of frames, interaction, row-time"),
+        ("frames:poke=1", "--measure frames has no option poke: it has count"),
+        ("frames:count=2.5", "--measure frames: give count a whole number from 1 to 1e+06"),
+        ("interaction:poke=x", "--measure interaction: poke=x is no number"),
+        ("row-time", "--measure row-time: give blink_hz a number from 0.001 to 1e+06"),
+    ],
+)
+def test_what_cannot_be_measured_is_said(aolink: Run, measure: str, says: str) -> None:
+    refused = aolink("calibrate", "film.npz", "--measure", measure, "--rig", "sh-4x4", "-o", "out.toml")
+    assert refused.returncode == 2
+    assert says in " ".join(refused.stderr.replace("│", " ").split())

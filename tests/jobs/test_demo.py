@@ -95,11 +95,11 @@ def test_the_demo_ends_with_what_its_recording_says(
 def test_the_demo_runs_the_estimators_that_are_named(
     aolink: Callable[..., subprocess.CompletedProcess[str]], tmp_path: Path
 ) -> None:
-    wrong = aolink("demo", "-e", "o4", "--out", tmp_path)
+    wrong = aolink("demo", "-e", "o4", "-o", tmp_path)
     assert "there is no estimator 'o4'" in wrong.stderr
     assert not list(tmp_path.iterdir())
     done = aolink(
-        "demo", "--rig", "section-vi-lively", "-e", "o3", "-e", "o1", "-e", "o3", "--exposures", "4", "--out", tmp_path
+        "demo", "--rig", "section-vi-lively", "-e", "o3", "-e", "o1", "-e", "o3", "--exposures", "4", "-o", tmp_path
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     (folder,) = tmp_path.glob("demo-*")

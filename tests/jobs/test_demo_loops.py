@@ -23,7 +23,7 @@ def test_the_demo_shows_what_each_loop_leaves(
     aolink: Callable[..., subprocess.CompletedProcess[str]], tmp_path: Path
 ) -> None:
     done = aolink(
-        "demo", "--rig", "tip-tilt", "--control", "lqg", "--exposures", str(EXPOSURES), "--out", tmp_path
+        "demo", "--rig", "tip-tilt", "--control", "lqg", "--exposures", str(EXPOSURES), "-o", tmp_path
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     (folder,) = tmp_path.glob("demo-*")

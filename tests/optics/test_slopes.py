@@ -195,7 +195,7 @@ def test_the_command_takes_a_hexagonal_sensor(aolink, tmp_path):
     frame, reference, places = pair("hexagonal", 25, lambda p: 0.01 * p, dtype="uint8")
     np.save(tmp_path / "frame.npy", frame)
     np.save(tmp_path / "flat.npy", reference)
-    done = aolink("slopes", "frame.npy", "--reference", "flat.npy", "-o", "out.npz", "--rrd", "out.rrd")
+    done = aolink("slopes", "frame.npy", "--reference", "flat.npy", "-o", "out.npz", "-o", "out.rrd")
     assert done.returncode == 0, done.stderr
     assert "hexagonal" in done.stdout
     assert f"{len(places)}, the reference has {len(places)}" in done.stdout
@@ -219,7 +219,7 @@ def test_the_command_takes_a_hexagonal_sensor(aolink, tmp_path):
 def test_the_command_prints_and_writes(aolink, mmirs, tmp_path):
     reference = str(mmirs / "mmirs_camera2_ref.fits.gz")
     done = aolink(
-        "slopes", mmirs / "mmirs_wfs_0150.fits.gz", "--reference", reference, "-o", "s.npz", "--rrd", "s.rrd", "--json"
+        "slopes", mmirs / "mmirs_wfs_0150.fits.gz", "--reference", reference, "-o", "s.npz", "-o", "s.rrd", "--json"
     )
     assert done.returncode == 0, done.stderr
     said = json.loads(done.stdout)

@@ -91,7 +91,7 @@ def test_what_cannot_be_drawn_or_written_is_one_clear_error(tmp_path: Path) -> N
 def test_the_demo_draws_it_and_names_the_package(
     aolink: Callable[..., subprocess.CompletedProcess[str]], tmp_path: Path
 ) -> None:
-    result = aolink("demo", "--rig", "single-lenslet", "--exposures", "4", "--out", tmp_path)
+    result = aolink("demo", "--rig", "single-lenslet", "--exposures", "4", "-o", tmp_path)
     assert result.returncode == 0, result.stderr
     (folder,) = tmp_path.glob("demo-*")
     (line,) = [each for each in result.stdout.splitlines() if each.startswith("picture")]
@@ -115,7 +115,7 @@ def test_without_matplotlib_the_demo_says_what_to_install(tmp_path: Path) -> Non
         "single-lenslet",
         "--exposures",
         "4",
-        "--out",
+        "-o",
         str(tmp_path),
     ]
     result = subprocess.run(command, capture_output=True, text=True, timeout=120)

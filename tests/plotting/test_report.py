@@ -176,7 +176,7 @@ def test_the_commands_write_their_files_and_say_what_is_wrong(aolink: Aolink, tm
             2,
             "the grid has 1 x 1 lenslets",
         ),
-        (("report", source, "--figure", "exposure", "--exposure", "99", "-o", "x.png"), 12, "there is no exposure 99"),
+        (("report", source, "--figure", "exposure", "--frame", "99", "-o", "x.png"), 12, "there is no exposure 99"),
     ):
         failed = aolink(*arguments)
         assert failed.returncode == code, (arguments, failed.stderr)
@@ -199,8 +199,8 @@ def test_every_figure_is_a_file_of_its_size(tmp_path: Path) -> None:
 def test_a_figure_is_a_vector_graphic_too_and_the_same_each_time(aolink: Aolink, tmp_path: Path) -> None:
     small = write_small(tmp_path / "small.mcap", 2, rig="single-lenslet", truth=True)
     for ending, begins in ((".svg", b"<?xml"), (".pdf", b"%PDF")):
-        done = aolink("report", small, "--figure", "exposure", "--lenslet", "0,0", "--steps", "-o", f"x{ending}")
+        done = aolink("report", small, "--figure", "exposure", "--lenslet", "0,0", "-o", f"x{ending}")
         assert (done.returncode, done.stdout) == (0, f"written: x{ending}\n"), done.stderr
         assert (tmp_path / f"x{ending}").read_bytes().startswith(begins)
-    again = save_figure(Recording(small), "exposure", tmp_path / "again.pdf", unit="steps")
+    again = save_figure(Recording(small), "exposure", tmp_path / "again.pdf")
     assert again.read_bytes() == (tmp_path / "x.pdf").read_bytes()

@@ -146,6 +146,7 @@ def test_a_recording_is_compared_with_itself_without_a_copy(aolink: Run, recorde
 
     differs = aolink("compare", "wrong.mcap", preexec_fn=no_files)
     assert differs.returncode == 1, differs.stderr
+    assert aolink("compare", "wrong.mcap", "--tolerance", "0.6").returncode == 0
     assert "/estimate/o1" in differs.stdout
     assert "frame 1: " in differs.stdout
     refused = aolink("compare", "wrong.mcap", "-t", "/camera/")
@@ -180,6 +181,13 @@ def test_a_topic_that_nobody_has_is_an_error_not_the_same(aolink: Run, recorded:
     result = aolink("compare", recorded.path, recorded.path, "--topic", "/estimat/")
     assert result.returncode == 5
     assert "there is nothing of /estimat/ to compare" in result.stderr
+
+
+@pytest.mark.parametrize("tolerance", ["close", "", "1e-9,", "1,2,3", "-1", "1e-9,-1", "nan"])
+def test_a_tolerance_that_is_none_is_refused(aolink: Run, recorded: Session, tolerance: str) -> None:
+    result = aolink("compare", recorded.path, recorded.path, "--tolerance", tolerance)
+    assert result.returncode == 2
+    assert f"--tolerance {tolerance}: give a relative and" in " ".join(result.stderr.replace("│", " ").split())
 
 
 def test_messages_of_unknown_kinds_are_compared_as_bytes(recorded: Session, tmp_path: Path) -> None:

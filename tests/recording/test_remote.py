@@ -205,7 +205,7 @@ def test_the_commands_take_urls(s3: S3Server, aolink: Run, tmp_path: Path) -> No
     s3fs.S3FileSystem().put(str(source), "lab/s.mcap")
     url = "s3://lab/s.mcap"
     estimate_file(url, tmp_path / "s.o3.mcap")
-    for arguments in (("estimate", url), ("view", url, "s.o3.mcap", "--save", "s.rrd")):
+    for arguments in (("estimate", url), ("view", url, "s.o3.mcap", "-o", "s.rrd")):
         result = aolink(*arguments)
         assert result.returncode == 0, result.stderr
 

@@ -91,11 +91,11 @@ def test_what_does_not_belong_together_is_one_clear_error(aolink: Run, tmp_path:
         estimate_file(source, tmp_path / f"{name}.o3.mcap")
     for arguments, expected in (
         (
-            ("view", "a.mcap", "b.o3.mcap", "--save", "x.rrd"),
+            ("view", "a.mcap", "b.o3.mcap", "-o", "x.rrd"),
             "b.o3.mcap does not belong to a.mcap: its estimates are",
         ),
-        (("view", "a.mcap", "b.mcap", "--save", "x.rrd"), "b.mcap is a recording of its own and no side file"),
-        (("view", "a.o3.mcap", "--save", "x.rrd"), "a.o3.mcap is a side file with the estimates of a.mcap alone"),
+        (("view", "a.mcap", "b.mcap", "-o", "x.rrd"), "b.mcap is a recording of its own and no side file"),
+        (("view", "a.o3.mcap", "-o", "x.rrd"), "a.o3.mcap is a side file with the estimates of a.mcap alone"),
         (("estimate", "a.o3.mcap"), "a.o3.mcap is a side file with the estimates of a.mcap alone"),
         (("compare", "a.mcap", "b.o3.mcap"), "b.o3.mcap does not belong to a.mcap"),
     ):
@@ -116,10 +116,10 @@ def test_view_and_compare_take_a_recording_and_its_side_file(aolink: Run, record
     other = aolink("compare", "s.mcap", "other.mcap")
     assert other.returncode == 1
     assert "the rig files differ" in other.stdout
-    seen = aolink("view", "s.mcap", "same.mcap", "--save", "s.rrd")
+    seen = aolink("view", "s.mcap", "same.mcap", "-o", "s.rrd")
     assert seen.returncode == 0, seen.stderr
     assert (tmp_path / "s.rrd").exists()
-    refused = aolink("view", "s.mcap", "same.mcap", "--save", "same.mcap", "--overwrite")
+    refused = aolink("view", "s.mcap", "same.mcap", "-o", "same.mcap", "--overwrite")
     assert refused.returncode != 0
 
 

@@ -46,7 +46,7 @@ def ran(*arguments: str | Path) -> tuple[str, AolinkError | None]:
 @pytest.mark.parametrize("name", SMALL)
 def test_a_small_recording_is_viewed_and_estimated(name: str, tmp_path: Path) -> None:
     path = write_small(tmp_path / "s.mcap", **SMALL[name])
-    ran("view", path, "--save", tmp_path / "s.rrd")
+    ran("view", path, "-o", tmp_path / "s.rrd")
     assert (tmp_path / "s.rrd").stat().st_size > 10_000
     for arguments in (["estimate"], ["replay"]):
         output, error = ran(*arguments, path, "-e", "o3", "-e", "open-loop")
@@ -118,7 +118,7 @@ def test_without_truth_there_is_a_nis_all_the_same(tmp_path: Path) -> None:
 @pytest.mark.parametrize("command", ["estimate", "replay", "deblur", "view"])
 def test_no_exposure_is_one_clear_error_and_leaves_nothing(command: str, tmp_path: Path) -> None:
     path = write_small(tmp_path / "none.mcap", 0)
-    target = {"estimate": ["-o"], "deblur": ["-o"], "view": ["--save"]}.get(command, [])
+    target = {"estimate": ["-o"], "deblur": ["-o"], "view": ["-o"]}.get(command, [])
     _, error = ran(
         command, path, *target, *([tmp_path / ("out.rrd" if command == "view" else "out.mcap")] if target else [])
     )
@@ -129,7 +129,7 @@ def test_no_exposure_is_one_clear_error_and_leaves_nothing(command: str, tmp_pat
 
 def test_frames_of_another_camera_are_one_clear_error(tmp_path: Path) -> None:
     path = write_small(tmp_path / "wide.mcap", 2, "black", shape=(1, 30))
-    said, error = ran("view", path, "--save", tmp_path / "s.rrd")
+    said, error = ran("view", path, "-o", tmp_path / "s.rrd")
     assert isinstance(error, ViewerError)
     assert "there is no exposure in" in str(error)
     assert "its size is not that of the rig's sensor, 1 x 40 pixels" in said

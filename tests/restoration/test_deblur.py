@@ -39,7 +39,7 @@ def picture(tmp_path: Path) -> np.ndarray:
 
 
 def test_a_picture_is_deblurred(aolink: Run, tmp_path: Path, picture: np.ndarray) -> None:
-    done = aolink("deblur", "--image", "in.png", "--psf", "psf.csv", "-o", "out.png", "--json")
+    done = aolink("deblur", "in.png", "--psf", "psf.csv", "-o", "out.png", "--json")
     assert done.returncode == 0, done.stderr
     printed, expected = json.loads(done.stdout), restore(picture, np.full(7, 2.0))
     assert printed["noise_sd"] == pytest.approx(expected.noise_sd)
@@ -53,7 +53,7 @@ def test_a_picture_is_deblurred(aolink: Run, tmp_path: Path, picture: np.ndarray
 
 def test_bad_files_are_one_line(aolink: Run, tmp_path: Path, picture: np.ndarray) -> None:
     (tmp_path / "bad.csv").write_text("1, two, 3\n")
-    done = aolink("deblur", "--image", "in.png", "--psf", "bad.csv", "-o", "out.png")
+    done = aolink("deblur", "in.png", "--psf", "bad.csv", "-o", "out.png")
     assert done.returncode == 10
     assert done.stderr.count("\n") == 1
     assert "cannot be read as a PSF" in done.stderr
@@ -64,13 +64,13 @@ def test_what_is_not_a_number_is_filled_in(aolink: Run, tmp_path: Path, picture:
     holed = picture.astype(np.float32)
     holed[10:13, 20:24] = np.nan
     np.save(tmp_path / "in.npy", holed)
-    done = aolink("deblur", "--image", "in.npy", "--psf", "psf.csv", "-o", "out.npy")
+    done = aolink("deblur", "in.npy", "--psf", "psf.csv", "-o", "out.npy")
     assert done.returncode == 0, done.stderr
     assert done.stdout.endswith(", 12 pixels that are not numbers filled in\n")
     whole = restore(picture.astype(np.float32), UNIFORM).image
     assert abs(read_picture(tmp_path / "out.npy", RestorationError) - whole).max() < 0.2 * np.ptp(whole)
     np.save(tmp_path / "in.npy", np.full_like(holed, np.nan))
-    none = aolink("deblur", "--image", "in.npy", "--psf", "psf.csv", "-o", "b.npy")
+    none = aolink("deblur", "in.npy", "--psf", "psf.csv", "-o", "b.npy")
     assert none.returncode == 10
     assert "2400 of the picture's 2400 pixels are not finite" in none.stderr
 
@@ -83,7 +83,7 @@ def test_transparency_is_no_light(tmp_path: Path, picture: np.ndarray) -> None:
     (tmp_path / "psf.csv").write_text(",".join(["1"] * 7))
     out = tmp_path / "out.png"
     printed = CliRunner().invoke(
-        app, ["deblur", "--image", str(tmp_path / "in.png"), "--psf", str(tmp_path / "psf.csv"), "-o", str(out)]
+        app, ["deblur", str(tmp_path / "in.png"), "--psf", str(tmp_path / "psf.csv"), "-o", str(out)]
     )
     assert printed.exit_code == 0, printed.output
     found = read_picture(out, RestorationError)
@@ -93,7 +93,7 @@ def test_transparency_is_no_light(tmp_path: Path, picture: np.ndarray) -> None:
 
 def test_the_inverse_says_how_it_scanned(tmp_path: Path, picture: np.ndarray) -> None:
     (tmp_path / "psf.csv").write_text("0.2 0.5 1")
-    files = ["--image", str(tmp_path / "in.png"), "--psf", str(tmp_path / "psf.csv")]
+    files = [str(tmp_path / "in.png"), "--psf", str(tmp_path / "psf.csv")]
     printed = CliRunner().invoke(app, ["deblur", *files, "-o", str(tmp_path / "o.png"), "--method", "inverse"])
     assert printed.output.endswith(": inverse, scanned backwards\n")
 
@@ -195,7 +195,7 @@ def test_what_is_written_is_what_was_read(kind: str, tmp_path: Path) -> None:
         stored, meaning = (65535 - frames, "miniswhite") if kind == "white is zero" else (frames, "minisblack")
         tifffile.imwrite(tmp_path / name, stored, photometric=meaning)
     np.save(tmp_path / "psf.npy", np.ones((1, 3)))
-    files = ["--image", str(tmp_path / name), "--psf", str(tmp_path / "psf.npy")]
+    files = [str(tmp_path / name), "--psf", str(tmp_path / "psf.npy")]
     done = CliRunner().invoke(app, ["deblur", *files, "-o", str(tmp_path / f"out-{name}")])
     assert done.exit_code == 0, done.output
     before, after = open_film(tmp_path / name), open_film(tmp_path / f"out-{name}")
@@ -208,7 +208,7 @@ def test_what_is_written_is_what_was_read(kind: str, tmp_path: Path) -> None:
 def test_a_stack_does_not_become_one_picture(tmp_path: Path) -> None:
     np.save(tmp_path / "a.npy", moved(2, 200, np.uint8))
     (tmp_path / "psf.csv").write_text("1 1 1")
-    files = ["--image", str(tmp_path / "a.npy"), "--psf", str(tmp_path / "psf.csv")]
+    files = [str(tmp_path / "a.npy"), "--psf", str(tmp_path / "psf.csv")]
     done = CliRunner().invoke(app, ["deblur", *files, "-o", str(tmp_path / "b.png")])
     assert isinstance(done.exception, RestorationError)
     assert "it holds one picture, and there are 2" in str(done.exception)
@@ -223,7 +223,7 @@ def test_saturated_pixels_are_left_out(top: int, dtype: type, tmp_path: Path) ->
     )
     np.save(tmp_path / "a.npy", np.clip(np.rint(blurred), 0, top).astype(dtype))
     np.save(tmp_path / "psf.npy", np.ones((1, 7)))
-    files = ["--image", str(tmp_path / "a.npy"), "--psf", str(tmp_path / "psf.npy")]
+    files = [str(tmp_path / "a.npy"), "--psf", str(tmp_path / "psf.npy")]
     done = CliRunner().invoke(app, ["deblur", *files, "-o", str(tmp_path / "b.npy")])
     assert "7 saturated pixels left out" in done.output
     assert abs(np.load(tmp_path / "b.npy")[20, :20] / top - 0.02).max() < 0.02

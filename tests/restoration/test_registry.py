@@ -37,7 +37,7 @@ def test_a_method_of_another_package_restores_a_picture(
     image, scene = blurred(0.1 + blocks(40, 66, seed=2), UNIFORM, (3,))
     np.save(tmp_path / "in.npy", image)
     np.savetxt(tmp_path / "psf.csv", UNIFORM[None], delimiter=",")
-    picture = ("--image", "in.npy", "--psf", "psf.csv", "-o", "out.npy", "--method")
+    picture = ("in.npy", "--psf", "psf.csv", "-o", "out.npy", "--method")
     done = aolink("deblur", *picture, "richardson_lucy", env=with_packages)
     assert done.returncode == 0, done.stderr
     assert done.stdout == "out.npy: richardson_lucy\n"
@@ -65,7 +65,7 @@ def test_a_method_that_cannot_be_loaded_is_one_line(
 ) -> None:  # fmt: skip
     np.save(tmp_path / "in.npy", np.ones((9, 9)))
     (tmp_path / "psf.csv").write_text("1,1\n")
-    arguments = ("deblur", "--image", "in.npy", "--psf", "psf.csv", "-o", "out.npy", "--method", "gone")
+    arguments = ("deblur", "in.npy", "--psf", "psf.csv", "-o", "out.npy", "--method", "gone")
     done = aolink(*arguments, env=with_packages)
     assert done.returncode == RestorationError.exit_code
     assert done.stderr == (

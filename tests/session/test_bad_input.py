@@ -8,7 +8,6 @@ import os
 import pty
 import re
 import resource
-import shutil
 import signal
 import socket
 import subprocess
@@ -188,7 +187,7 @@ def test_an_existing_target_is_kept(aolink: Run, tmp_path: Path) -> None:
     assert Recording(tmp_path / "a.mcap").counts["/camera/image"] == 2
     for name in ("b.mcap", "b.rrd"):
         (tmp_path / name).write_text("precious")
-    for command in (["estimate", "a.mcap", "-o", "b.mcap"], ["view", "a.mcap", "--save", "b.rrd"]):
+    for command in (["estimate", "a.mcap", "-o", "b.mcap"], ["view", "a.mcap", "-o", "b.rrd"]):
         assert "exists and is not overwritten" in aolink(*command).stderr
 
 
@@ -437,20 +436,18 @@ def test_numbers_that_make_no_sense(aolink: Run, tmp_path: Path, arguments: list
     assert not (tmp_path / "a.mcap").exists()
 
 
-@pytest.mark.parametrize("where", ["devices", "record", "rig file", "check", "replay"])
+@pytest.mark.parametrize("where", ["devices", "record", "rig file", "check"])
 def test_a_port_that_would_write_a_file_is_refused_before_it_does(aolink: Run, tmp_path: Path, where: str) -> None:
     (precious := tmp_path / "precious").write_text("precious")
     master, slave = pty.openpty()
     port = f"spy://{os.ttyname(slave)}?file={precious}"
     text = load_rig("section-vi").toml + f'\n[devices]\nmirror = {{ driver = "native", port = "{port}" }}\n'
     (tmp_path / "my.toml").write_text(text)
-    shutil.copy(RECORDING, tmp_path / "old.mcap")
     command = {
         "devices": ["devices", port],
         "record": ["record", "--camera", os.ttyname(slave), "--mirror", port, "--rig", "section-vi", "-o", "a.mcap"],
         "rig file": ["record", "--camera", os.ttyname(slave), "--rig", "my.toml", "-o", "a.mcap"],
         "check": ["rig", "my.toml", "--check"],
-        "replay": ["replay", "old.mcap", "--to-rig", "--camera", port, "--mirror", os.ttyname(slave), "-o", "a.mcap"],
     }[where]
     result = aolink(*command)
     os.close(master)

@@ -422,11 +422,13 @@ def test_the_command_deblurs_a_recording(aolink: Run, session: Path, tmp_path: P
     assert "b.mcap exists and is not overwritten" in again.stderr
 
 
-@pytest.mark.parametrize("wrong", [[], ["a.mcap", "--image", "x.png"], ["--image", "x.png"], ["a.mcap", "--psf", "p"]])
+@pytest.mark.parametrize(
+    "wrong", [[], ["a.mcap", "--image", "x.png"], ["--image", "x.png"], ["a.mcap", "--psf", "p", "--path", "l"]]
+)
 def test_the_command_takes_a_recording_or_a_picture(wrong: list[str]) -> None:
     refused = CliRunner().invoke(app, ["deblur", *wrong, "-o", "c.mcap"])
     assert refused.exit_code == 2
-    assert "give a recording alone, or --image with --psf or --path" in " ".join(
+    assert "give a recording alone, or a picture with --psf or --path" in " ".join(
         refused.stderr.replace("│", " ").split()
     )
 
@@ -447,7 +449,7 @@ def test_the_demo_from_a_rig_file_with_a_picture_and_slopes_beside_it(aolink: Ru
     np.save(folder / "slopes.npy", 0.3 * np.sin(np.arange(400) / 30)[:, None])
     text = RIG.toml.replace("moving-scene.png", "mine.npy").replace("picture_pixels = 4", "picture_pixels = 2")
     (folder / "my.toml").write_text(text + '\n[disturbance]\nrecorded = "slopes.npy"\n')
-    done = aolink("demo", "--rig", "mine/my.toml", "--exposures", "4", "--out", tmp_path / "out")
+    done = aolink("demo", "--rig", "mine/my.toml", "--exposures", "4", "-o", tmp_path / "out")
     assert done.returncode == 0, done.stderr
     (made,) = (tmp_path / "out").glob("demo-*")
     assert "; the scene goes from " in done.stdout

@@ -158,7 +158,7 @@ def test_a_row_of_inputs_may_be_longer_than_a_packet(tmp_path: Path, faults: str
 
 @pytest.mark.rare
 def test_the_demo_works(aolink: Callable[..., subprocess.CompletedProcess[str]], tmp_path: Path) -> None:
-    result = aolink("demo", "--rig", "single-lenslet", "--exposures", "8", "--out", tmp_path)
+    result = aolink("demo", "--rig", "single-lenslet", "--exposures", "8", "-o", tmp_path)
     assert result.returncode == 0, result.stderr
     assert "agree bit for bit" in result.stdout
 

@@ -51,7 +51,6 @@ def test_no_other_machine_is_served(aolink: Run) -> None:
     [
         "sim section-vi --allow-remote", "sim section-vi --unsigned", "sim section-vi --key=",
         "devices x --key rig.key", "record --rig section-vi -o a.mcap --key rig.key",
-        "replay a.mcap --to-rig --key rig.key",
         "calibrate --rig section-vi -o a.toml --key rig.key",
     ],
 )  # fmt: skip

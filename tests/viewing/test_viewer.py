@@ -195,7 +195,7 @@ def test_a_missing_file_is_one_clear_error(tmp_path: Path) -> None:
 def test_without_a_display_the_error_says_what_else_works(rrd: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
-    with pytest.raises(ViewerError, match="--screenshot"):
+    with pytest.raises(ViewerError, match=r"-o X\.png"):
         open_viewer(rrd)
 
 
@@ -243,7 +243,7 @@ def test_a_viewer_that_gets_the_data_over_the_network_shows_the_layout(rrd: Path
 
 @pytest.mark.slow
 def test_a_file_without_time_is_shown_as_it_is(tmp_path: Path) -> None:
-    """As `aolink slopes --rrd` writes one."""
+    """As `aolink slopes -o X.rrd` writes one."""
     with rr.RecordingStream("another") as stream:
         stream.save(tmp_path / "still.rrd")
         stream.log("picture", rr.Image(np.random.default_rng(1).integers(0, 255, (40, 60, 3), np.uint8)), static=True)
@@ -344,6 +344,6 @@ def test_what_is_no_rerun_file_is_one_clear_error(aolink: Callable[..., Any], rr
         result = aolink("view", name, "--web")
         assert result.returncode == 7
         assert result.stderr.startswith(f"aolink: {message}")
-    result = aolink("view", rrd, "--save", "again.rrd")
+    result = aolink("view", rrd, "-o", "again.rrd")
     assert result.returncode == 2
     assert "is a Rerun file already" in " ".join(result.stderr.replace("│", " ").split())

@@ -261,7 +261,7 @@ def chunks_read(effort: Effort) -> list[Row]:
             "estimate -e o3": lambda: scored_and_compared(recording, ["o3"]),
             "export x.csv": lambda: export(recording, folder / "x.csv"),
             "report": lambda: write_report([recording], folder / "x.html"),
-            "view --save": lambda: save_rrd(recording, folder / "x.rrd"),
+            "view -o": lambda: save_rrd(recording, folder / "x.rrd"),
         }
         rows = []
         setattr(messages, "chunk_at", counting)  # noqa: B010

@@ -92,8 +92,8 @@ def view_start(effort: Effort) -> list[Row]:
     peer = "import numpy, rerun"
     with tempfile.TemporaryDirectory() as name:
         saved = Path(name) / "one.rrd"
-        command = (*_COMMAND, "view", _RECORDING, "--exposure", "3", "--save", saved, "--overwrite")
-        one = _row("aolink view --exposure 3 --save, from its start", command, peer, 2.0, effort)
+        command = (*_COMMAND, "view", _RECORDING, "--frame", "3", "-o", saved, "--overwrite")
+        one = _row("aolink view --frame 3 -o, from its start", command, peer, 2.0, effort)
     path = hour(effort)
     with _compiled():
         _until_first_part(path)

@@ -67,7 +67,7 @@ def test_a_camera_alone_can_be_calibrated(aolink: Run, tmp_path: Path) -> None:
     noise = np.random.default_rng(1).normal(20_000, 50, (30, *SHAPE))
     np.save(tmp_path / "dark.npy", noise.round().astype(np.uint16))
     (tmp_path / "my.toml").write_text(rig_of('driver = "folder"\npath = "dark.npy"', tmp_path).toml)
-    done = aolink("calibrate", "--rig", "my.toml", "--frames", "30", "-o", "out.toml", input="\ns\ns\n")
+    done = aolink("calibrate", "--rig", "my.toml", "--measure", "frames:count=30", "-o", "out.toml", input="\ns\ns\n")
     assert done.returncode == 0, done.stderr
     measured = load_rig(str(tmp_path / "out.toml")).sensor
     assert measured.black_level == pytest.approx(20_000, abs=10)
