@@ -2,7 +2,7 @@
 
 A new key is a field of its table's dataclass, with its meaning and unit below it and a default, so that old files still
 work; a new table is a field of ``_File`` in `file`. Refuse what cannot work where the table is read; report what is
-doubtful in `aolink.jobs.check_rig`. Then ``tools/keys`` writes KEYS.md.
+doubtful in `aolink.jobs.check_rig`. Then ``tools/pages`` writes KEYS.md.
 """
 
 from aolink.optics.sensor import Kernel, Sensor, SpotSensor

@@ -9,7 +9,7 @@ import typer
 from typer.core import TyperGroup
 from typer.testing import CliRunner
 
-from aolink.cli import app
+from aolink.cli.common import app
 from aolink.cli.common import _BEFORE, _GONE, _GONE_OPTIONS
 from aolink.cli.films import _FILM, _TAKEN, film_file
 from aolink.errors import ImportingError
