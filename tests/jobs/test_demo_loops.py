@@ -48,4 +48,4 @@ def test_the_demo_shows_what_each_loop_leaves(
         for row in view.get("ViewContents:query", [])
         if any("/residual/" in each for each in row)
     ]
-    assert shown == [f"+ /residual/{name}" for name in LOOPS]
+    assert shown == ["+ /residual/**"]
