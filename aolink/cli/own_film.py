@@ -49,7 +49,7 @@ def look(
     about a minute; then sums of processes are tried. Ctrl-C keeps what there is.
     """
     from aolink.importing.recording import import_film
-    from aolink.jobs.look import Looked
+    from aolink.jobs.look import ESTIMATOR, Looked, heeding
     from aolink.jobs.look import look as look_at
     from aolink.jobs.look_page import write_page
     from aolink.jobs.look_words import as_json as numbers
@@ -96,13 +96,15 @@ def look(
         import_film(looked.cut, rig, looked.settings, imported, sources=[source])
         with progress("estimate", len(looked.spots.light)) as tell:
             if looked.moves:
-                source_of = Recording(imported)
-                write_reestimated(source_of, ["moments"], recording, overwrite=overwrite, progress=tell)
+                scores, _ = write_reestimated(
+                    Recording(imported), [ESTIMATOR], recording, overwrite=overwrite, progress=tell
+                )  # fmt: skip
+                looked = heeding(looked, scores[ESTIMATOR])
             else:
                 imported.replace(recording)
     commands = [
         f"{program()} view {recording}",
-        f"{program()} estimate {recording} -e profile",
+        f"{program()} info {recording}",
         f"{program()} report {recording} -o {folder / 'report.html'}",
     ]
     drawn = f"{page}: the pictures"

@@ -17,7 +17,8 @@ import numpy as np
 
 from aolink.errors import IdentificationError, ImportingError
 from aolink.estimation import run
-from aolink.estimation.verdict import Fit
+from aolink.estimation.score import Score
+from aolink.estimation.verdict import ADVICE, Fit, Verdict
 from aolink.exposure import Exposure
 from aolink.films.film import Film
 from aolink.identification import FEWEST, Identified, Maximum, Piece, Readings, kinds_of, maxima, readings
@@ -59,6 +60,17 @@ _CHANCE = 1e-3
 """Chance of a line in what a model leaves of the places, below which it is taken for one."""
 _MUCH_WIDER = 1.5
 """Widening of the intervals from which on the verdict that a model does not fit is a doubt."""
+_REFUSED = 0.1
+"""Share of gated exposures from which on a rig file is of no use."""
+_ADVICE = {
+    "in a ring about the spot": "the kernel: give its width with --kernel",
+    "everywhere in the spot": "the noise or the light",
+    "to one side of the prediction": "a drift of where it rests",
+    "from exposure to exposure": "a vibration that is missing, or the exposure time",
+}
+"""What to do about a verdict, by where its evidence is."""
+ESTIMATOR = "profile"
+"""The estimator of the paths: `moments` refuses spots that swing fast along a slanted line."""
 _UNEVEN = 0.003
 """Share by which the exposure may differ from a whole number of fast steps."""
 _REST = 2.0
@@ -100,6 +112,11 @@ class Direction:
     def size(self) -> float:
         """Standard deviation of the path, pixels."""
         return math.hypot(self.moved, self.blur if self.blurred else 0.0)
+
+    @property
+    def unexplained(self) -> bool:
+        """Whether the model leaves something of the motion."""
+        return bool(self.misfit) or self.left_hz is not None
 
     @property
     def moves(self) -> bool:
@@ -171,9 +188,9 @@ def look(
     frames:
         Number of frames that are looked at, from the first on.
     thorough:
-        Whether sums of processes are tried for blurred frames as well.
+        Whether sums of processes are tried for blurred frames as well, where ``before`` leaves something unexplained.
     before:
-        What an earlier look at the film has found, so that its spots need not be searched again.
+        What an earlier look at the film has found: its spots, and the motion that it explains, are taken from it.
     tell:
         Called with the present task, how much of it is done, and how much there is.
 
@@ -216,7 +233,10 @@ def look(
     together = len(everything) > 1 and _one_motion(seen)
     which = [0] if together else everything
     for d, each in enumerate(directions):
-        if each.moves:
+        first = None if before is None else before.directions[d]
+        if first is not None and not first.unexplained:
+            directions[d] = first  # a sum of processes would explain what is explained
+        elif each.moves:
             names = (*_SINGLE, *_SUMS) if thorough or not each.blurred else _SINGLE  # sharp frames take no time
             directions[d] = _identified(scene, d, each, which, sd, names, partial(_say, tell, each.name))
     for d, each in enumerate(directions):
@@ -300,14 +320,14 @@ def _identified(
     if not direction.blurred and band is None:
         found = _with_aliases(found, scene, LEAST_BLUR * sd)
     rig = parse_rig(scene.line_text(sd, found.model))
-    each_film = [run(rig, each, ["profile"])["profile"] for each in films]
+    each_film = [run(rig, each, [ESTIMATOR])[ESTIMATOR] for each in films]
     path = np.array([[one.path[0] for one in each] for each in each_film]).swapaxes(0, 1)
     settled = [one for each in each_film for one in each[_SETTLED:]]
     error = float(np.mean(np.square([each.path_sd for each in settled])))
     within = float(np.mean((path[_SETTLED:] - path[_SETTLED:].mean(axis=2, keepdims=True)) ** 2))
     verdicts = [each[-1].verdict for each in each_film]
     misfits = [
-        each.text
+        _for_films(each)
         for each in verdicts
         if each is not None and each.fit is Fit.DOES_NOT_FIT and each.widening > _MUCH_WIDER
         if direction.blurred or each.kind == "motion"  # what sharp frames tell needs no kernel
@@ -336,6 +356,27 @@ def _common_band(one: Direction, other: Direction) -> tuple[float, float] | None
     (piece,) = certain.pieces
     own = [each for each in hz.pieces if each.low <= piece.high and each.high >= piece.low]
     return (min(own[0].low, piece.low), max(own[0].high, piece.high)) if own else None
+
+
+def _for_films(verdict: Verdict) -> str:
+    """A verdict with advice that somebody with a film can follow."""
+    text = verdict.text
+    for where, advice in _ADVICE.items():
+        text = text.replace(ADVICE[where], advice)
+    return text
+
+
+def heeding(looked: Looked, score: Score) -> Looked:
+    """What a film shows, with the doubts of the score of all its windows by the rig file that was written."""
+    doubts = []
+    if score.gated > _REFUSED * score.estimated:
+        doubts.append(
+            f"{score.gated} of {score.estimated} frames do not fit the rig file that is written, and its estimates are"
+            " not to be used: try --kernel, with the width of a spot at rest"
+        )
+    elif score.verdict is not None and score.verdict.fit is Fit.DOES_NOT_FIT and score.verdict.widening > _MUCH_WIDER:
+        doubts.append(f"in the recording {_for_films(score.verdict)}")
+    return replace(looked, doubts=(*looked.doubts, *doubts))
 
 
 def _line_left(seen: Sequence[Readings], model: ProcessSum, rate_hz: float) -> float | None:

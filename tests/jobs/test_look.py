@@ -87,7 +87,7 @@ def test_the_command_writes_a_rig_file_a_recording_and_a_page(aolink: Run, tmp_p
     assert any(low <= 37.3 <= high for low, high in said["directions"]["x"]["parameters"]["frequency_hz"]["set"])
     folder = tmp_path / "film-look"
     recording = Recording(folder / "film.mcap")
-    assert recording.estimators == ["moments"]
+    assert recording.estimators == ["profile"]
     assert len(recording) == 60
     assert load_rig(str(folder / "rig.toml")).sensor.spots == 1
     page = (folder / "page.html").read_text()
