@@ -41,6 +41,8 @@ class RestoredCounts:
     exposures: int = 0
     scenes: int = 0
     """Scenes restored."""
+    spots: int = 0
+    """Exposures whose spots were restored."""
     reasons: Counter[str] = field(default_factory=Counter)
     """Reasons why pictures are missing, each with its number."""
     psnr_blurred: list[float] = field(default_factory=list)
@@ -170,6 +172,7 @@ def _score(
     summary.exposures += 1
     summary.motion.add(exposure, estimate)
     summary.scenes += done.scene is not None
+    summary.spots += done.spots is not None
     if not np.isnan(done.expected_gain_db):
         summary.expected_gains.append(done.expected_gain_db)
     if done.reason:

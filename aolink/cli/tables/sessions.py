@@ -160,7 +160,7 @@ def deblurred(summary: RestoredCounts) -> dict[str, Any]:
 def deblurred_lines(summary: RestoredCounts, estimator: str, method: str) -> list[str]:
     """The results for restored pictures, in words."""
     facts = deblurred(summary)
-    scenes = f"{facts['scenes_restored']} scenes" if facts["scenes_restored"] else "spots"
+    scenes = f"{facts['scenes_restored']} scenes" if facts["scenes_restored"] else f"spots in {summary.spots}"
     lines = [f"{scenes} of {facts['exposures']} exposures restored with the path of {estimator}, {method}"]
     if facts["psnr_blurred_db"] is not None:
         lines.append(
