@@ -192,9 +192,8 @@ def test_nothing_is_recovered_from_nothing(recorded: Session, tmp_path: Path) ->
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("command", [["copy", "-o", "c.mcap"], ["replay", "-e", "o1"]])
-def test_a_start_after_the_end_of_a_recording_is_said(aolink: Run, recorded: Session, command: list[str]) -> None:
-    refused = aolink(command[0], recorded.path, *command[1:], "--start", "100")
+def test_a_start_after_the_end_of_a_recording_is_said(aolink: Run, recorded: Session) -> None:
+    refused = aolink("copy", recorded.path, "-o", "c.mcap", "--start", "100")
     assert refused.returncode == 5
     assert "has no exposure between 100 s and the end" in refused.stderr
 
