@@ -46,7 +46,8 @@ def look(
     """Say what moves in a film of up to four spots, and how well its blur tells the path inside each exposure.
 
     Writes a rig file to go on with, a recording with estimates, and a page with pictures. The first answer comes in
-    about a minute; then sums of processes are tried. Ctrl-C keeps what there is.
+    about a minute; where it leaves something of blurred frames unexplained, sums of processes are then tried, which may
+    take minutes. Ctrl-C keeps what there is.
     """
     from aolink.importing.recording import import_film
     from aolink.jobs.look import ESTIMATOR, Looked, heeding

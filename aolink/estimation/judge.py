@@ -5,7 +5,7 @@ them decide. That of the pixels is Student's t of the residuals beyond those of 
 of the motion is the sum of squared, white errors of prediction of the spot's mean position, each made normal (Wilson &
 Hilferty, Proc. Natl. Acad. Sci. 17 (1931)), or the mean of these errors. The estimator's own NIS, made normal as well,
 decides with them; it does not say which of the two it is, and is wider than a chi-square, since posteriors are not
-Gaussian. So does the share of exposures that are gated, which cannot be compared.
+Gaussian. Gated exposures cannot be compared: their share is evidence of the motion by itself.
 """
 
 from __future__ import annotations

@@ -6,12 +6,10 @@ motion is identified along x and along y, and the path inside each exposure is e
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
 
 import numpy as np
 
@@ -19,19 +17,16 @@ from aolink.errors import IdentificationError, ImportingError
 from aolink.estimation import run
 from aolink.estimation.score import Score
 from aolink.estimation.verdict import ADVICE, Fit, Verdict
-from aolink.exposure import Exposure
 from aolink.films.film import Film
 from aolink.identification import FEWEST, Identified, Maximum, Piece, Readings, kinds_of, maxima, readings
 from aolink.identification.likelihood import Likelihood
 from aolink.identification.models import ProcessSum
-from aolink.identification.rig_text import as_table
 from aolink.importing.blurred import Spots, find_spots
-from aolink.importing.exposures import film_series
-from aolink.importing.frames import FilmSettings, FrameTimes, film_times, nonlinear_note
+from aolink.importing.frames import FilmSettings, film_times, nonlinear_note
 from aolink.jobs.identify import IdentifiedModel, Wanted, from_readings, space_wanted
+from aolink.jobs.look_scene import LEAST_MOTION, Scene
 from aolink.numerics.arrays import FloatArray
 from aolink.rig import Rig, parse_rig
-from aolink.rig.edit import with_tables
 
 FRAMES = 300
 """Frames that are looked at, from the first on."""
@@ -40,14 +35,10 @@ _SEARCHED = 96
 _SINGLE = ("random-walk", "ornstein-uhlenbeck", "resonance")
 _SUMS = ("ornstein-uhlenbeck+resonance", "random-walk+resonance", "resonance+resonance")
 """Models that are tried for the first answer, and those that are tried after it."""
-LEAST_MOTION = 0.02
-"""Smallest motion that is spoken of, pixels rms."""
 _CERTAIN = 2.0
 """Motion that chance does not show, in `Direction.sure`: its square is then four standard deviations away."""
 LEAST_BLUR = 1 / 3
 """Blur, in standard deviations of the kernel, from which on it shows the motion inside an exposure."""
-_STEPS, _MOST_STEPS = 16, 48
-"""Fast steps in an exposure, at least where the exposure is short, and at most."""
 _SHARPEST = 0.05
 """Share of the frames that are the sharpest."""
 _NOTHING = 1e6
@@ -71,12 +62,6 @@ _ADVICE = {
 """What to do about a verdict, by where its evidence is."""
 ESTIMATOR = "profile"
 """The estimator of the paths: `moments` refuses spots that swing fast along a slanted line."""
-_UNEVEN = 0.003
-"""Share by which the exposure may differ from a whole number of fast steps."""
-_REST = 2.0
-"""Standard deviation of where a spot rests about the middle of its window, pixels."""
-_COUNTS, _NOISE_SDS = 50_000, 6
-"""Counts of the brightest pixel of a resting spot, and standard deviations of noise below black."""
 DIRECTIONS = ("x", "y")
 
 
@@ -225,7 +210,7 @@ def look(
             f"{film.name}: the frames are too dim to tell how wide a spot at rest is: give its standard deviation with"
             " --kernel PIXELS, or take brighter frames"
         )
-    scene = _Scene(film, spots, times, rate, exposure_s, name)
+    scene = Scene(film, spots, times, rate, exposure_s, name)
     everything = range(len(spots.corners))
 
     seen = [[readings(*scene.along(d, k, sd)) for k in everything] for d in (0, 1)]
@@ -248,10 +233,11 @@ def look(
             f"cannot tell what happens inside an exposure: the blur, {max(each.blur for each in directions):.2g} pixels"
             f" rms, is below a third of the kernel, {sd:.2g} pixels: expose longer"
         )
+    models = [each.found.model if each.found else None for each in directions]
     doubts = tuple(_doubts(spots, directions, sd, given=kernel is not None, thorough=thorough))
     return Looked(
         spots=spots, rate_hz=rate, exposure_s=exposure_s, sd=sd, together=together, directions=tuple(directions),
-        text=scene.text(sd, directions, together=together), cut=scene.cut(sd), settings=scene.settings,
+        text=scene.text(sd, models, together=together), cut=scene.cut(sd), settings=scene.settings,
         assumed=tuple(_assumed(film, settings, scene, kernel)), unknown=unknown, doubts=doubts,
     )  # fmt: skip
 
@@ -302,7 +288,7 @@ def _one_motion(seen: Sequence[Sequence[Readings]]) -> bool:
 
 
 def _identified(
-    scene: _Scene, d: int, direction: Direction, which: Sequence[int], sd: float, names: Sequence[str],
+    scene: Scene, d: int, direction: Direction, which: Sequence[int], sd: float, names: Sequence[str],
     tell: Tell, band: tuple[float, float] | None = None,
 ) -> Direction:  # fmt: skip
     """The direction with the model of its motion and the errors of its path; with a band, it is one vibration in it."""
@@ -339,7 +325,7 @@ def _identified(
         held=scene.unit * math.sqrt(within + error),
         path=scene.unit * (path + 1) - 0.5,
         misfit=misfits[0] if misfits else "",
-        left_hz=_line_left([readings(rig, each) for each in films], found.model, scene.rate_hz),
+        left_hz=line_left([readings(rig, each) for each in films], found.model, scene.rate_hz),
     )
 
 
@@ -379,7 +365,7 @@ def heeding(looked: Looked, score: Score) -> Looked:
     return replace(looked, doubts=(*looked.doubts, *doubts))
 
 
-def _line_left(seen: Sequence[Readings], model: ProcessSum, rate_hz: float) -> float | None:
+def line_left(seen: Sequence[Readings], model: ProcessSum, rate_hz: float) -> float | None:
     """The frequency of a line in the innovations of the places, where chance does not explain it: Fisher's test (1929)
     of the largest value of a periodogram against their mean."""
     left = [one for each in seen for one in Likelihood(each, 1).whitened_means(model)]
@@ -392,7 +378,7 @@ def _line_left(seen: Sequence[Readings], model: ProcessSum, rate_hz: float) -> f
     return (top + first) / count * rate_hz if chance < _CHANCE else None
 
 
-def _with_aliases(found: IdentifiedModel, scene: _Scene, most_blur: float) -> IdentifiedModel:
+def _with_aliases(found: IdentifiedModel, scene: Scene, most_blur: float) -> IdentifiedModel:
     """The model with all aliases of a frequency in its set that would blur the spot by no more than ``most_blur``,
     pixels rms: sharp frames cannot tell them apart."""
     rate, exposure_s, highest = scene.rate_hz, scene.exposure_s, 0.5 / scene.step_s
@@ -442,117 +428,7 @@ def _best_model(
     return best[1:]
 
 
-class _Scene:
-    """The spots of a film as frames of rigs: one for their sums along one direction, and one for the windows."""
-
-    def __init__(self, film: Film, spots: Spots, times: FrameTimes, rate: float, exposure_s: float, name: str) -> None:
-        self.spots, self.name, self.film = spots, name, film
-        self.side = spots.light.shape[-1]
-        self.unit = self.side / 2
-        """Pixels of a slope unit."""
-        self.rate_hz, self.exposure_s = rate, exposure_s
-        self.settings = FilmSettings(rate_hz=rate, exposure_s=exposure_s, scale=1.0)
-        share = min(exposure_s * rate, 1.0)
-        # The first number of steps with which the period has nearly a whole number too.
-        self.steps = min(
-            range(_STEPS, _MOST_STEPS + 1), key=lambda n: (abs(n / round(n / share) / share - 1) > _UNEVEN, n)
-        )
-        self.period = round(self.steps / share)
-        self.step_s = round(1e9 / rate / self.period) / 1e9
-        self._times = None if film.times_ns is None else film.times_ns[: len(spots.light)]
-
-    def _film(self, values: FloatArray) -> Film:
-        return Film(
-            name=self.film.name, shape=(values.shape[1], values.shape[2]), dtype=values.dtype, count=len(values),
-            pictures=lambda: iter(values), rate_hz=self.film.rate_hz, exposure_s=self.exposure_s,
-            start_ns=self.film.start_ns, times_ns=self._times,
-        )  # fmt: skip
-
-    def along(self, d: int, spot: int, sd: float) -> tuple[Rig, list[Exposure]]:
-        """A rig of a line sensor that sees a spot's sums along a direction, and its exposures."""
-        rig = parse_rig(self.line_text(sd))
-        sums = self.spots.light[:, spot, None].sum(axis=2 + d) * self.unit
-        counts = rig.sensor.black_level + rig.sensor.counts_per_density * sums
-        return rig, list(film_series(self._film(counts), rig, self.settings))
-
-    def cut(self, sd: float) -> Film:
-        """The windows side by side."""
-        rig = parse_rig(self.text(sd, (), together=False))
-        density = self.spots.light * self.unit**2
-        frames = np.moveaxis(density, 1, 2).reshape(len(density), self.side, -1)
-        return self._film(rig.sensor.black_level + rig.sensor.counts_per_density * frames)
-
-    def line_text(self, sd: float, model: ProcessSum | None = None) -> str:
-        """A rig file for a spot's sums along a direction."""
-        tables = [] if model is None else [as_table(each, self.step_s) for each in model.processes]
-        return self._rig(
-            sd, f'kind = "line"\npixels = {self.side}', 2 * self.spots.noise**2 * self.unit**2, 1, 1, tables
-        )
-
-    def text(self, sd: float, directions: Sequence[Direction], *, together: bool) -> str:
-        """The rig file for the windows."""
-        n = len(self.spots.corners)
-        outputs = 2 * n if together else 2
-        tables: list[dict[str, Any]] = []
-        for d, each in enumerate(directions):
-            processes = [] if each.found is None else [as_table(one, self.step_s) for one in each.found.model.processes]
-            still = {
-                "kind": "ornstein-uhlenbeck",
-                "correlation_s": 1 / self.rate_hz,
-                "sd": LEAST_MOTION / self.unit,
-            }
-            for table in processes or [still]:
-                size = {key: [table[key]] for key in ("sd", "step_sd") if key in table}
-                tables.append(table | size | {"modes": [[float(o % 2 == d)] for o in range(outputs)]})
-        kind = f'kind = "spots"\ngrid = [1, {n}]\nwindow = [{self.side}, {self.side}]'
-        return self._rig(sd, kind, self.spots.noise**2 * self.unit**2, 1 if together else n, outputs, tables)
-
-    def _rig(
-        self, sd: float, kind: str, noise_density: float, axes: int, outputs: int, tables: list[dict[str, Any]]
-    ) -> str:
-        """The text of a rig file. The plant is where each spot rests, which is not known: the disturbance moves it."""
-        sigma, pixel = sd * math.sqrt(2) / self.unit, 1 / self.unit
-        plane = kind.startswith('kind = "spots"')
-        wide = math.sqrt(2 * math.pi * (sigma**2 / 2 + pixel**2 / 12))
-        area = pixel ** (1 + plane)
-        noise = math.sqrt(noise_density / area)
-        counts = _COUNTS / (1 / wide ** (1 + plane) + 2 * _NOISE_SDS * noise)
-        one, nothing = json.dumps(np.eye(outputs).tolist()), json.dumps([[0.0]] * outputs)
-        rest = json.dumps((np.eye(outputs) * _REST**2 / self.unit**2).tolist())
-        text = f"""# Written by `aolink look {self.film.name}`.
-name = {json.dumps(self.name)}
-
-[plant]               # where each spot rests, which is constant; the disturbance moves it about there
-axes = {axes}
-A = {one}
-B = {nothing}
-B_w = {one}
-C = {one}
-process_noise = {json.dumps(np.zeros((outputs, outputs)).tolist())}
-initial_covariance = {rest}
-
-[timing]
-fast_step_s = {self.step_s!r}
-exposure_steps = {self.steps}
-frame_period_steps = {self.period}
-
-[sensor]              # slope unit: {self.unit:g} pixels
-{kind}
-field = [-1.0, 1.0]
-noise_density = {noise_density:.6g}
-bit_depth = 16
-black_level = {math.ceil(_NOISE_SDS * noise * counts)}
-counts_per_density = {counts:.6g}
-photoelectrons = {self.spots.electrons:.4g}
-
-[sensor.kernel]
-shape = "gaussian"
-sigma = {sigma:.6g}  # {sd:.4g} pixels rms in one direction
-"""
-        return with_tables(text, "disturbance.model", tables, "by `aolink look`") if tables else text
-
-
-def _assumed(film: Film, settings: FilmSettings, scene: _Scene, kernel: float | None) -> Iterator[str]:
+def _assumed(film: Film, settings: FilmSettings, scene: Scene, kernel: float | None) -> Iterator[str]:
     """What was taken for granted, each with what follows where it is wrong."""
     spots = scene.spots
     yield (

@@ -9,7 +9,6 @@ import typer
 from typer.core import TyperGroup
 from typer.testing import CliRunner
 
-import aolink.cli  # noqa: F401 # its modules add the commands
 from aolink.cli.common import _BEFORE, _GONE, _GONE_OPTIONS, app
 from aolink.cli.films import _FILM, _TAKEN, film_file
 from aolink.errors import ImportingError

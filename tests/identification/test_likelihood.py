@@ -80,3 +80,15 @@ def test_an_exposure_that_is_missing_says_nothing(seen):
     spoilt = np.where(usable, seen.mean, 99.0)
     here = replace(seen, usable=usable)
     assert Likelihood(replace(here, mean=spoilt), 8)(MODEL) == Likelihood(here, 8)(MODEL)
+
+
+def test_whitened_means_are_innovations_of_unit_variance(seen):
+    """Where the model drew the readings they are white; a model of too little motion leaves more than that."""
+    truth = ProcessSum((Process("resonance", (12.0, 0.02, 0.2)),))
+    drawn = Likelihood(simulated(seen, truth, 60, seed=1), 8)
+    white = np.concatenate(drawn.whitened_means(truth))
+    assert white.var() == pytest.approx(1.0, abs=5 * np.sqrt(2 / len(white)) + 1 / drawn.seen.slots)
+    one_after = np.concatenate([each[1:] * each[:-1] for each in drawn.whitened_means(truth)])
+    assert abs(one_after.mean()) < 5 / np.sqrt(len(one_after))
+    quiet = ProcessSum((Process("resonance", (12.0, 0.02, 0.1)),))
+    assert np.concatenate(drawn.whitened_means(quiet)).var() > 2

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -10,6 +13,9 @@ from aolink.films.film import Film, array_film
 from aolink.importing.blurred import find_spots
 from aolink.importing.frames import FilmSettings
 from aolink.optics.kernel import pixel_masses
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
+from paper_report.strangers import draw
 
 FRAMES, SHAPE = 60, (48, 64)
 
@@ -82,3 +88,20 @@ def test_a_hot_pixel_is_no_spot() -> None:
     frames[:, 8, 50] = 4000
     found = find_spots(array_film(frames, "hot", rate_hz=50.0), FilmSettings(), FRAMES)
     assert len(found.corners) == 1
+
+
+@pytest.mark.slow
+def test_the_kernel_is_found_beside_shot_noise() -> None:
+    film = draw(5002)
+    found = find_spots(film.film, film.settings, FRAMES)
+    assert found.electrons > 0
+    assert found.sd == pytest.approx(film.sd, rel=0.1)
+
+
+def test_a_window_beyond_the_edge_is_dark_there() -> None:
+    found = find_spots(shaken(middles=((57.0, 24.6),), angle=np.pi / 2, amplitude=2.0), FilmSettings(), FRAMES)
+    side = found.light.shape[-1]
+    beyond = found.corners[0, 0] + np.arange(side) >= SHAPE[1]
+    assert beyond.any()
+    assert np.isfinite(found.light).all(), "sums over a window can be used"
+    assert not found.light[..., beyond].any()

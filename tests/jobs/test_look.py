@@ -6,19 +6,26 @@ import json
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from aolink.errors import ImportingError
+from aolink.estimation import Scorer
+from aolink.estimation.verdict import Fit, Verdict
 from aolink.films.film import array_film
-from aolink.importing.frames import FilmSettings
-from aolink.jobs.look import look
+from aolink.identification import readings
+from aolink.identification.models import Process, ProcessSum
+from aolink.importing.blurred import find_spots
+from aolink.importing.frames import FilmSettings, film_times
+from aolink.jobs.look import heeding, line_left, look
+from aolink.jobs.look_scene import Scene
 from aolink.jobs.look_words import paragraph
 from aolink.recording.reader import Recording
 from aolink.rig import load_rig, parse_rig
-from tests.importing.test_blurred import shaken
+from tests.importing.test_blurred import FRAMES, shaken
 
 RATE, EXPOSURE = 50.0, 0.67 / 37.3
 """With .67 cycles in an exposure and .746 from frame to frame: 37.3 Hz at 50 frames a second."""
@@ -45,6 +52,10 @@ def test_a_vibration_beyond_half_the_frame_rate_is_found_in_the_blur() -> None:
     assert error < 0.3
     assert x.held == pytest.approx(float(truth.std(axis=1).mean()), rel=0.1)
     parse_rig(looked.text)
+    # What is explained is not searched again.
+    assert not x.unexplained
+    film = shaken(angle=0.0)
+    assert look(film, FilmSettings(exposure_s=EXPOSURE), "shaken", thorough=True, before=looked).directions[0] is x
 
 
 @pytest.mark.slow
@@ -65,6 +76,39 @@ def test_a_film_without_motion_is_said_to_have_none() -> None:
     looked = look(shaken(amplitude=0.0), FilmSettings(exposure_s=EXPOSURE), "still")
     assert not looked.moves
     assert paragraph(looked).count("nothing moves by more than") == 2
+    # What the whole recording says of the rig file is a doubt, where it refuses it.
+    some = replace(Scorer().result(), estimated=60)
+    assert heeding(looked, replace(some, gated=6)).doubts == looked.doubts
+    (*_, doubt) = heeding(looked, replace(some, gated=7)).doubts
+    assert "7 of 60 frames do not fit the rig file" in doubt
+    wrong = Verdict(fit=Fit.DOES_NOT_FIT, where="in a ring about the spot", widening=1.4)
+    assert heeding(looked, replace(some, verdict=wrong)).doubts == looked.doubts
+    (*_, doubt) = heeding(looked, replace(some, verdict=replace(wrong, widening=1.6))).doubts
+    assert "give its width with --kernel" in doubt
+    assert "aolink calibrate" not in doubt
+
+
+@pytest.mark.slow
+def test_a_drift_is_no_vibration() -> None:
+    drift = np.stack([frame for k, frame in enumerate(shaken(amplitude=2.0, cycles=0.0, step=0.25 / FRAMES).frames())])
+    looked = look(array_film(drift, "drift"), FilmSettings(rate_hz=RATE, exposure_s=EXPOSURE), "drift")
+    (x, _) = looked.directions
+    assert x.moves
+    assert x.found is not None
+    assert "resonance" not in x.found.model.name
+
+
+@pytest.mark.slow
+def test_a_line_that_a_model_leaves_is_found_and_one_that_it_has_is_not() -> None:
+    film, settings = shaken(cycles=0.02, angle=0.0), FilmSettings(rate_hz=RATE, exposure_s=0.02 / 37.3)
+    spots = find_spots(film, settings, FRAMES)
+    seen = [readings(*Scene(film, spots, film_times(film, settings), RATE, 0.02 / 37.3, "x").along(0, 0, spots.sd))]
+    size = float(np.std(seen[0].mean))
+    walk = ProcessSum((Process("ornstein-uhlenbeck", (0.02, size)),))
+    left = line_left(seen, walk, RATE)
+    assert left == pytest.approx(RATE - 37.3, abs=0.5)
+    swing = ProcessSum((Process("resonance", (RATE - 37.3, 1e-3, size)),))
+    assert line_left(seen, swing, RATE) is None
 
 
 @pytest.mark.parametrize(
@@ -78,13 +122,14 @@ def test_what_the_film_does_not_say_is_asked_for(rate: float | None, exposure: f
 
 @pytest.mark.slow
 def test_the_command_writes_a_rig_file_a_recording_and_a_page(aolink: Run, tmp_path: Path) -> None:
-    np.savez(
-        tmp_path / "film.npz", frames=np.stack(list(shaken(angle=0.0).frames())), rate_hz=RATE, exposure_s=EXPOSURE
-    )
+    np.savez(tmp_path / "film.npz", frames=np.stack(list(shaken().frames())), rate_hz=RATE, exposure_s=EXPOSURE)
     done = aolink("look", "film.npz", "--quick", "--json")
     assert done.returncode == 0, done.stderr
     said = json.loads(done.stdout)
     assert any(low <= 37.3 <= high for low, high in said["directions"]["x"]["parameters"]["frequency_hz"]["set"])
+    # It moves aslant, and the smaller motion along y alone would leave the alias too.
+    ((low, high),) = said["directions"]["y"]["parameters"]["frequency_hz"]["set"]
+    assert low <= 37.3 <= high
     folder = tmp_path / "film-look"
     recording = Recording(folder / "film.mcap")
     assert recording.estimators == ["profile"]

@@ -18,10 +18,12 @@ from PIL import Image
 from typer.testing import CliRunner
 
 from aolink.cli.common import app
+from aolink.cli.tables.sessions import deblurred_lines
 from aolink.errors import RestorationError
 from aolink.films.film import array_film
 from aolink.films.formats import open_film
 from aolink.films.pictures import read_picture, read_psf, write_pictures
+from aolink.recording.deblur import RestoredCounts
 from aolink.restoration import restore
 from tests.restoration.scenes import UNIFORM, blocks, blurred
 
@@ -247,3 +249,8 @@ def test_a_motion_that_a_log_has_restores_as_its_psf_does(tmp_path: Path) -> Non
     assert np.sqrt(np.mean((np.load(tmp_path / "b.npy") - expected)[:, 4:-4] ** 2)) < 0.3 * np.std(picture - expected)
     wrong = CliRunner().invoke(app, ["deblur", *files, "--overwrite", "--offset", "20"])
     assert "give the right --offset or --exposure" in str(wrong.exception)
+
+
+def test_what_was_not_restored_is_not_counted() -> None:
+    done = RestoredCounts(exposures=3, spots=1)
+    assert deblurred_lines(done, "moments", "tv")[0].startswith("spots in 1 of 3 exposures restored")

@@ -13,7 +13,8 @@ from pathlib import Path
 import numpy as np
 
 from aolink.errors import AolinkError
-from aolink.jobs.look import LEAST_MOTION, Looked, look
+from aolink.jobs.look import Looked, look
+from aolink.jobs.look_scene import LEAST_MOTION
 from aolink.rig import parse_rig
 from paper_report.strangers import Stranger, draw
 
