@@ -97,17 +97,6 @@ def broken_assumptions(rig: Rig) -> Iterator[tuple[str, str]]:
             f" estimators were judged from {STEPS_IN_SWING} on: the model has no motion inside a step; make it shorter",
         )
 
-    if plant.wandering is not None and plant.wandering.parameter == "frequency":
-        between = swings[swings > 0] * timing.frame_period_steps / timing.exposure_steps
-        reach = 0.5 * plant.wandering.largest * between
-        for each in between[np.abs(between - np.round(2 * between) / 2) < reach]:
-            yield (
-                "plant.wandering",
-                f"an eigenmode of the plant swings {each:.3g} times from frame to frame, nearly a whole or half"
-                " number: a faster plant looks like a slower one there, and the frequency may be lost; leave the table"
-                " out",
-            )
-
 
 def _modes(rig: Rig) -> tuple[int, FloatArray]:
     """The number of eigenmodes that move the spot along one axis, an oscillation counting as one; and the swings of

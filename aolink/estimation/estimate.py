@@ -56,16 +56,6 @@ class AlignmentError:
 
 
 @dataclass(frozen=True, eq=False)
-class WanderingValue:
-    """A quantity that drifts, relative to the rig file's value."""
-
-    mean: FloatArray
-    """(axes,)"""
-    sd: FloatArray
-    """(axes,)"""
-
-
-@dataclass(frozen=True, eq=False)
 class Components:
     """The posterior of an exposure as a Gaussian mixture for each axis, of few coefficients t: z = expand t + a rest.
 
@@ -143,9 +133,6 @@ class Estimate:
     verdict: Verdict | None = field(default=None, compare=False)
     """Whether the model fits, by the exposures up to this one; None where that is not judged, and in older recordings.
     Where it does not fit, the covariances are those of the filter times ``verdict.widening`` squared."""
-    wandering: WanderingValue | None = field(default=None, compare=False)
-    """The drifting quantity, where the rig has ``plant.wandering`` and the estimator follows it; recordings do not have
-    it."""
 
     @cached_property
     def path(self) -> FloatArray:

@@ -42,11 +42,6 @@ class Estimator:
         # From the first exposure on that needs them, copies with inputs of later and of earlier fast steps, with the
         # share of a standard deviation in their shift.
 
-    @property
-    def shared(self) -> list[object]:
-        """The data that copies of the estimator share."""
-        return [self.rig, self.rig.plant, self.rig.sensor]
-
     def step(self, exposure: Exposure) -> Estimate:
         """The estimate of an exposure, from its frame and all earlier ones."""
         (estimate,) = self.steps(Batch(self.rig, [exposure]))
@@ -73,7 +68,8 @@ class Estimator:
                     if k:
                         yield from self.steps_as_aligned(Batch(self.rig, batch.exposures[:k]))
                         batch = Batch(self.rig, batch.exposures[k:])
-                    share, shared = share_of_shift(exposure, step_ns), {id(part): part for part in self.shared}
+                    share = share_of_shift(exposure, step_ns)
+                    shared = {id(part): part for part in (self.rig, self.rig.plant, self.rig.sensor)}
                     both = [(copy.deepcopy(self, dict(shared)), Shifted(each, step_ns)) for each in (share, -share)]
                     for copied, _ in both:
                         copied.judge = None

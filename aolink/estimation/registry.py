@@ -59,8 +59,6 @@ class EstimatorRow:
     """A function that gives the reason why it cannot work on a rig, and what to use instead; None where it can."""
     engines: tuple[Engine, ...] = ("aolink",)
     """Engines that it can run on."""
-    wanders: bool = False
-    """Whether it follows a plant with ``plant.wandering``; it has to model the noise inside an exposure."""
     loops: Callable[[Rig], tuple[str, ...]] = lambda rig: ()
     """The groups of compiled loops (`compiled.GROUPS`) that it needs on a rig, beside those that all need."""
 
@@ -125,22 +123,15 @@ def make_estimator(rig: Rig, name: str, **options: Any) -> Estimator:
 
     make_ready(*_shared_loops(rig), *row.loops(rig))
 
-    def made(rig: Rig) -> Estimator:
-        # Code that the first exposure would load or compile is ready before the session.
-        steps = rig.window_steps
-        try:
-            exposure_model(rig.plant, steps, rig.timing.exposure_offset).response(np.ones((steps, rig.n_inputs)))
-            return Estimator(rig, name, row.build(rig, chosen))
-        except (ArithmeticError, ValueError) as error:  # a LinAlgError is a ValueError
-            raise EstimatorError(
-                f"{name} cannot compute with this rig: {error}; are its numbers too large or too small?"
-            ) from error
-
-    if rig.plant.wandering is None or not row.wanders:
-        return made(rig)
-    from aolink.estimation.wandering import WanderingEstimator  # its imports take long
-
-    return WanderingEstimator(rig, made)
+    # Code that the first exposure would load or compile is ready before the session.
+    steps = rig.window_steps
+    try:
+        exposure_model(rig.plant, steps, rig.timing.exposure_offset).response(np.ones((steps, rig.n_inputs)))
+        return Estimator(rig, name, row.build(rig, chosen))
+    except (ArithmeticError, ValueError) as error:  # a LinAlgError is a ValueError
+        raise EstimatorError(
+            f"{name} cannot compute with this rig: {error}; are its numbers too large or too small?"
+        ) from error
 
 
 def _many_spots_refusal(rig: Rig, name: str = "moments") -> str | None:
@@ -209,15 +200,14 @@ _OURS = {
         EstimatorRow(name="o3", rank=30, colour=(240, 110, 50), build=_built("paper", 1, 2), engines=_PAPER_ENGINES),
         EstimatorRow(
             name="moments", rank=40, colour=(0, 175, 125), build=_built("moments"), refusal=_many_spots_refusal,
-            wanders=True,
         ),
         EstimatorRow(
             name="profile", rank=50, colour=(140, 210, 80), build=_built("profile"),
-            refusal=_pixels_refusal("profile"), loops=_pixels_loops, wanders=True,
+            refusal=_pixels_refusal("profile"), loops=_pixels_loops,
         ),
         EstimatorRow(
             name="sampled", rank=70, colour=(190, 130, 80), build=_built("sampled"),
-            refusal=_pixels_refusal("sampled"), loops=_pixels_loops, wanders=True,
+            refusal=_pixels_refusal("sampled"), loops=_pixels_loops,
         ),
     )
 }  # fmt: skip

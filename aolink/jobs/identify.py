@@ -187,7 +187,7 @@ def _of_output(
     everything = tops = list(known) or identification.maxima(of, seen)
     x = tops[0].x
     left_hz: dict[int, list[tuple[float, float]]] = {}
-    if wanted.pixels and rig.plant.n_outputs == 1 and rig.plant.axes <= _BY_PIXELS and rig.plant.wandering is None:
+    if wanted.pixels and rig.plant.n_outputs == 1 and rig.plant.axes <= _BY_PIXELS:
 
         def rig_of(x: FloatArray) -> Rig:
             return _with_model(rig, of, x)

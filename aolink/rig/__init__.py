@@ -16,8 +16,6 @@ from aolink.rig.parts import (
     Plant,
     Simulation,
     Timing,
-    Wandering,
-    Wanders,
     parse_light,
 )  # fmt: skip
 from aolink.rig.sensor_tables import CalibrationTable
@@ -25,6 +23,6 @@ from aolink.rig.tables import with_faults
 
 __all__ = [
     "CalibrationTable", "Control", "Drive", "Faults", "Kernel", "Light", "MirrorDriver", "Plant", "Rig", "Sensor",
-    "Simulation", "SpotSensor", "Timing", "Wandering", "Wanders", "builtin_rigs", "load_rig", "parse_light",
+    "Simulation", "SpotSensor", "Timing", "builtin_rigs", "load_rig", "parse_light",
     "parse_rig", "with_faults",
 ]  # fmt: skip

@@ -16,7 +16,7 @@ from aolink.numerics.arrays import FloatArray
 from aolink.numerics.block_diagonal import stationary_covariance
 from aolink.optics.lenslets import Lenslets
 from aolink.optics.mirror import Membrane, mirror_plant, second_order, square_pads
-from aolink.rig.parts import Plant, Wandering, read_wandering
+from aolink.rig.parts import Plant
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,7 +105,6 @@ class _Mirror:
     drift_s: Positive | None = None
     """Time in which the inputs' drift falls to 1/e, s."""
     unmodelled: Any = None
-    wandering: Annotated[Wandering | None, read_wandering] = None
 
     def plant(self, slopes: FloatArray, fast_step_s: float) -> Plant:
         """The plant, from slopes for each input at rest, (outputs, inputs)."""
@@ -116,7 +115,7 @@ class _Mirror:
         return Plant(
             A=model.A, B=model.B, B_w=model.B_w, C=model.C, process_noise=W, initial_mean=np.zeros(len(model.A)),
             initial_covariance=stationary_covariance(model.A, model.B_w @ W @ model.B_w.T),
-            unmodelled=self.unmodelled, wandering=self.wandering,
+            unmodelled=self.unmodelled,
         )  # fmt: skip
 
 

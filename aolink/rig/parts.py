@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Any, Literal
 
 import numpy as np
 
 from aolink.errors import RigError
-from aolink.keys import Count, NotNegative, Positive, Shape, Share, Within, as_it_is, checked, read
+from aolink.keys import Count, NotNegative, Positive, Shape, Share, Within, as_it_is, checked
 from aolink.numerics.arrays import FloatArray
 from aolink.optics.mirror import VoltageLaw
 
@@ -45,44 +45,6 @@ class UnmodelledSlopes:
         return self.sd**2 * share, self.sd**2 * (1 - share)
 
 
-Wanders = Literal["frequency", "gain", "process_noise", "kernel_width", "sensor_noise"]
-"""Quantities that may drift: all frequencies of the plant, its response to inputs, the standard deviation of its noise,
-the width of the kernel, the standard deviation of the camera's read-out noise."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Wandering:
-    """The drift of one quantity from the rig file's value by a factor: which quantity, how far and how fast."""
-
-    parameter: Wanders
-    largest: float
-    """Largest relative increase; the largest decrease is by the same factor."""
-    rate_per_minute: float
-    """Standard deviation of the relative change in a minute; the drift is a random walk."""
-
-
-# The largest changes that estimators follow: a plant that differs more from its matrices should be identified.
-@dataclass(frozen=True, kw_only=True)
-class _Drifts:
-    rate_per_minute: Positive
-    """Standard deviation of the relative change in a minute; of the others one, the largest relative change."""
-    frequency: Annotated[float, Within(above=0.0, high=0.2)] | None = None
-    gain: Annotated[float, Within(above=0.0, high=0.5)] | None = None
-    process_noise: Annotated[float, Within(above=0.0, high=3.0)] | None = None
-    kernel_width: Annotated[float, Within(above=0.0, high=0.5)] | None = None
-    sensor_noise: Annotated[float, Within(above=0.0, high=3.0)] | None = None
-
-
-def read_wandering(values: Any, key: str) -> Wandering:
-    """Read the table ``[plant.wandering]``. Raises `RigError`."""
-    rate = read(_Drifts, values, key).rate_per_minute
-    given = [name for name in get_args(Wanders) if name in values]
-    if len(given) != 1:
-        found = " and ".join(given) or "nothing that drifts"
-        raise RigError(f"{key} has {found}: give one of {', '.join(get_args(Wanders))}")
-    return Wandering(parameter=given[0], largest=float(values[given[0]]), rate_per_minute=rate)
-
-
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Plant:
     """The fast-rate plant, x(k+1) = A x(k) + B u(k) + B_w w(k), theta(k) = C x(k)  (Mishra & Wen (1)).
@@ -108,8 +70,6 @@ class Plant:
     """Number of independent copies."""
     unmodelled: Annotated[UnmodelledSlopes | None, as_it_is] = None
     """The estimators' model of slopes beside C x(k), as a fitting error and turbulence; None for no such slopes."""
-    wandering: Annotated[Wandering | None, read_wandering] = None
-    """The drift that estimators follow; None for none."""
     disturbance_states: int = 0
     """Number of the last states, which are those of the disturbance's model and which no input reaches."""
     delays: tuple[int, ...] = ()

@@ -113,16 +113,6 @@ def test_how_many_frames_will_show_no_spot_is_what_they_do(noise_density: str) -
     assert unseen == pytest.approx(count * sum(said) / 100, abs=3 * math.sqrt(count * 0.15 * 0.85))
 
 
-@pytest.mark.parametrize(("swings", "warned"), [(1.0, True), (1.49, True), (1.3, False)])
-def test_a_frequency_that_is_an_alias_of_its_neighbours_is_not_to_wander(swings: float, warned: bool) -> None:
-    text = re.sub(r"(?m)^A = .*", f"A = {swinging(2 * math.pi * swings / 200)}", SECTION_VI)
-    rig = parse_rig(
-        text.replace("[sensor]", "[plant.wandering]\nfrequency = 0.05\nrate_per_minute = 0.01\n\n[sensor]", 1)
-    )
-    said = [f.message for f in check_rig(rig) if f.key == "plant.wandering"]
-    assert [f"swings {swings:g} times from frame to frame" in each for each in said] == [True] * warned
-
-
 def test_the_numbers_that_a_rig_comes_to_are_stated() -> None:
     """By hand for section-vi: sd of the kernel sigma/sqrt(2), noise sqrt(V/D), peak erf(D/2/sigma)/D = 10.41."""
     info = found("info")
