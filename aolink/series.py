@@ -30,13 +30,6 @@ _READ_THROUGH = 32
 """Exposures between two wanted ones that are read and left out: to begin anew behind them would take longer."""
 
 
-_RENAMED = {
-    "iter_estimates": "walk([name])", "with_estimates": "walk(names)", "timed_exposures": "steps()",
-    "skipped": "steps([name]), by Step.skipped,",
-}  # fmt: skip
-"""What does the same as a method of earlier versions."""
-
-
 @dataclass(eq=False, slots=True)
 class Step:
     """An exposure of a series with what belongs to it."""
@@ -110,12 +103,6 @@ class Series(Sequence[Exposure]):
     def has_truth(self) -> bool:
         """Whether the truth is known, for some exposures at least."""
         return self.source.has_truth
-
-    if not TYPE_CHECKING:  # the type checker would accept any name
-
-        def __getattr__(self, name: str) -> Any:
-            more = f": {_RENAMED[name]} gives the same" if name in _RENAMED else ""
-            raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}{more}")
 
     def __len__(self) -> int:
         return len(self.numbers)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.markup import escape
 
-from aolink.cli.common import JsonOption, KeyOption, OverwriteOption, app, local_file, progress, stderr, stdout
+from aolink.cli.common import JsonOption, OverwriteOption, app, local_file, progress, stderr, stdout
 from aolink.cli.terminal import ask, progress_bar
 from aolink.errors import AolinkError, CalibrationError
 from aolink.files import check_target, writing
@@ -47,7 +47,6 @@ def calibrate(
         str | None, typer.Option(metavar="PORT", help="Port of the camera, to record the frames now.")
     ] = None,
     mirror: Annotated[str | None, typer.Option(metavar="PORT", help="Port of the mirror.")] = None,
-    key: KeyOption = None,
     measure: Annotated[
         str,
         typer.Option(

@@ -13,7 +13,7 @@ import typer
 from typer.core import TyperGroup
 
 from aolink.cli.terminal import PlainConsole, progress_bar
-from aolink.errors import EstimatorError, PortError, RigError
+from aolink.errors import EstimatorError, RigError
 
 if TYPE_CHECKING:
     from aolink.estimation import Score
@@ -21,56 +21,6 @@ if TYPE_CHECKING:
     from aolink.recording.reader import Recording
     from aolink.recording.remote import Url
     from aolink.rig import Rig
-
-
-_GONE = {
-    "cut": "copy FILE --start S --end S -o PART.mcap", "merge": "copy FILE FILE... -o SESSION.mcap",
-    "recover": "copy FILE -o WHOLE.mcap", "plot": "report FILE --figure NAME -o X.pdf",
-}  # fmt: skip
-"""What does the same as a command of the release before."""
-
-_IN_PYTHON = "set in Python: aolink.record(..., options=WriteOptions(...))"
-
-
-def _films(*forms: str) -> dict[str, str]:
-    return {f"--{form.partition('=')[0].replace('_', '-')}": f"--film {form}" for form in forms}
-
-
-_GONE_OPTIONS = {
-    "record": dict.fromkeys(("--compression", "--chunk-kib", "--flush-s", "--fsync-s", "--split-mib"), _IN_PYTHON),
-    "replay": {
-        "--to-rig": "aolink record --rig RIG.toml --input SESSION.mcap -o AGAIN.mcap", "--rate": "--speed X",
-        "--start": "aolink copy FILE --start S -o PART.mcap", "--end": "aolink copy FILE --end S -o PART.mcap",
-    },
-    "calibrate": {
-        "--frames": "--measure frames:count=100", "--interaction": "--measure interaction",
-        "--poke": "--measure interaction:poke=0.1", "--repeats": "--measure interaction:repeats=2",
-        "--hold": "--measure interaction:hold_s=1", "--row-time": "--measure row-time:blink_hz=HZ",
-        "--keep": "without an option: the recordings are kept",
-    },
-    "estimate": {
-        "--engine": "-e o1:engine=filterpy", "--only": "-o DIR/, whose side files have the new estimates alone",
-    },
-    "look": _films("invert", "gamma=2.2", "topic=NAME", "colour=red"),
-    "import": _films(
-        "invert", "gamma=2.2", "topic=NAME", "colour=red", "background", "scale=COUNTS", "start=DATE", "row_time=S"
-    ),
-    "rig": _films("invert", "gamma=2.2", "topic=NAME"),
-    "identify": {
-        "--noise": "--fit noise", "--kernel": "--fit kernel", "--plant": "--fit first-order, or --fit second-order",
-    },
-    "view": {
-        "--screenshot": "-o X.png", "--exposure": "--frame N", "--start": "aolink copy FILE --start S -o PART.mcap",
-        "--end": "aolink copy FILE --end S -o PART.mcap",
-    },
-    "slopes": {"--rrd": "-o X.rrd"},
-    "compare": {"--relative": "--tolerance RELATIVE", "--absolute": "--tolerance RELATIVE,ABSOLUTE"},
-    "report": {"--steps": "without an option: time is in seconds", "--exposure": "--frame N"},
-    "demo": {"--seed": "aolink sim RIG --seed N, with aolink record", "--real-time": "aolink sim RIG --real-time"},
-}  # fmt: skip
-"""What does the same as an option of the release before, by command."""
-_BEFORE = {"view": {"--save": "--output"}, "deblur": {"--out": "--output"}, "demo": {"--out": "--output"}}
-"""Names of the release before that options still have, by command; their help has one."""
 
 
 _GROUPS = {
@@ -91,15 +41,6 @@ class _Commands(TyperGroup):
         return [name for names in _GROUPS.values() for name in names]
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        if args and args[0] in _GONE:
-            raise typer.BadParameter(f"{args[0]} is now: aolink {_GONE[args[0]]}")
-        gone, before = (table.get(args[0], {}) if args else {} for table in (_GONE_OPTIONS, _BEFORE))
-        for at, each in enumerate(args[1:], 1):
-            name, equals, value = each.partition("=")
-            if name in gone:
-                raise typer.BadParameter(f"{name} is now {gone[name]}")
-            if name in before:
-                args[at] = f"{before[name]}{equals}{value}"
         found = super().resolve_command(ctx, args)
         parameters: list[Any] = found[1].get_params(ctx) if found[1] is not None else []
         for parameter in parameters:
@@ -148,16 +89,6 @@ EstimatorOption = Annotated[
 ]
 
 
-def _no_signing(option: typer.CallbackParam, value: str | bool | None) -> None:
-    if value not in (None, False):
-        from aolink.wire.packet import NO_SIGNING
-
-        raise PortError(f"{'/'.join(option.opts)}: {NO_SIGNING}")
-
-
-KeyOption = Annotated[str | None, typer.Option("--key", hidden=True, callback=_no_signing)]
-RemoteOption = Annotated[bool, typer.Option("--allow-remote", "--unsigned", hidden=True, callback=_no_signing)]
-"""Options of the last release, which are refused with what does the same now."""
 OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace the target file if it exists.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON for scripts.")]
 

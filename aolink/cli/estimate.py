@@ -46,8 +46,6 @@ def estimate(
         typer.Option("--set", metavar="KEY=VALUE,...", help="Change a key of the rig file; each value makes a model."),
     ] = None,
     jobs: Annotated[int, typer.Option(min=1, metavar="N", help="How many recordings to estimate at once.")] = 1,
-    side: Annotated[bool, typer.Option("--side", hidden=True)] = False,
-    parquet: Annotated[bool, typer.Option("--parquet", hidden=True)] = False,
     table: Annotated[
         Path | None,
         typer.Option(
@@ -71,18 +69,16 @@ def estimate(
     A file that fails does not stop the others (exit code 1). Exit code 6 if no exposure gave a measurement.
     """
     output, is_folder = (Path(target), target.endswith("/") or Path(target).is_dir()) if target else (None, False)
-    if parquet:
-        raise typer.BadParameter("--table X.parquet writes the table as Parquet")
     if scheduler and jobs > 1:
         raise typer.BadParameter("--jobs is for this machine: with --scheduler its workers do the work")
     _check_names(estimator or [])
     models = batch_models(rig, settings)
-    if not (side or is_folder or table or shard or scheduler) and len(files) == 1 and len(models) == 1:
+    if not (is_folder or table or shard or scheduler) and len(files) == 1 and len(models) == 1:
         if jobs > 1:
             raise typer.BadParameter("--jobs is for many files or models, with -o DIR/")
         _estimate_one(files[0], models[0], estimator, output, overwrite=overwrite, as_json=as_json)
         return
-    if output is None or (output.suffix == ".mcap" and not is_folder and not side):
+    if output is None or (output.suffix == ".mcap" and not is_folder):
         raise typer.BadParameter("many files or models need -o DIR: a folder for the results")
     from aolink.estimation.registry import DEFAULT_ESTIMATOR
     from aolink.jobs import batch
@@ -218,14 +214,13 @@ def _estimate_one(
     from aolink.recording.reestimate import (
         check_has_exposures,
         kept_estimators,
-        own_estimators,
         scored_and_compared,
         write_reestimated,
     )
 
     recording = common.say_damage(model.applied_to(Recording(file)))
     check_has_exposures(recording)
-    names = list(dict.fromkeys(estimator or own_estimators(recording, warn) or [DEFAULT_ESTIMATOR]))
+    names = list(dict.fromkeys(estimator or recording.estimators or [DEFAULT_ESTIMATOR]))
     try:
         common.get_ready(recording.rig, names)
         with progress("estimate", recording.n_frames) as tell:

@@ -18,7 +18,6 @@ if TYPE_CHECKING:
 RateOption = Annotated[
     float | None, typer.Option("--rate", metavar="HZ", help="Frames a second, where the film does not state them.")
 ]
-SumOption = Annotated[int | None, typer.Option("--sum", metavar="K", min=1, hidden=True)]
 TrackOption = Annotated[
     int,
     typer.Option(
@@ -79,10 +78,10 @@ class FilmFile(NamedTuple):
         return film if self.colour is None else one_colour(film, self.colour)
 
 
-def film_file(options: list[str] | None, command: str, frames: int | None = None) -> FilmFile:
-    """What the options --film of a command say, and its --sum. Raises ImportingError for what they cannot say."""
+def film_file(options: list[str] | None, command: str) -> FilmFile:
+    """What the options --film of a command say. Raises ImportingError for what they cannot say."""
     forms = {form.partition("=")[0]: form for form in list(_FILM)[: _TAKEN[command]]}
-    found: dict[str, Any] = {"frames_per_exposure": frames or 1}
+    found: dict[str, Any] = {"frames_per_exposure": 1}
     for each in (part for text in options or () for part in text.split(",")):
         name, equals, value = each.partition("=")
         if name not in forms:
@@ -168,7 +167,6 @@ def import_(
     exposure: Annotated[
         float | None, typer.Option(metavar="S", help="Exposure time of a frame, s, where the film lacks it.")
     ] = None,
-    frames: SumOption = None,
     track: TrackOption = 0,
     at: AtOption = None,
     film: FilmOfImport = None,
@@ -179,7 +177,7 @@ def import_(
     from aolink.importing.recording import import_film
     from aolink.rig import load_rig
 
-    how = film_file(film, "import", frames)
+    how = film_file(film, "import")
     settings, loaded, shown = film_settings(rate, track, at, how, exposure), load_rig(rig), how.open(source)
     with progress("import", shown.count // settings.frames_per_exposure) as tell:
         account = import_film(

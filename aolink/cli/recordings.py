@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from aolink.cli import common
-from aolink.cli.common import JsonOption, OutputOption, OverwriteOption, app, open_recording, progress, stdout, warn
+from aolink.cli.common import JsonOption, OutputOption, OverwriteOption, app, open_recording, progress, stdout
 from aolink.errors import RecordingError
 
 if TYPE_CHECKING:
@@ -82,13 +82,13 @@ def compare(
     from aolink.recording import topics
     from aolink.recording.compare import compare as compare_recordings
     from aolink.recording.compare import first_parting, is_wanted
-    from aolink.recording.reestimate import Reestimated, own_estimators
+    from aolink.recording.reestimate import Reestimated
     from aolink.recording.side_files import check_is_side_of
 
     relative, absolute = _tolerances(tolerance)
     one = open_recording(first)
     if second is None:
-        two: Recording = Reestimated(one, own_estimators(one, warn))
+        two: Recording = Reestimated(one, one.estimators)
         if not (topic := [each for each in two.counts if is_wanted(each, topic or ())]):
             raise RecordingError(f"{first} holds no such estimates to make again: give a second recording")
     else:

@@ -67,7 +67,6 @@ def deblur(
             help="The estimator whose path is used, by default moments; it is run if it was not.",
         ),
     ] = None,
-    image: Annotated[Path | None, typer.Option("--image", hidden=True)] = None,
     psf: Annotated[
         Path | None,
         typer.Option(
@@ -108,14 +107,14 @@ def deblur(
     from aolink.restoration.registry import DEFAULT_METHOD
 
     method = method or DEFAULT_METHOD
-    source, blur = image or file, psf or path
-    if source is None or (image and file) or (psf and path) or ((image or noise_sd) and not blur):
+    blur = psf or path
+    if file is None or (psf and path) or (noise_sd and not blur):
         raise typer.BadParameter("give a recording alone, or a picture with --psf or --path (--noise-sd is for these)")
     if blur is None:
-        _deblur_recording(source, out, estimator or DEFAULT_ESTIMATOR, method, overwrite=overwrite, as_json=as_json)
+        _deblur_recording(file, out, estimator or DEFAULT_ESTIMATOR, method, overwrite=overwrite, as_json=as_json)
     else:
         clock = PathClock(offset, exposure) if psf is None else None
-        _deblur_pictures(source, blur, clock, out, method, noise_sd, overwrite=overwrite, as_json=as_json)
+        _deblur_pictures(file, blur, clock, out, method, noise_sd, overwrite=overwrite, as_json=as_json)
 
 
 def _deblur_recording(

@@ -12,8 +12,8 @@ import typer
 from rich.markup import escape
 
 from aolink.cli import common, films
-from aolink.cli.common import JsonOption, KeyOption, OverwriteOption, RigArgument, app, load_checked, program, stdout
-from aolink.cli.films import AtOption, FilmOfRig, RateOption, SumOption, TrackOption
+from aolink.cli.common import JsonOption, OverwriteOption, RigArgument, app, load_checked, program, stdout
+from aolink.cli.films import AtOption, FilmOfRig, RateOption, TrackOption
 from aolink.cli.terminal import input_ended
 from aolink.errors import AolinkError, RigError
 from aolink.files import check_target, writing
@@ -46,7 +46,6 @@ def rig(
         ),
     ] = None,
     rate: RateOption = None,
-    frames: SumOption = None,
     track: TrackOption = 0,
     at: AtOption = None,
     film: FilmOfRig = None,
@@ -62,7 +61,7 @@ def rig(
         return
     _check_goes_with(context, source)
     if source is not None:
-        path, how = Path(rig or f"{source.stem}.toml"), films.film_file(film, "rig", frames)
+        path, how = Path(rig or f"{source.stem}.toml"), films.film_file(film, "rig")
         _write_first_rig(path, source, how, films.film_settings(rate, track, at, how), overwrite)
         return
     if not rig:
@@ -142,8 +141,6 @@ def sim(
     listen: Annotated[
         str | None, typer.Option(metavar="HOST:PORT", help="Serve TCP ports, to this machine only, not terminals.")
     ] = None,
-    key: KeyOption = None,
-    allow_remote: common.RemoteOption = False,
     light: Annotated[
         str | None,
         typer.Option(
@@ -199,7 +196,6 @@ def devices(
     ports: Annotated[
         list[str] | None, typer.Argument(metavar="[PORT]...", help="Ports whose devices to identify.")
     ] = None,
-    key: KeyOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """List the serial ports and the drivers of this machine with their devices, or identify the devices behind

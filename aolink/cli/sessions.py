@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from aolink.cli import common
-from aolink.cli.common import EstimatorOption, JsonOption, KeyOption, app, get_ready, program, progress, stdout, warn
+from aolink.cli.common import EstimatorOption, JsonOption, app, get_ready, program, progress, stdout, warn
 from aolink.cli.terminal import progress_bar
 from aolink.errors import EstimatorError
 from aolink.signals import Interrupted, StopRequest
@@ -50,7 +50,6 @@ def record(
         ),
     ] = None,
     mirror: Annotated[str | None, typer.Option(metavar="PORT", help="Port of the mirror, likewise.")] = None,
-    key: KeyOption = None,
     estimator: EstimatorOption = None,
     exposures: Annotated[
         int | None, typer.Option(min=1, max=MOST_EXPOSURES, metavar="N", help="How many exposures.")
@@ -226,10 +225,9 @@ def replay(
     Exposures that an estimator skipped in the session are skipped again; `aolink estimate` skips none.
     """
     from aolink.estimation.registry import DEFAULT_ESTIMATOR
-    from aolink.recording.reestimate import own_estimators
 
     recording = common.open_recording(file)
-    names = list(dict.fromkeys(estimator or own_estimators(recording, common.warn) or [DEFAULT_ESTIMATOR]))
+    names = list(dict.fromkeys(estimator or recording.estimators or [DEFAULT_ESTIMATOR]))
     get_ready(recording.rig, names)
     if control:
         if view or speed:

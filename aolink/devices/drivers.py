@@ -15,13 +15,10 @@ from aolink.extensions import installed, loaded
 from aolink.keys import shown
 from aolink.rig import Rig
 from aolink.rig.device_tables import DeviceTable
-from aolink.wire.packet import NO_SIGNING
 from aolink.wire.port import check_address
 
 DeviceKind = Literal["camera", "mirror"]
 KINDS: tuple[DeviceKind, ...] = get_args(DeviceKind)
-_GONE = {"basler": "aravis opens GigE and USB3 Vision cameras, micromanager those that Micro-Manager knows"}
-"""Drivers of earlier versions, and what opens their devices now."""
 NATIVE = "native"
 """The driver of devices that speak aolink's packets; its only key is ``port``."""
 
@@ -97,8 +94,6 @@ def _called(hint: Any, article: str = "a ", plural: str = "") -> str:
 
 def native_port(kind: DeviceKind, table: DeviceTable) -> str:
     """The port of a native device. Raises PortError where it cannot be one, and RigError for other keys."""
-    if "key" in table.options:
-        raise RigError(f"devices.{kind}.key: {NO_SIGNING}")
     port = table.options.get("port")
     if not isinstance(port, str) or len(table.options) > 1 or table.delay:
         raise RigError(
@@ -123,8 +118,6 @@ def calling(kind: str, when: str) -> Iterator[None]:
 def load_driver(kind: DeviceKind, name: str) -> Callable[..., Any]:
     """The class of a driver. Raises DeviceError where there is none of this name, or it cannot be loaded."""
     point = _others(kind).get(name)
-    if name in _GONE and point is None:
-        raise DeviceError(f"the {kind} driver {name} is no more: {_GONE[name]}")
     if point is None:
         raise DeviceError(
             f"there is no {kind} driver {name}, there is {', '.join(driver_names(kind))}: install the package that"

@@ -10,7 +10,7 @@ from aolink.rig import Rig
 from aolink.wire import messages_pb2 as pb
 from aolink.wire.hub import Hub
 from aolink.wire.link import Link
-from aolink.wire.packet import NO_SIGNING, PROTOCOL_VERSION, SIGNED_VERSION, schema_hash
+from aolink.wire.packet import PROTOCOL_VERSION, schema_hash
 
 _LONGEST_NAME = 200
 
@@ -46,10 +46,9 @@ def identify(hub: Hub, link: Link, nonce: int) -> pb.Identity:
             " does another host have it?"
         )
     if identity is None or found != PROTOCOL_VERSION:
-        update = f"update the {'device' if found < PROTOCOL_VERSION else 'host'}"
         raise DeviceError(
             f"the device on the {link.name} port speaks protocol version {found}, this aolink speaks"
-            f" {PROTOCOL_VERSION}: {NO_SIGNING if found == SIGNED_VERSION else update}"
+            f" {PROTOCOL_VERSION}: update the {'device' if found < PROTOCOL_VERSION else 'host'}"
         )
     if identity.schema_hash != schema_hash():
         raise DeviceError(

@@ -131,7 +131,7 @@ class Estimate:
     """The mixture's components, where the estimator carries a mixture; recordings do not have them. `smooth` uses
     them."""
     verdict: Verdict | None = field(default=None, compare=False)
-    """Whether the model fits, by the exposures up to this one; None where that is not judged, and in older recordings.
+    """Whether the model fits, by the exposures up to this one; None where that is not judged.
     Where it does not fit, the covariances are those of the filter times ``verdict.widening`` squared."""
 
     @cached_property

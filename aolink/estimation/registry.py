@@ -34,9 +34,6 @@ DEFAULT_ESTIMATOR = "moments"
 """The estimator where one is needed and none is named: also for a controller, as it takes milliseconds an exposure."""
 BASELINE_ESTIMATOR = "o1"
 """The estimator that others are compared with: it takes the centroid of a blurred spot alone."""
-RETIRED = {"mixture": "profile"}
-"""Estimators of earlier versions, each with the one to use instead. Recordings that hold their estimates are still read
-and shown."""
 # Spots of one copy of the plant, by `moments`.
 _MOST_SPOTS = 128
 _LOADED_BYTES = 384 << 20
@@ -66,15 +63,7 @@ class EstimatorRow:
 def estimator_row(name: str) -> EstimatorRow:
     """The row of an estimator, whose name may have its options. Raises EstimatorError if there is none, or if the
     package that has it is broken."""
-    if reason := retired(name):
-        raise EstimatorError(reason)
     return row_named(name.partition(":")[0], _OURS, GROUP, "estimator", EstimatorError)
-
-
-def retired(name: str) -> str:
-    """What to use instead of an estimator that earlier versions had; empty for all others."""
-    plain = name.partition(":")[0]
-    return f"{plain} is an estimator of earlier versions: use {RETIRED[plain]}" if plain in RETIRED else ""
 
 
 def estimator_rows() -> tuple[EstimatorRow, ...]:

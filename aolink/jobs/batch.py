@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import json
 import re
 import tomllib
 from collections import deque
@@ -14,7 +13,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from aolink.errors import AolinkError, RecordingError, RigError
+from aolink.errors import AolinkError, RigError
 from aolink.exporting.common import Progress, no_progress
 from aolink.files import remove_unfinished
 from aolink.jobs.tables import COLUMNS
@@ -102,14 +101,7 @@ def jobs(
     ------
     RigError
         Two would write the same file.
-    RecordingError
-        The folder has the copies that batches of earlier versions wrote.
     """
-    if any(map(_is_record_of_a_copy, folder.glob("*.json"))):
-        raise RecordingError(
-            f"{folder} has copies of recordings from a batch of an earlier aolink: give another folder, and the same"
-            " command estimates them again, into side files"
-        )
     made = {}
     for source, model, name in itertools.product(dict.fromkeys(sources), each, dict.fromkeys(estimators)):
         suffix = re.sub(r"[^\w=.-]", "-", model.name.replace("plant.", ""))
@@ -223,14 +215,6 @@ def _numerically(text: str) -> list[tuple[str, float]]:
     """A key that sorts texts with numbers in them by the numbers: 5 before 10, and 1e-05 before both."""
     parts = _NUMBERS.split(text)
     return [(words, float(number)) for words, number in zip(parts[::2], [*parts[1::2], "-inf"], strict=True)]
-
-
-def _is_record_of_a_copy(path: Path) -> bool:
-    """Whether a file is what batches of earlier versions wrote beside each copy."""
-    try:
-        return bool({"digest", "rows"} <= json.loads(path.read_text()).keys())
-    except (OSError, ValueError, AttributeError):
-        return False
 
 
 def do(job: Job, version: str) -> Done:

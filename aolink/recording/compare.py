@@ -93,8 +93,7 @@ def compare(
     Parameters
     ----------
     only:
-        Topics to compare; all if none is given. One that ends with "/" means all that begin with it, and a former name
-        the topic that has another now.
+        Topics to compare; all if none is given. One that ends with "/" means all that begin with it.
     relative_to_start:
         Count exposures and fast steps from the first of each recording, and leave out clock times: in two sessions of
         one rig they differ.
@@ -104,8 +103,7 @@ def compare(
     RecordingError
         Neither recording has any of the topics; or messages without a counterpart do not fit on the disk.
     """
-    wanted = [*only, *(topics.FORMER_TOPICS[each] for each in only if each in topics.FORMER_TOPICS)]
-    names = {topic for recording in (first, second) for topic in recording.counts if is_wanted(topic, wanted)}
+    names = {topic for recording in (first, second) for topic in recording.counts if is_wanted(topic, only)}
     if not names:
         asked = f" of {', '.join(only)}" if only else ""
         raise RecordingError(f"there is nothing{asked} to compare in {first.path} and {second.path}")

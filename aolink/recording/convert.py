@@ -170,34 +170,23 @@ def correlated(covariance: NDArray[np.float64]) -> bytes:
     return b"".join(blocks) + frame.flush()
 
 
-def is_compressed(data: bytes, axes: int, n: int, *, correlations: bool) -> bool:
-    """Whether bytes declare such matrices of this size, and memory has room for them.
-
-    Parameters
-    ----------
-    correlations:
-        Whether they are those of `correlated`; otherwise an older version's, which are in single precision.
-    """
+def is_compressed(data: bytes, axes: int, n: int) -> bool:
+    """Whether bytes declare the matrices of `correlated` of this size, and memory has room for them."""
     try:
         size = zstandard.get_frame_parameters(data).content_size
     except zstandard.ZstdError:
         return False
-    expected = axes * (4 * n + 3 * (n * (n - 1) // 2)) if correlations else 2 * axes * n * (n + 1)
-    return 8 * axes * n * n <= limits().chunk_bytes and size == expected
-
-
-def _decompressed(data: bytes, axes: int, n: int, *, correlations: bool) -> NDArray[np.uint8]:
-    try:
-        if is_compressed(data, axes, n, correlations=correlations):
-            return np.frombuffer(zstandard.decompress(data), np.uint8)
-    except zstandard.ZstdError:
-        pass
-    raise RecordingError("an estimate in the file has the wrong size: the file is damaged") from None
+    return 8 * axes * n * n <= limits().chunk_bytes and size == axes * (4 * n + 3 * (n * (n - 1) // 2))
 
 
 def decoded(data: bytes, axes: int, n: int) -> NDArray[np.float64]:
     """Inverse of `correlated`."""
-    content = _decompressed(data, axes, n, correlations=True)
+    try:
+        content = np.frombuffer(zstandard.decompress(data) if is_compressed(data, axes, n) else b"", np.uint8)
+    except zstandard.ZstdError:
+        content = np.empty(0, np.uint8)
+    if not len(content):
+        raise RecordingError("an estimate in the file has the wrong size: the file is damaged")
     sd = np.frombuffer(content[: 4 * axes * n], "<f4").astype(np.float64).reshape(axes, n)
     planes = np.zeros((axes * (n * (n - 1) // 2), 4), np.uint8)
     planes[:, :3] = content[4 * axes * n :].reshape(3, -1).T
@@ -208,15 +197,6 @@ def decoded(data: bytes, axes: int, n: int) -> NDArray[np.float64]:
     return from_correlation_steps(sd, steps + steps.swapaxes(-1, -2))
 
 
-def decoded_older(data: bytes, axes: int, n: int) -> NDArray[np.float64]:
-    """Matrices in single precision, as older versions recorded them."""
-    planes = _decompressed(data, axes, n, correlations=False)
-    numbers = np.ascontiguousarray(planes.reshape(4, -1).T).view("<f4").reshape(axes, -1)
-    lower, triangle = np.zeros((axes, n, n)), np.tri(n, dtype=bool)
-    lower[:, triangle] = numbers
-    return np.where(triangle, lower, lower.swapaxes(-1, -2))
-
-
 @lru_cache(maxsize=8)
 def _below_diagonal(n: int) -> NDArray[np.int64]:
     """The indices of the lower triangle without the diagonal, in a matrix that is read row by row."""
@@ -224,11 +204,8 @@ def _below_diagonal(n: int) -> NDArray[np.int64]:
 
 
 def _covariance(message: pb.Estimate, name: str, axes: int, n: int) -> NDArray[np.float64]:
-    correlations: bytes = getattr(message, f"correlated_{name}")
-    older: bytes = getattr(message, f"packed_{name}")
-    if correlations:
-        return decoded(correlations, axes, n)
-    return decoded_older(older, axes, n) if older else _array(getattr(message, name), axes, n, n)
+    data: bytes = getattr(message, f"correlated_{name}")
+    return decoded(data, axes, n) if data else _array(getattr(message, name), axes, n, n)
 
 
 def _fill(message: Message, field: str, values: NDArray[np.float64]) -> None:

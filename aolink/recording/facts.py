@@ -29,13 +29,6 @@ _LOSSES = (
     "control_open_exposures", "control_late_exposures", "control_misfit_exposures", "control_fall_back_exposures",
 )  # fmt: skip
 """A session's counts of losses and faults."""
-_FORMERLY = {
-    "connection_sequence_gaps": "packets_missing",
-    "connection_bad_crc": "packets_bad_crc",
-    "connection_bad_framing": "packets_bad_framing",
-    "connection_bad_payload": "packets_bad_payload",
-}
-"""Their names in older recordings."""
 _ENDS = ("commanded", "applied", "superseded", "late", "refused", "not_reported")
 """Steps that a session commanded, and how they ended: the first is the sum of the others."""
 
@@ -145,7 +138,7 @@ def _date(time_ns: int) -> str | None:
 
 def _losses(recording: Recording) -> dict[str, int]:
     known, counted = recording.metadata, {}
-    values = {name: known.get(name) or known.get(_FORMERLY.get(name, ""), "") for name in _LOSSES}
+    values = {name: known.get(name, "") for name in _LOSSES}
     # Exposures, by the estimator that had no time for them.
     values |= {name: value for name, value in known.items() if name.startswith("skipped_")}
     for name, value in values.items():

@@ -75,7 +75,7 @@ class GrowingRecording(Recording):
             if isinstance(record, Schema):
                 self._names[record.id] = record.name
             elif isinstance(record, Channel):
-                self.add_channel(record.id, record.topic, self._names.get(record.schema_id, ""))
+                self.channels[record.id] = (record.topic, self._names.get(record.schema_id, ""))
             elif isinstance(record, Metadata):
                 self.note_metadata([record])
             elif isinstance(record, McapMessage) and record.channel_id in self.channels:

@@ -57,8 +57,8 @@ class RawMessage(NamedTuple):
 class RecordedMessages:
     """The messages of a file, with its attachments and metadata: surveyed at once, and read when they are wanted.
 
-    A subclass that finds its messages in another way gives `survey` and `own_messages`, and tells of what it finds with
-    `add_channel`, `note_metadata` and `lose`.
+    A subclass that finds its messages in another way gives `survey` and `own_messages`, and tells of what it finds in
+    ``channels`` and with `note_metadata` and `lose`.
     """
 
     def __init__(self, path: str | Path | Url, *, check: bool) -> None:
@@ -76,9 +76,7 @@ class RecordedMessages:
         self.lost: dict[int, Loss] = {}
         """The parts of the file that could not be read, by their place; negative numbers stand for no place."""
         self.channels: dict[int, tuple[str, str]] = {}
-        """Topic and name of the schema, by the channel's id: their present names, which may be others in the file."""
-        self.names_in_file: dict[str, str] = {}
-        """The name that the file has for a topic, by the present one."""
+        """Topic and name of the schema, by the channel's id."""
         self.schemas: dict[str, Schema] = {}
         """Schemas by name, as they are in the file."""
         self.encodings: dict[str, str] = {}
@@ -121,8 +119,7 @@ class RecordedMessages:
                 self.index_digest = summary.digest
         if self.index_digest is not None:
             return self.index_digest
-        counts = sorted((self.names_in_file.get(topic, topic), number) for topic, number in self.counts.items())
-        facts = [self.rig_text, self.metadata.get("session"), self.start_ns, self.end_ns, counts]
+        facts = [self.rig_text, self.metadata.get("session"), self.start_ns, self.end_ns, sorted(self.counts.items())]
         return hashlib.sha256(json.dumps(facts).encode()).hexdigest()
 
     @property
@@ -178,8 +175,8 @@ class RecordedMessages:
                 before = self.channels.get(record.id)
                 if sure or before is None:  # its schema may have been in a chunk that is lost
                     kind = ids.get(record.schema_id, before[1] if before else "")
-                    topic = self.add_channel(record.id, record.topic, kind)
-                    self.encodings[topic] = record.message_encoding
+                    self.channels[record.id] = (record.topic, kind)
+                    self.encodings[record.topic] = record.message_encoding
             elif isinstance(record, Attachment):
                 self._attach(record)
             elif isinstance(record, Metadata):
@@ -207,12 +204,6 @@ class RecordedMessages:
         if self._attached_bytes > limits().attachment_bytes:
             raise exceeded(f"{self.path} holds attachments of {self._attached_bytes} bytes", "attachment_bytes")
 
-    def add_channel(self, number: int, topic: str, schema: str) -> str:
-        """Keep a channel of the file by the present names of its topic and its schema. Gives the topic's name."""
-        name, _ = self.channels[number] = topics.present_names(topic, schema)
-        self.names_in_file[name] = topic
-        return name
-
     def note_metadata(self, records: Sequence[Metadata]) -> None:
         """Keep the facts in the file's metadata."""
         for name, values in unsealed(records):
@@ -228,7 +219,7 @@ class RecordedMessages:
                 number = int(values["id"])
                 # The chunk that names the channel, or the one that holds its schema, may be lost.
                 if not self.channels.get(number, ("", ""))[1]:
-                    self.add_channel(number, values.get("topic", ""), values.get("schema", ""))
+                    self.channels[number] = (values.get("topic", ""), values.get("schema", ""))
 
     def _records(self, channels: Collection[int], low: int, high: int, chunks: slice) -> Iterator[McapRecord]:
         """Records in the order of the file, at least all messages of some channels between two log times."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from importlib.metadata import version
 from pathlib import Path
 
@@ -12,7 +12,6 @@ import numpy as np
 from aolink.errors import RecordingError
 from aolink.estimation import Driver, Estimate, Score, Scorer
 from aolink.estimation.estimate import COMPARED
-from aolink.estimation.registry import retired
 from aolink.exporting.common import Progress, no_progress
 from aolink.exposure import Exposure
 from aolink.files import writing
@@ -98,13 +97,6 @@ class Reestimated(Recording):
         for exposure, estimates in reestimated(self._source, names, as_recorded=True):
             for estimate in estimates:
                 yield recorded_estimate(estimate, exposure.host_receive_ns)
-
-
-def own_estimators(recording: Recording, say: Callable[[str], None]) -> list[str]:
-    """The estimators of a recording that can run again; ``say`` gets a line about each of an earlier version."""
-    for reason in filter(None, map(retired, recording.estimators)):
-        say(f"{recording.path.name} has estimates that are not made again: {reason}")
-    return [name for name in recording.estimators if not retired(name)]
 
 
 def scored(recording: Recording, names: Sequence[str]) -> dict[str, Score]:

@@ -172,7 +172,7 @@ class Latency(_message.Message):
     def __init__(self, frame_id: _Optional[int] = ..., exposure_end_ns: _Optional[int] = ..., first_byte_ns: _Optional[int] = ..., complete_ns: _Optional[int] = ..., estimated_ns: _Optional[int] = ..., command_sent_ns: _Optional[int] = ..., command_acknowledged_ns: _Optional[int] = ..., command_applied_ns: _Optional[int] = ...) -> None: ...
 
 class Estimate(_message.Message):
-    __slots__ = ("estimator", "frame_id", "first_step", "n_steps", "status", "reason", "axes", "n_states", "n_coefficients", "n_measurements", "end_state", "end_covariance", "coefficients", "coefficient_covariance", "innovation", "innovation_covariance", "nis", "innovation_variance", "correlated_end_covariance", "correlated_coefficient_covariance", "packed_end_covariance", "packed_coefficient_covariance", "alignment_steps", "alignment_coefficients", "alignment_end_state", "verdict")
+    __slots__ = ("estimator", "frame_id", "first_step", "n_steps", "status", "reason", "axes", "n_states", "n_coefficients", "n_measurements", "end_state", "end_covariance", "coefficients", "coefficient_covariance", "innovation", "innovation_covariance", "nis", "innovation_variance", "correlated_end_covariance", "correlated_coefficient_covariance", "alignment_steps", "alignment_coefficients", "alignment_end_state", "verdict")
     class Status(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
         __slots__ = ()
         OK: _ClassVar[Estimate.Status]
@@ -207,8 +207,6 @@ class Estimate(_message.Message):
     INNOVATION_VARIANCE_FIELD_NUMBER: _ClassVar[int]
     CORRELATED_END_COVARIANCE_FIELD_NUMBER: _ClassVar[int]
     CORRELATED_COEFFICIENT_COVARIANCE_FIELD_NUMBER: _ClassVar[int]
-    PACKED_END_COVARIANCE_FIELD_NUMBER: _ClassVar[int]
-    PACKED_COEFFICIENT_COVARIANCE_FIELD_NUMBER: _ClassVar[int]
     ALIGNMENT_STEPS_FIELD_NUMBER: _ClassVar[int]
     ALIGNMENT_COEFFICIENTS_FIELD_NUMBER: _ClassVar[int]
     ALIGNMENT_END_STATE_FIELD_NUMBER: _ClassVar[int]
@@ -233,13 +231,11 @@ class Estimate(_message.Message):
     innovation_variance: _containers.RepeatedScalarFieldContainer[float]
     correlated_end_covariance: bytes
     correlated_coefficient_covariance: bytes
-    packed_end_covariance: bytes
-    packed_coefficient_covariance: bytes
     alignment_steps: float
     alignment_coefficients: _containers.RepeatedScalarFieldContainer[float]
     alignment_end_state: _containers.RepeatedScalarFieldContainer[float]
     verdict: Verdict
-    def __init__(self, estimator: _Optional[str] = ..., frame_id: _Optional[int] = ..., first_step: _Optional[int] = ..., n_steps: _Optional[int] = ..., status: _Optional[_Union[Estimate.Status, str]] = ..., reason: _Optional[str] = ..., axes: _Optional[int] = ..., n_states: _Optional[int] = ..., n_coefficients: _Optional[int] = ..., n_measurements: _Optional[int] = ..., end_state: _Optional[_Iterable[float]] = ..., end_covariance: _Optional[_Iterable[float]] = ..., coefficients: _Optional[_Iterable[float]] = ..., coefficient_covariance: _Optional[_Iterable[float]] = ..., innovation: _Optional[_Iterable[float]] = ..., innovation_covariance: _Optional[_Iterable[float]] = ..., nis: _Optional[_Iterable[float]] = ..., innovation_variance: _Optional[_Iterable[float]] = ..., correlated_end_covariance: _Optional[bytes] = ..., correlated_coefficient_covariance: _Optional[bytes] = ..., packed_end_covariance: _Optional[bytes] = ..., packed_coefficient_covariance: _Optional[bytes] = ..., alignment_steps: _Optional[float] = ..., alignment_coefficients: _Optional[_Iterable[float]] = ..., alignment_end_state: _Optional[_Iterable[float]] = ..., verdict: _Optional[_Union[Verdict, _Mapping]] = ...) -> None: ...
+    def __init__(self, estimator: _Optional[str] = ..., frame_id: _Optional[int] = ..., first_step: _Optional[int] = ..., n_steps: _Optional[int] = ..., status: _Optional[_Union[Estimate.Status, str]] = ..., reason: _Optional[str] = ..., axes: _Optional[int] = ..., n_states: _Optional[int] = ..., n_coefficients: _Optional[int] = ..., n_measurements: _Optional[int] = ..., end_state: _Optional[_Iterable[float]] = ..., end_covariance: _Optional[_Iterable[float]] = ..., coefficients: _Optional[_Iterable[float]] = ..., coefficient_covariance: _Optional[_Iterable[float]] = ..., innovation: _Optional[_Iterable[float]] = ..., innovation_covariance: _Optional[_Iterable[float]] = ..., nis: _Optional[_Iterable[float]] = ..., innovation_variance: _Optional[_Iterable[float]] = ..., correlated_end_covariance: _Optional[bytes] = ..., correlated_coefficient_covariance: _Optional[bytes] = ..., alignment_steps: _Optional[float] = ..., alignment_coefficients: _Optional[_Iterable[float]] = ..., alignment_end_state: _Optional[_Iterable[float]] = ..., verdict: _Optional[_Union[Verdict, _Mapping]] = ...) -> None: ...
 
 class Verdict(_message.Message):
     __slots__ = ("fit", "where", "pixels", "motion", "exposures", "nis", "since", "widening")

@@ -98,9 +98,8 @@ def _of_estimate(message: pb.Estimate, rig: Rig) -> str:
 
 
 def _is_whole(message: pb.Estimate, name: str, n: int) -> bool:
-    for kind, correlations in (("correlated", True), ("packed", False)):
-        if data := getattr(message, f"{kind}_{name}"):
-            return is_compressed(data, message.axes, n, correlations=correlations)
+    if data := getattr(message, f"correlated_{name}"):
+        return is_compressed(data, message.axes, n)
     return len(getattr(message, name)) == message.axes * n * n
 
 

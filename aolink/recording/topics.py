@@ -90,24 +90,11 @@ RUNS = {row.name: row.message.DESCRIPTOR.full_name for row in TOPICS if "u" in r
 """The topics with the inputs of runs of steps, and their schemas."""
 _UNKNOWN = Topic("", Message)
 
-FORMER_TOPICS = {"/link": CONNECTION}
-_FORMER_SCHEMAS = {"aolink.recording.LinkStatistics": pb.ConnectionStatistics.DESCRIPTOR.full_name}
-"""Names in older recordings, and what they are called now. A message keeps the numbers of its fields, so its bytes stay
-what they were."""
-
 
 def find(name: str, message: Message | None) -> Topic:
     """The row of a message; where the topic does not hold such messages, a row that belongs to its time only."""
     row = named(name)
     return row if isinstance(message, row.message) else _UNKNOWN
-
-
-def present_names(topic: str, schema: str) -> tuple[str, str]:
-    """The topic and the schema of a file's channel by their present names. A topic that other software gave one of the
-    former names, with messages of its own, keeps it."""
-    schema = _FORMER_SCHEMAS.get(schema, schema)
-    renamed = FORMER_TOPICS.get(topic, topic)
-    return (renamed if named(renamed).message is SCHEMAS.get(schema) else topic), schema
 
 
 @lru_cache(maxsize=256)

@@ -215,7 +215,7 @@ class RecordingWriter:
             return []
         for number, each in found:
             facts = first_facts(each)
-            of_this_name = facts.get(topics.PART_OF, self.path.name) == self.path.name  # older parts do not say it
+            of_this_name = facts.get(topics.PART_OF) == self.path.name
             if each == self._part_path(number) and facts.get(topics.PART) == str(number) and of_this_name:
                 session = session or facts.get("session")
                 if facts.get("session") == session:

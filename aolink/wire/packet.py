@@ -22,12 +22,6 @@ from google.protobuf.message import DecodeError, Message
 from aolink.wire import messages_pb2 as pb
 
 PROTOCOL_VERSION = 1
-SIGNED_VERSION = 2
-"""Protocol version of signed packets, which there were once."""
-NO_SIGNING = (
-    "packets are no longer signed, and a simulated rig serves its own machine only: use no key at either end, and let"
-    " other machines in through a tunnel, such as ssh -N -L 5000:127.0.0.1:5000 -L 5001:127.0.0.1:5001 USER@MACHINE"
-)
 MAX_PAYLOAD = 4608
 """The longest payload in bytes: 4 KiB of data and the fields around it."""
 MAX_CHUNK = 4096

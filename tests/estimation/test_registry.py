@@ -66,8 +66,6 @@ def test_options_may_follow_the_name():
         ("o3:flux=some", "flux = 'some' is not known"),
         ("o4:second_order", "no estimator 'o4': use one of open-loop, o1"),
         ("profile:tempered=0", "profile:tempered=0: estimators have no option 'tempered': use gain"),
-        ("mixture", "mixture is an estimator of earlier versions: use profile"),
-        ("mixture:draws=50", "mixture is an estimator of earlier versions: use profile"),
     ],
 )
 def test_an_option_that_makes_no_sense_is_named(text, message):

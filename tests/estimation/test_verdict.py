@@ -121,7 +121,7 @@ def test_it_is_recorded_scored_and_heeded_by_control(rig: Rig) -> None:
     back = convert.estimate_from_message(message, made[-1].model, exposures[-1])
     assert back.verdict == made[-1].verdict
     assert same_bits(back, made[-1])
-    message.ClearField("verdict")  # as in a recording of an earlier version
+    message.ClearField("verdict")
     assert convert.estimate_from_message(message, made[-1].model, exposures[-1]).verdict is None
     assert any("does not fit (motion" in note for note in score_table({"moments": score(exposures, made)}).notes)
     monitor = FitMonitor()

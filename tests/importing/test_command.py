@@ -185,7 +185,7 @@ def missing(folder: Path) -> Path:
         (good, ["--exposure", "nan"], 11, "--exposure nan must be above 0"),
         (
             good,
-            ["--exposure", "0.01", "--rate", "100", "--sum", "2"],
+            ["--exposure", "0.01", "--rate", "100", "--film", "sum=2"],
             11,
             "0.01 is not used with --film sum=2",
         ),

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from aolink.errors import RecordingError, RigError
+from aolink.errors import RigError
 from aolink.jobs import batch
 from aolink.recording.compare import compare
 from aolink.recording.reader import Recording
@@ -82,17 +82,6 @@ def test_what_was_done_is_not_done_again_until_something_changes(recorded: Sessi
     assert first.row == second.row
     todo[0].output.unlink()
     assert not next(run_here(todo, 1)).skipped
-
-
-def test_copies_of_an_earlier_batch_are_refused_with_how_to_do_it_again(recorded: Session, tmp_path: Path) -> None:
-    (tmp_path / "s.mcap").touch()
-    (tmp_path / "other.json").write_text("[]")
-    assert batch.jobs([str(recorded.path)], batch.models(None, []), ["o1"], tmp_path)
-    (tmp_path / "s.json").write_text('{"digest": "a", "rows": [{"recording": "s.mcap"}]}')
-    with pytest.raises(
-        RecordingError, match=r"copies .* of an earlier aolink: give another folder, .* into side files"
-    ):
-        batch.jobs([str(recorded.path)], batch.models(None, []), ["o1"], tmp_path)
 
 
 def test_values_given_twice_are_one_model_and_another_rig_names_its_models() -> None:

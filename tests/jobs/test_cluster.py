@@ -173,7 +173,7 @@ def test_a_worker_with_another_aolink_is_one_clear_line(cluster: Cluster, aolink
     other.mkdir(parents=True)
     (other / "METADATA").write_text("Metadata-Version: 2.1\nName: aolink\nVersion: 0.0.9\n")
     write_small(tmp_path / "s.mcap", 3)
-    arguments = ("estimate", "s.mcap", "--side", "-o", "out", "--scheduler", cluster.address)
+    arguments = ("estimate", "s.mcap", "-o", "out", "--scheduler", cluster.address)
     nobody = aolink(*arguments)
     assert nobody.returncode == 1
     assert nobody.stderr.startswith(f"aolink: the scheduler at {cluster.address} has no workers: start some")
@@ -190,7 +190,7 @@ def test_a_worker_with_another_aolink_is_one_clear_line(cluster: Cluster, aolink
 def test_the_command_on_a_cluster(cluster: Cluster, aolink: Run, tmp_path: Path) -> None:
     """Names may be relative: the workers have other folders. A second time, everything was done before."""
     names = [write_small(tmp_path / f"s{k}.mcap", 3 + k).name for k in range(3)]
-    arguments = ("estimate", *names, "--side", "-o", "out", "--table", "all.parquet", "--scheduler", cluster.address)
+    arguments = ("estimate", *names, "-o", "out", "--table", "all.parquet", "--scheduler", cluster.address)
     with cluster.worker("one"):
         cluster.wait_for(1)
         first, second = aolink(*arguments), aolink(*arguments)

@@ -63,7 +63,7 @@ def scene_psnrs(recording: Recording) -> tuple[float, float]:
 def test_the_demo_ends_with_what_its_recording_says(
     aolink: Callable[..., subprocess.CompletedProcess[str]], tmp_path: Path
 ) -> None:
-    done = aolink("demo", "--out", tmp_path)
+    done = aolink("demo", "-o", tmp_path)
     assert done.returncode == 0, done.stderr
     (folder,) = tmp_path.glob("demo-*")
     recording = Recording(folder / "deblurred.mcap")

@@ -163,7 +163,6 @@ def test_a_table_takes_the_place_of_a_table_only(aolink: Run, tmp_path: Path, na
     ("arguments", "message"),
     [
         (["--shard", "1/2"], "need -o DIR"),
-        (["-o", "out/", "--parquet"], "--table X.parquet writes the table as Parquet"),
         (["-o", "out/", "--table", "t.csv"], "give a name that ends with .parquet"),
         (["-o", "out/", "--shard", "3/2"], "I/N is needed"),
         (["-o", "out/", "--scheduler", "tcp://127.0.0.1:1", "--jobs", "2"], "--jobs is for this machine"),

@@ -120,11 +120,10 @@ def test_a_live_session_has_latencies(tmp_path: Path) -> None:
         (lambda path: write_small(path, 1), ["holds no estimates", "The truth is not known", "holds no NIS"]),
         (lambda path: write_small(path, 3, applied=False), ["no reports of the mirror"]),
         (lambda path: write_small(path, 2, "nothing", missing=True), ["frames incomplete", "holds no estimates"]),
-        (lambda path: shutil.copy(ROOT / "tests" / "data" / "first-version.mcap", path), ["The session"]),
         (lambda path: write_small(path, 2, rig="sh-4x4"), ["Over the pupil", "holds no estimates"]),
         (lambda path: write_small(path, 2, rig="moving-scene"), ["were not restored"]),
     ],
-    ids=["empty", "one frame", "no reports", "dark", "first version", "lenslets", "no scene"],
+    ids=["empty", "one frame", "no reports", "dark", "lenslets", "no scene"],
 )
 def test_a_poor_recording_shows_what_there_is_and_says_what_there_is_not(
     tmp_path: Path, make: Callable[[Path], Path], said: list[str]

@@ -14,7 +14,6 @@ import pytest
 from mcap.records import Schema
 
 from aolink.recording import topics
-from aolink.recording.compare import compare
 from aolink.recording.editing import cut
 from aolink.recording.mcap_file import McapFile, WriteOptions, schema_of
 from aolink.recording.reader import Recording
@@ -54,7 +53,7 @@ def split(data: bytes) -> bytes:
 
 
 def one_by_one(data: bytes) -> bytes:
-    """The same message with each number by itself, as writers of old do it."""
+    """The same message with each number by itself."""
     message = Applied.FromString(data)
     numbers = b"".join(b"\x21" + struct.pack("<d", value) for value in message.u)  # field 4, eight bytes
     del message.u[:]
@@ -117,13 +116,3 @@ def test_the_page_for_other_software_is_right(tmp_path: Path, monkeypatch: pytes
     recording = Recording(tmp_path / "mine.mcap")
     assert len(reestimate(recording, ["o3"])["o3"]) == 10
     rerun_check(tmp_path / "mine.mcap")
-
-
-def test_a_recording_of_the_first_version_reads_and_estimates_as_it_did() -> None:
-    """Kept as it was written before channels and rig stood in the file twice, and fields were added since."""
-    path = ROOT / "tests" / "data" / "first-version.mcap"
-    recording = Recording(path, check=True)
-    assert not recording.damage
-    assert len(list(recording.exposures())) == 3
-    assert [each.frame_id for each in recording.estimates("o3")] == [1, 2, 3]
-    assert all(each.same for each in compare(recording, Recording(path)).values())

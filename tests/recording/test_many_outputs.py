@@ -161,23 +161,13 @@ def test_covariances_that_were_not_rounded_are_recorded_as_doubles() -> None:
     assert convert.correlated(large_covariances(300)) == b""
 
 
-def test_covariances_of_older_recordings_are_read() -> None:
-    """In single precision: lower triangles, first the lowest bytes of all numbers, then the second ones, and so on."""
-    given = large_covariances(300).astype(np.float32)
-    rows, columns = np.tril_indices(300)
-    data = zstandard.compress(given[:, rows, columns].ravel().view(np.uint8).reshape(-1, 4).T.tobytes())
-    np.testing.assert_array_equal(convert.decoded_older(data, 2, 300), given)
-
-
 def test_compressed_covariances_are_damage_where_they_are_not_what_they_say() -> None:
     """Also what would not fit into memory: a frame of nothing but zeros is small."""
     data = convert.correlated(as_recorded(large_covariances(300)))
     zeros = zstandard.compress(bytes(4 * 8000 + 3 * 8000 * 7999 // 2))
-    older = zstandard.compress(bytes(2 * 8000 * 8001))
-    assert convert.is_compressed(data, 2, 300, correlations=True)
+    assert convert.is_compressed(data, 2, 300)
     wrong = [(data, 2, 299), (data, 1, 300), (b"", 2, 300), (data[4:], 2, 300), (zeros, 1, 8000)]
-    assert not any(convert.is_compressed(*each, correlations=True) for each in wrong)
-    assert not any(convert.is_compressed(*each, correlations=False) for each in ((data, 2, 300), (older, 1, 8000)))
+    assert not any(convert.is_compressed(*each) for each in wrong)
 
 
 def test_a_truth_of_very_many_outputs_is_in_single_precision() -> None:

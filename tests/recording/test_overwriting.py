@@ -203,18 +203,6 @@ def test_a_first_part_that_is_another_file_is_refused(recorded: Session, tmp_pat
     assert (tmp_path / "s-001.mcap").read_bytes() == recorded.path.read_bytes()
 
 
-def test_parts_of_sessions_before_this_version_are_known_too(recorded: Session, tmp_path: Path) -> None:
-    """Their metadata have the number of the part, not the name of the session."""
-    source = Recording(recorded.path)
-    for number in (1, 2):
-        facts = {"session": "old", topics.PART: str(number)}
-        RecordingWriter(tmp_path / f"s-00{number}.mcap", source.rig, facts, 0).close()
-    writing = Writing(recorded.path, tmp_path / "s.mcap", WriteOptions(split_s=1e6))
-    writing.write()
-    writing.writer.close()
-    assert names(tmp_path) == {"s-001.mcap"}
-
-
 def removed(path: Path) -> None:
     path.unlink()
 

@@ -31,7 +31,7 @@ import aolink
 from aolink.assembly import Frame
 from aolink.errors import RecordingError
 from aolink.estimation import exposure_model
-from aolink.recording import convert, schemas_pb2, topics
+from aolink.recording import convert, topics
 from aolink.recording.reader import Recording
 from aolink.recording.reestimate import write_reestimated
 from aolink.recording.writer import RecordingWriter
@@ -162,13 +162,6 @@ def test_frames_survive_the_recording(mask: list[bool], counts: list[int]) -> No
     again = convert.frame_from_messages(info, image)
     for name, value in vars(frame).items():
         assert np.array_equal(getattr(again, name), value), name
-
-
-def test_exposures_of_older_recordings_start_with_a_step(recorded: Session) -> None:
-    for each in Recording(recorded.path).messages(topics.EXPOSURE):
-        assert isinstance(each.message, schemas_pb2.ExposureInfo)
-        assert not each.message.exposure_offset_ns  # proto3 does not write a zero: these bytes are an older file's
-    assert {exposure.start_offset for exposure in Recording(recorded.path).exposures()} == {0.0}
 
 
 def test_estimates_survive_the_recording(recorded: Session) -> None:

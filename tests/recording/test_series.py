@@ -114,19 +114,6 @@ def test_what_the_package_offers_is_what_dir_shows() -> None:
     assert "exposure" not in dir(aolink)
 
 
-@pytest.mark.parametrize(
-    ("old", "now"),
-    [
-        (lambda series: series.iter_estimates("o1"), "walk"),
-        (lambda series: series.with_estimates(["o1"]), "walk"),
-        (lambda series: aolink.estimate(series, "o1")[0].path, "estimates"),  # type: ignore[attr-defined]
-    ],
-)
-def test_what_was_renamed_names_what_does_the_same(old: Callable[[Any], object], now: str) -> None:
-    with pytest.raises(AttributeError, match=now):
-        old(aolink.read(LIVELY))
-
-
 def test_smooth_takes_a_series_with_its_estimates() -> None:
     exposures = aolink.simulate("section-vi", 2)
     with pytest.raises(EstimatorError, match=r"aolink\.smooth\(series"):

@@ -46,7 +46,7 @@ def test_a_picture_is_deblurred(aolink: Run, tmp_path: Path, picture: np.ndarray
     printed, expected = json.loads(done.stdout), restore(picture, np.full(7, 2.0))
     assert printed["noise_sd"] == pytest.approx(expected.noise_sd)
     assert (read_picture(tmp_path / "out.png", RestorationError) == expected.image).all()
-    again = aolink("deblur", "--image", "in.png", "--psf", "psf.csv", "-o", "out.png")
+    again = aolink("deblur", "in.png", "--psf", "psf.csv", "-o", "out.png")
     assert again.returncode == 10
     assert again.stderr == (
         "aolink: out.png exists and is not overwritten: give another name, or --overwrite to replace it\n"
@@ -241,7 +241,7 @@ def test_a_motion_that_a_log_has_restores_as_its_psf_does(tmp_path: Path) -> Non
     fits.PrimaryHDU(picture, fits.Header({"DATE-OBS": "2026-09-21T14:13:24", "EXPTIME": 2.0})).writeto(
         tmp_path / "a.fits"
     )
-    files = ["--image", str(tmp_path / "a.fits"), "--path", str(tmp_path / "log.csv"), "-o", str(tmp_path / "b.npy")]
+    files = [str(tmp_path / "a.fits"), "--path", str(tmp_path / "log.csv"), "-o", str(tmp_path / "b.npy")]
     done = CliRunner().invoke(app, ["deblur", *files, "--offset", "2.5"])
     assert done.exit_code == 0, done.output
     psf = np.ones(3)  # a motion of three pixels at a steady velocity

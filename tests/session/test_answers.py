@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from google.protobuf.message import Message
 
-from aolink.cli.tables.recordings import facts as table_of
 from aolink.errors import DeviceError
 from aolink.recording import topics
 from aolink.recording.answers import Answers
@@ -179,13 +178,6 @@ def test_the_parts_of_a_session_joined_have_each_answer_once(session: Path, tmp_
     assert len(writer.paths) > 2
     merge(writer.paths, tmp_path / "joined.mcap")
     assert answers_in(tmp_path / "joined.mcap") == answers_in(session)
-
-
-@pytest.mark.parametrize("old", sorted(REFERENCE.glob("*.mcap")), ids=lambda path: path.name)
-def test_recordings_without_answers_stay_readable(old: Path) -> None:
-    facts = recording_facts(Recording(old))
-    assert Answers.of(facts["answers"]) == Answers()
-    assert "answers" not in [*table_of(facts).columns[0].cells]
 
 
 def test_an_answer_takes_little_room(session: Path) -> None:

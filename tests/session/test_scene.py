@@ -154,14 +154,6 @@ def test_a_camera_with_another_scene_is_refused(tmp_path: Path) -> None:
                 record(rig, camera, mirror, tmp_path / "a.mcap", exposures=1)
 
 
-def test_older_recordings_have_no_scene() -> None:
-    path = Path(__file__).parents[1] / "data" / "first-version.mcap"
-    recording = Recording(path)
-    assert recording.true_scene is None
-    assert list(recording.restored()) == []
-    assert all(exposure.scene is None for exposure in recording.exposures())
-
-
 def test_cut_and_merged_again_scenes_stay_with_their_exposures(sharp: Path, tmp_path: Path) -> None:
     whole = list(Recording(sharp).exposures())
     middle = (Recording(sharp).end_ns - Recording(sharp).start_ns) / 2e9
@@ -423,7 +415,7 @@ def test_the_command_deblurs_a_recording(aolink: Run, session: Path, tmp_path: P
 
 
 @pytest.mark.parametrize(
-    "wrong", [[], ["a.mcap", "--image", "x.png"], ["--image", "x.png"], ["a.mcap", "--psf", "p", "--path", "l"]]
+    "wrong", [[], ["a.mcap", "--noise-sd", "1"], ["--psf", "p"], ["a.mcap", "--psf", "p", "--path", "l"]]
 )
 def test_the_command_takes_a_recording_or_a_picture(wrong: list[str]) -> None:
     refused = CliRunner().invoke(app, ["deblur", *wrong, "-o", "c.mcap"])

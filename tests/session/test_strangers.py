@@ -12,12 +12,8 @@ import subprocess
 import threading
 import tty
 from collections.abc import Callable
-from pathlib import Path
 
-import pytest
-
-from aolink.errors import DeviceError, PortError, RigError
-from aolink.rig import load_rig
+from aolink.errors import DeviceError, PortError
 from aolink.wire import messages_pb2 as pb
 from aolink.wire.packet import encode_message
 from tests.commands import simulated_rig
@@ -44,29 +40,6 @@ def test_no_other_machine_is_served(aolink: Run) -> None:
     assert result.returncode == PortError.exit_code
     assert result.stderr.startswith("aolink: --listen 0.0.0.0:0 would let every machine that reaches this one move")
     assert result.stderr.count("\n") == 1
-
-
-@pytest.mark.parametrize(
-    "command",
-    [
-        "sim section-vi --allow-remote", "sim section-vi --unsigned", "sim section-vi --key=",
-        "devices x --key rig.key", "record --rig section-vi -o a.mcap --key rig.key",
-        "calibrate --rig section-vi -o a.toml --key rig.key",
-    ],
-)  # fmt: skip
-def test_what_went_with_signed_packets_says_what_to_use_now(aolink: Run, command: str) -> None:
-    result = aolink(*command.split())
-    assert result.returncode == PortError.exit_code
-    assert re.fullmatch(r"aolink: --\S+: packets are no longer signed, .* ssh -N -L .*\n", result.stderr)
-
-
-def test_a_key_in_a_rig_file_is_refused_likewise(aolink: Run, tmp_path: Path) -> None:
-    (tmp_path / "my.toml").write_text(
-        load_rig("section-vi").toml + '\n[devices.camera]\ndriver = "native"\nport = "x"\nkey = "rig.key"\n'
-    )
-    result = aolink("record", "--rig", tmp_path / "my.toml", "-o", tmp_path / "a.mcap")
-    assert result.returncode == RigError.exit_code
-    assert re.fullmatch(r"aolink: devices\.camera\.key: packets are no longer signed, .*\n", result.stderr)
 
 
 def test_a_device_that_trickles_is_given_up(aolink: Run) -> None:

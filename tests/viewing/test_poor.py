@@ -4,7 +4,6 @@ is, and says what there is not.
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -69,11 +68,6 @@ CASES: dict[str, tuple[Callable[[Path], object], list[str], list[str]]] = {
         with_many_lenslets,
         ["/camera/image", "/pupil/light", "/pupil/slope_x"],
         ["no estimates"],
-    ),
-    "first version": (
-        lambda path: shutil.copy(ROOT / "tests" / "data" / "first-version.mcap", path),
-        ["/camera/image", "/path/o3/mean", "/path/truth"],
-        ["no latencies"],
     ),
 }  # fmt: skip
 """What makes a recording, entities that it has, and words that its page says."""

@@ -89,8 +89,3 @@ def test_what_cannot_work_is_one_clear_error(camera: str, says: str, tmp_path: P
         record(rig_of(camera, tmp_path), None, None, tmp_path / "a.mcap", exposures=2)
     assert "\n" not in str(raised.value)
     assert not (tmp_path / "a.mcap").exists()
-
-
-def test_the_driver_that_went_names_what_opens_its_cameras(tmp_path: Path) -> None:
-    with pytest.raises(DeviceError, match="basler is no more: aravis opens GigE and USB3"):
-        record(rig_of('driver = "basler"', tmp_path), None, None, tmp_path / "a.mcap", exposures=2)
