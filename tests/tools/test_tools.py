@@ -65,19 +65,12 @@ def test_the_reference_recordings_can_be_made_anew(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_bad_inputs_find_nothing() -> None:
-    done = run(TOOLS / "fuzz", "--count", "20", "--from", "1000")
+def test_hostile_inputs_find_nothing() -> None:
+    done = run(TOOLS / "fuzz", "--count", "20")
     assert done.returncode == 0, done.stdout + done.stderr
     lines = done.stdout.splitlines()
     assert [line.split(":")[0] for line in lines] == ["packets", "to-host", "to-device", "files"]
-    assert all("from 1000 to 1020" in line and line.endswith("nothing found") for line in lines)
-
-
-@pytest.mark.slow
-def test_a_kind_of_inputs_that_there_is_not_is_an_error() -> None:
-    done = run(TOOLS / "fuzz", "pakets")
-    assert done.returncode == 2
-    assert "there is no kind pakets: packets, to-host, to-device, files" in done.stderr
+    assert all("20 inputs" in line for line in lines)
 
 
 # The benchmark
