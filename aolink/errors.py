@@ -42,13 +42,9 @@ class EstimatorError(AolinkError):
 
 
 class ViewerError(AolinkError):
-    """A viewer, or a picture of it, that is not available on this machine."""
+    """A viewer that is not available on this machine, or a file that it cannot show."""
 
     exit_code = 7
-
-
-class RendererError(ViewerError):
-    """A machine without a graphics driver that the viewer can draw with; the message names the packages."""
 
 
 class CalibrationError(AolinkError):

@@ -19,10 +19,7 @@ _LOOK_S = 0.1
 """Time between two looks at a file that grows, s."""
 
 
-@app.command(
-    epilog="Example: aolink view session.mcap -o session.png"
-    "  |  aolink view session.mcap --frame 7  |  aolink view session.mcap --compare again.mcap"
-)
+@app.command(epilog="Example: aolink view session.mcap  |  aolink view session.mcap --frame 7 -o one.rrd")
 def view(
     recorded: Annotated[
         str, typer.Argument(metavar="FILE", help="A recording, or a Rerun file (.rrd) that -o has written.")
@@ -32,13 +29,8 @@ def view(
         typer.Argument(metavar="[SIDE...]", help="Its side files: their estimates instead of its own."),
     ] = None,
     output: Annotated[
-        list[Path] | None,
-        typer.Option(
-            "--output",
-            "-o",
-            metavar="X.rrd|X.png",
-            help="Write a Rerun file, or a picture of the viewer, instead of opening it; needs no screen.",
-        ),
+        Path | None,
+        typer.Option("--output", "-o", metavar="X.rrd", help="Write a Rerun file instead of opening it."),
     ] = None,
     web: Annotated[
         bool, typer.Option("--web", help="Serve the web viewer on this machine (127.0.0.1) until Ctrl-C.")
@@ -47,9 +39,6 @@ def view(
         int | None, typer.Option(min=0, metavar="N", help="Show one exposure alone, counted from 0.")
     ] = None,
     lenslet: LensletOption = None,
-    compare: Annotated[
-        str | None, typer.Option(metavar="OTHER", help="Show another recording beside it, in fainter lines.")
-    ] = None,
     follow: Annotated[
         bool, typer.Option("--follow", help="Show a recording that a session is still writing, as it grows.")
     ] = False,
@@ -59,61 +48,46 @@ def view(
 
     For five exposures or fewer, paths are shown at every fast step; for more, at 32 places of each exposure.
     """
-    import tempfile
-
     from aolink import viewing
     from aolink.recording.remote import location, only_paths
 
-    choices = (frame, lenslet, compare)
-    save, screenshot = _targets(output, ".png")
+    choices = (frame, lenslet)
     if follow:
         if side or output or any(each is not None for each in choices):
             raise typer.BadParameter("--follow shows the whole session as it comes, alone or with --web")
         _follow(recorded, web=web)
         return
     file, *sides = map(location, [recorded, *(side or ())])
-    sources = only_paths([file, *sides, *([location(compare)] if compare else [])])
-    for target, suffix in ((save, ".rrd"), (screenshot, ".png")):
-        if target is not None:
-            check_target(target, overwrite=overwrite, sources=sources, suffix=suffix)
+    if output is not None:
+        check_target(output, overwrite=overwrite, sources=only_paths([file, *sides]), suffix=".rrd")
     recording = None if file.suffix == ".rrd" else open_recording(file, side=sides)
-    if recording is None and (save is not None or side or any(each is not None for each in choices)):
+    if recording is None and (output is not None or side or any(each is not None for each in choices)):
         raise typer.BadParameter(f"{file} is a Rerun file already: -o X.rrd, side files and choices need a recording")
-    if not (web or save or screenshot):
+    if not (web or output):
         viewing.check_display()
     if recording is None:
-        if screenshot is not None:
-            viewing.screenshot(recorded, screenshot)
-            stdout.print(f"written: {screenshot}", markup=False)
         if web:
             viewing.serve_web(recorded, on_ready=_address)
-        elif screenshot is None:
+        else:
             viewing.open_viewer(recorded)
         return
     exposures = None if frame is None else _number(recording, frame)
-    look = viewing.Look(
-        exposures=exposures, spot=common.spot_of(recording.rig.sensor, lenslet) if lenslet else 0,
-        compared=open_recording(compare) if compare else None,
-    )  # fmt: skip
+    spot = common.spot_of(recording.rig.sensor, lenslet) if lenslet else 0
+    look = viewing.Look(exposures=exposures, spot=spot)
     total = len(exposures) if exposures is not None else recording.n_frames
-    with tempfile.TemporaryDirectory(prefix="aolink-") as folder, progress("read", total) as tell:
-        if save is not None or screenshot is not None:
-            rrd = save or Path(folder) / f"{file.stem}.rrd"
-            viewing.save_rrd(recording, rrd, look=look, overwrite=overwrite, progress=tell)
-            if screenshot is not None:
-                viewing.screenshot(rrd, screenshot)
-        for written in (save, screenshot):
-            if written is not None:
-                stdout.print(f"written: {written}", markup=False)
+    with progress("read", total) as tell:
+        if output is not None:
+            viewing.save_rrd(recording, output, look=look, overwrite=overwrite, progress=tell)
+            stdout.print(f"written: {output}", markup=False)
         if web:
             viewing.serve(recording, look, on_ready=_address, progress=tell)
-        elif save is None and screenshot is None:
+        elif output is None:
             viewing.show(recording, look, progress=tell)
 
 
-def _targets(output: list[Path] | None, other: str) -> tuple[Path | None, Path | None]:
-    """What is to be written: a file of the usual kind, and one with the other suffix."""
-    others = [each for each in output or () if each.suffix.lower() == other]
+def _targets(output: list[Path] | None) -> tuple[Path | None, Path | None]:
+    """What is to be written: the results, and a Rerun file."""
+    others = [each for each in output or () if each.suffix.lower() == ".rrd"]
     usual = [each for each in output or () if each not in others]
     if len(usual) > 1 or len(others) > 1:
         raise typer.BadParameter(f"one file of a kind can be written: {', '.join(map(str, output or ()))}")
@@ -180,7 +154,7 @@ def slopes(
     if (pitch_m is None) != (focal_m is None):
         raise typer.BadParameter("give --pitch-m and --focal-m, or neither")
     inputs = [frame, reference]
-    output, rrd = _targets(written, ".rrd")
+    output, rrd = _targets(written)
     if output is not None:
         check_target(output, overwrite=overwrite, sources=inputs, suffix=".npz", error=FrameError)
     if rrd is not None:

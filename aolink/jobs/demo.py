@@ -14,7 +14,7 @@ from pathlib import Path
 
 from aolink.colours import by_rank
 from aolink.control.integrator import INTEGRATOR
-from aolink.errors import AolinkError, DeviceError, ExportError, ViewerError
+from aolink.errors import AolinkError, DeviceError, ExportError
 from aolink.estimation import Score, estimator_row
 from aolink.estimation.registry import BASELINE_ESTIMATOR, DEFAULT_ESTIMATOR
 from aolink.exposure import residual_rms
@@ -26,8 +26,6 @@ from aolink.recording.reestimate import first_difference, reestimate, scored
 from aolink.rig import Rig
 from aolink.session import Report, record
 
-_PICTURE_SIZE = (1600, 1000)
-"""Size of the viewer's picture, pixels."""
 _RIG_START_S = 60.0
 _RIG_END_S = 5.0
 
@@ -41,10 +39,8 @@ class DemoResult:
     rrd: Path | None = None
     """The Rerun file; None if the demo was interrupted before."""
     picture: Path | None = None
-    not_of_viewer: str = ""
-    """The reason why the picture is not the viewer's, but matplotlib's or None; empty where it is the viewer's."""
-    shown: str = ""
-    """The exposure that the picture is about, and why."""
+    no_picture: str = ""
+    """The reason why there is no picture."""
     report: Report
     scores: Mapping[str, Score] = field(default_factory=dict)
     """The estimators' scores against the truth, by rank."""
@@ -175,28 +171,15 @@ def run_demo(
         recording = Recording(folder / "deblurred.mcap")
     with part("write .rrd"):
         loops = {of or "open": Recording(where) for of, where, _ in sessions} if control else {}
-        number, why = next(iter(plotting.overview(recording).telling().items()))
-        viewing.save_rrd(recording, rrd, look=viewing.Look(loops=loops, about=number))
-    drawn: Path | None = picture
-    not_of_viewer = ""
+        viewing.save_rrd(recording, rrd, look=viewing.Look(loops=loops))
+    drawn, no_picture = None, ""
     with part("draw"):
         try:
-            viewing.screenshot(rrd, picture, size=_PICTURE_SIZE, at_ns=_middle_ns(recording, number))
-        except ViewerError as error:
-            drawn, not_of_viewer = None, str(error)
-            try:
-                drawn = plotting.draw_session(recording, picture)
-            except ExportError as also:
-                not_of_viewer += f"; {also}"
+            drawn = plotting.draw_session(recording, picture)
+        except ExportError as error:
+            no_picture = str(error)
     return DemoResult(
-        recording=recording.path, rrd=rrd, picture=drawn, not_of_viewer=not_of_viewer, report=report, scores=scores,
-        shown=f"exposure {number}, {why}", residuals=residuals, deblurred=deblurred, differences=differences,
+        recording=recording.path, rrd=rrd, picture=drawn, no_picture=no_picture, report=report, scores=scores,
+        residuals=residuals, deblurred=deblurred, differences=differences,
         seconds=seconds,
     )  # fmt: skip
-
-
-def _middle_ns(recording: Recording, number: int) -> int:
-    """The middle of an exposure, ns since the first exposure began."""
-    exposure = recording[number]
-    steps = exposure.first_step - recording[0].first_step + exposure.n_steps // 2
-    return steps * recording.rig.timing.fast_step_ns

@@ -1,4 +1,4 @@
-"""One exposure of a recording explained in one PNG, for machines on which the viewer cannot draw."""
+"""One exposure of a recording explained in one PNG."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def draw_session(series: Series, path: str | Path) -> Path:
     ExportError
         matplotlib is missing, the series has no exposure, or the file cannot be written.
     """
-    plain = needed("matplotlib", "plot", "a picture without the viewer")
+    plain = needed("matplotlib", "plot", "a picture")
     view = overview(series)
     need_exposures(view)
     number, why = next(iter(view.telling().items()))

@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     from aolink.viewing.look import Look
     from aolink.viewing.process import check_display, open_viewer, serve_web
     from aolink.viewing.save import save_rrd
-    from aolink.viewing.viewer import screenshot
 else:  # the type checker would accept any name
     from aolink.names import at_first_use
 
@@ -28,13 +27,12 @@ else:  # the type checker would accept any name
             "look": "Look",
             "process": "check_display open_viewer serve_web",
             "save": "save_rrd",
-            "viewer": "screenshot",
         },
     )
 
 __all__ = [
-    "LiveView", "Look", "check_display", "follow", "live_viewer", "open_viewer", "save_rrd", "screenshot", "serve",
-    "serve_web", "show",
+    "LiveView", "Look", "check_display", "follow", "live_viewer", "open_viewer", "save_rrd", "serve", "serve_web",
+    "show",
 ]  # fmt: skip
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
 import rerun.blueprint as rrb
@@ -19,44 +18,32 @@ View = rrb.Container | rrb.View
 
 PATH_WINDOW = 2
 """Exposures that the path's view shows to each side of the time cursor."""
-_HALF = 0.55
-"""The same where the layout is about one exposure, when the cursor is in its middle: the axis has room for its ends."""
-_ROWS = 8
-"""Exposures of a page that are shown where the layout is about one of them."""
 
 _LEGEND_ROW, _LEGEND_MOST = 0.1, 0.65
 """Height of a legend's row in a plot of the bottom row, and the most that all rows get, as shares of the plot's
 height."""
 
 
-def blueprint(
-    drawn: Drawing, compared: Drawing | None = None, *, about: int | None = None, alone: bool = False
-) -> rrb.Blueprint:
+def blueprint(drawn: Drawing, *, alone: bool = False) -> rrb.Blueprint:
     """The layout: the exposure on top, the session's estimates below it, the devices at the bottom.
 
-    For one exposure ``alone`` it has the path that explains its blur, beside its paths and its frame. A layout that is
-    ``about`` one exposure, given by its row on its page, has a few large views, though all exposures are there. The
-    drawing that is ``compared`` is shown beside the first.
+    For one exposure ``alone`` it has the path that explains its blur, beside its paths and its frame.
     """
-    return rrb.Blueprint(*_Layout(drawn, compared, about, alone).all())
+    return rrb.Blueprint(*_Layout(drawn, alone).all())
 
 
 class _Layout:
     """The views of a session, and their order."""
 
-    def __init__(self, drawn: Drawing, compared: Drawing | None, about: int | None, alone: bool) -> None:
-        self.drawn, self.compared, self.about, self.alone = drawn, compared, about, alone
-        self.sides = [drawn, *([compared] if compared else [])]
+    def __init__(self, drawn: Drawing, alone: bool) -> None:
+        self.drawn, self.alone = drawn, alone
         self.names = drawn.estimators
         self.truth = drawn.has(f"{entities.PATH}/truth")
         self.states = range(1, 1 + min(drawn.rig.plant.n_states, MOST_STATES))
 
     def all(self) -> list[rrb.Container | rrb.BlueprintPanel | rrb.SelectionPanel | rrb.TimePanel]:
         layout: rrb.Container
-        if self.about is not None:
-            explained = [self.camera()[0], self.profile(), *self.residual()]
-            layout = rrb.Horizontal(rrb.Vertical(contents=explained), self.paths())
-        elif self.alone:
+        if self.alone:
             seen = self.camera()
             cameras = rrb.Horizontal(contents=seen) if self.drawn.has(entities.RESTORED_SPOTS) else _tabs(seen)
             beside = rrb.Vertical(contents=[self.paths(), cameras, self.texts()], row_shares=[3, 3, 1])
@@ -77,72 +64,49 @@ class _Layout:
         return [layout, *panels, rrb.TimePanel(state="collapsed", timeline=TIME)]
 
     def camera(self) -> list[rrb.View]:
-        """The frame and the page that the exposure is on; also those of the recording that is compared."""
+        """The frame and the page that the exposure is on."""
         sensor = self.drawn.rig.sensor
         views: list[rrb.View] = []
-        for each in self.sides:
-            root, title = each.root, "Compared: " if each.root else "Camera: "
-            drawn = [*(["truth"] if each.has(f"{entities.PATH}/truth") else []), *each.estimators[-1:]]
-            if sensor.directions == 2:
-                shown = [entities.FRAME, *(f"{entities.FRAME}/path/{name}" for name in drawn)]
-                views.append(_picture(root, shown, f"{title}frame (pixels), paths", *sensor.shape))
-            shown = [entities.PAGE, entities.CENTROIDS, entities.ROW_NOW]
-            shown += [f"{entities.PAGE}/path/{name}" for name in drawn]
-            what = "paths in their blur" if sensor.directions == 1 else "one spot along x"
-            rows, columns = self.part_of_page(each)
-            count = "one exposure" if self.alone else f"{len(rows)} exposures"
-            name = f"{title}{count} (pixels), {what}"
-            views.append(_picture(root, shown, name, len(rows), len(columns), (rows[0], columns[0])))
-            if each.has(entities.RESTORED_SPOTS):
-                name = f"{title}frame restored (pixels)"
-                views.append(_picture(root, [entities.RESTORED_SPOTS], name, *sensor.shape))
+        drawn = [*(["truth"] if self.truth else []), *self.names[-1:]]
+        if sensor.directions == 2:
+            shown = [entities.FRAME, *(f"{entities.FRAME}/path/{name}" for name in drawn)]
+            views.append(_picture(shown, "Camera: frame (pixels), paths", *sensor.shape))
+        shown = [entities.PAGE, entities.CENTROIDS, entities.ROW_NOW]
+        shown += [f"{entities.PAGE}/path/{name}" for name in drawn]
+        what = "paths in their blur" if sensor.directions == 1 else "one spot along x"
+        count = "one exposure" if self.alone else f"{HISTORY} exposures"
+        views.append(_picture(shown, f"Camera: {count} (pixels), {what}", HISTORY, sensor.profile.pixels))
+        if self.drawn.has(entities.RESTORED_SPOTS):
+            views.append(_picture([entities.RESTORED_SPOTS], "Camera: frame restored (pixels)", *sensor.shape))
         return views
-
-    def part_of_page(self, drawn: Drawing) -> tuple[range, range]:
-        """The rows and the columns of a page that are shown: all, or those about the exposure that the layout is
-        about."""
-        line, near = drawn.rig.sensor.profile, drawn.near
-        if self.about is None or near is None:
-            return range(HISTORY), range(line.pixels)
-        first = min(max(0, self.about - _ROWS // 2), HISTORY - _ROWS)
-        low, high = ((end - line.field[0]) / line.pixel_width for end in near)
-        return range(first, first + _ROWS), range(math.floor(low), math.ceil(high))
 
     def scenes(self) -> list[rrb.View]:
         """The scene as it came, restored, at rest."""
         titles = (SCENES["came"], SCENES["restored"], f"{SCENES['true']} (truth)")
         sensor = self.drawn.rig.scene
         return [
-            _picture("", [path], f"Scene {title} (pixels)", *sensor.shape)
+            _picture([path], f"Scene {title} (pixels)", *sensor.shape)
             for path, title in zip(entities.SCENES, titles, strict=True)
             if sensor is not None and self.drawn.has(path)
         ]
 
     def profile(self) -> View:
         """The explanation of the blur: path, histogram and intensity over one axis, with the key of all colours."""
-        views: list[rrb.View] = []
-        for each in self.sides:
-            names = 1 + len(each.estimators) + each.has(f"{entities.PATH}/truth")
-            bounds = profile_bounds(each.rig.sensor.profile, each.top or 1.0, names, each.near)
-            title = f"Intensity ({PER_SLOPE}) over slope: measured, and predicted"
-            if self.about is None or each.root:
-                path = "Compared: path" if each.root else "Path"
-                title = f"{path}; time at a position; intensity ({PER_SLOPE}) over slope"
-            shown = rrb.VisualBounds2D(x_range=bounds[0], y_range=bounds[1])
-            views.append(rrb.Spatial2DView(origin=each.root + entities.PROFILE, name=title, visual_bounds=shown))
-        return _tabs(views)
+        drawn = self.drawn
+        x_range, y_range = profile_bounds(drawn.rig.sensor.profile, drawn.top or 1.0, 1 + len(self.names) + self.truth)
+        title = f"Path; time at a position; intensity ({PER_SLOPE}) over slope"
+        shown = rrb.VisualBounds2D(x_range=x_range, y_range=y_range)
+        return rrb.Spatial2DView(origin=entities.PROFILE, name=title, visual_bounds=shown)
 
     def paths(self) -> View:
         """A tab for each estimator with its band, with the estimator of the highest rank in front, and a tab with all
-        of them. In a layout that is about one exposure they are under each other, by rank."""
+        of them."""
         names, truth = self.names, [f"{entities.PATH}/truth/**"] if self.truth else []
         unit = f"({SLOPES}{', y fainter' if len(self.drawn.labels) > 1 else ''})"
         tabs: list[View] = [
             self.lines(f"Path, {name}, 95 % band {unit}", [*truth, f"{entities.PATH}/{name}/**"], window=not self.alone)
             for name in reversed(names)
         ]
-        if self.about is not None and names:
-            return rrb.Vertical(contents=tabs[::-1])
         if not truth and not names:
             return rrb.TextDocumentView(origin=entities.SESSION, name="No paths: no estimates, no truth")
         bands = [entities.band(f"{entities.PATH}/{name}") for name in names]
@@ -180,7 +144,7 @@ class _Layout:
                 end = f"{self.drawn.scales[name]:.2g}"
                 low = f"-{end}" if colours == "RdBu_r" else "0"
                 words = f"{title[0].upper()}{title[1:]} ({unit}), {low} to {end}"
-                views.append(_picture("", [f"{entities.PUPIL}/{name}"], words, *self.drawn.rig.sensor.grid))
+                views.append(_picture([f"{entities.PUPIL}/{name}"], words, *self.drawn.rig.sensor.grid))
         return [rrb.Grid(contents=views, grid_columns=2)] if views else []
 
     def residual(self) -> list[View]:
@@ -214,8 +178,6 @@ class _Layout:
         for entity, name in ((entities.WARNINGS, "Warnings"), (entities.LOG, "Log")):
             if self.drawn.has(entity):
                 texts.append(rrb.TextLogView(origin=entity, name=name))
-        if self.compared:
-            texts.append(rrb.TextDocumentView(origin=self.compared.root + entities.SESSION, name="Compared"))
         return _tabs(texts)
 
     def legended(self, views: dict[str, list[str]]) -> list[View]:
@@ -230,24 +192,19 @@ class _Layout:
     def lines(
         self, name: str, shown: list[str], hidden: Sequence[str] = (), *, window: bool = False, legend: bool = False
     ) -> rrb.TimeSeriesView:
-        """A plot over time: of the whole session, or of `PATH_WINDOW` exposures about the time cursor; in a layout that
-        is about one exposure, of that length. Beside each path that is shown is its twin of the recording compared.
+        """A plot over time: of the whole session, or of `PATH_WINDOW` exposures about the time cursor.
 
         A ``legend`` stands above the lines; without one, the profile's key has the colours.
         """
         corner = rrb.PlotLegend(rrb.Corner2D.LeftTop, visible=legend)
-        expressions = [f"+ /{path}" for path in shown]
-        if self.compared is not None:
-            theirs = [path for path in shown if self.compared.has(path.removesuffix("/**"))]
-            expressions += [f"+ /{self.compared.root}{path}" for path in theirs]
-        expressions += [f"- /{each.root}{path}" for each in self.sides for path in hidden]
+        expressions = [*(f"+ /{path}" for path in shown), *(f"- /{path}" for path in hidden)]
         if not window:
             whole = rrb.TimeRange(rrb.TimeRangeBoundary.infinite(), rrb.TimeRangeBoundary.infinite())
             axis_x = rrb.archetypes.TimeAxis(view_range=whole)
             axis_y = self.room_above(shown) if legend else None
             return rrb.TimeSeriesView(name=name, contents=expressions, axis_x=axis_x, axis_y=axis_y, plot_legend=corner)
         timing = self.drawn.rig.timing
-        steps = PATH_WINDOW * timing.frame_period_steps if self.about is None else round(_HALF * timing.exposure_steps)
+        steps = PATH_WINDOW * timing.frame_period_steps
         near, span_s = rrb.TimeRangeBoundary.cursor_relative, steps * timing.fast_step_s
         ranges = [
             rrb.VisibleTimeRange(FAST_STEP, start=near(seq=-steps), end=near(seq=steps)),
@@ -271,9 +228,6 @@ def _tabs(views: Sequence[View]) -> View:
     return rrb.Tabs(contents=views, active_tab=0) if len(views) > 1 else views[0]
 
 
-def _picture(
-    root: str, paths: list[str], name: str, rows: int, columns: int, corner: tuple[int, int] = (0, 0)
-) -> rrb.View:
-    (top, left) = corner
-    bounds = rrb.VisualBounds2D(x_range=(left, left + columns), y_range=(top, top + rows))
-    return rrb.Spatial2DView(name=name, contents=[f"+ /{root}{path}" for path in paths], visual_bounds=bounds)
+def _picture(paths: list[str], name: str, rows: int, columns: int) -> rrb.View:
+    bounds = rrb.VisualBounds2D(x_range=(0, columns), y_range=(0, rows))
+    return rrb.Spatial2DView(name=name, contents=[f"+ /{path}" for path in paths], visual_bounds=bounds)

@@ -29,8 +29,6 @@ HISTORY = 32
 """Exposures on a page."""
 _PANELS = (0.20, 0.16, 0.32)
 """Heights of the profile's panels as shares of their width: path, histogram of the path, intensity."""
-_ALONE = (0.0, 0.0, 0.6)
-"""The same where the intensity is drawn alone."""
 _GAP = 0.03
 """Gap between the panels, in the same unit."""
 _KEY_ROW, _KEY_COLUMNS = 0.095, 5
@@ -39,8 +37,8 @@ _MOST = 1.0 + _GAP / _PANELS[2]
 """Highest predicted intensity drawn, relative to the panel's top: a higher one would reach into the panel above."""
 _LIGHT = 2.5
 """Top of the histogram divided by that of the intensity, which is the histogram blurred."""
-_POINTS_IN_ROW, _POINTS_IN_HIGH_ROW = 21, 101
-"""Points of a path inside one row of a page, more than the eye can separate: of many rows, and of a few."""
+_POINTS_IN_ROW = 21
+"""Points of a path inside one row of a page, more than the eye can separate."""
 _SWINGS_IN_ROW = 5
 """A path over some pixels that a curve through this many points would miss is drawn as its range, because a row is not
 high."""
@@ -73,7 +71,7 @@ def log_camera(
     # The following is about one slope over time.
     blurs = [Blur.of(drawing.rig, each, drawing.outputs[0]) for each in steps]
     if drawing.top is None:
-        drawing.top = _density_top(blurs, alone=drawing.near is not None)
+        drawing.top = _density_top(blurs)
         truth = ["truth"] if any(each.exposure.truth is not None for each in steps) else []
         _log_profile_axes(drawing, sensor.profile, drawing.top, [*truth, *drawing.estimators])
     pages: dict[int, list[Blur]] = {}
@@ -123,15 +121,14 @@ def page_of(exposure: Exposure, first_frame: int) -> int:
     return (exposure.frame_id - first_frame) // HISTORY
 
 
-def _density_top(blurs: Sequence[Blur], *, alone: bool) -> float:
+def _density_top(blurs: Sequence[Blur]) -> float:
     """Density at the top of the profile's plot: the brightest pixel of all but the most extreme exposures.
 
-    Where all exposures are dark, it is the peak of a resting spot, so that the plot has the same scale as with light;
-    so it is where the intensity is drawn ``alone``, so that no predicted one is cut.
+    Where all exposures are dark, it is the peak of a resting spot, so that the plot has the same scale as with light.
     """
     brightest = [np.nanmax(each.measured) for each in blurs if np.isfinite(each.measured).any()]
     top, line = float(np.percentile(brightest, 98)) if brightest else 0.0, blurs[0].line
-    return top if top > pixel_noise_sd(line) and not alone else max(top, line.peak_density)
+    return top if top > pixel_noise_sd(line) else max(top, line.peak_density)
 
 
 def _log_page(
@@ -167,21 +164,19 @@ def _log_page(
     drawing.log(CENTROIDS, rr.Points2D.from_fields(colors=_PALE, radii=rr.Radius.ui_points(2.5)))
     columns = rr.Points2D.columns(positions=points.astype(np.float32)).partition([len(points)])
     drawing.send_columns(CENTROIDS, timebase.at_starts([at]), columns)
-    high = drawing.near is not None
     for name in dict.fromkeys(name for each in page for name in each.paths):
         strips = []
         for row, path in [(row, each.paths[name]) for row, each in zip(rows, page, strict=True) if name in each.paths]:
-            if not high and np.ptp(path) > _PIXELS * line.pixel_width and hides_swings(path, _SWINGS_IN_ROW):
+            if np.ptp(path) > _PIXELS * line.pixel_width and hides_swings(path, _SWINGS_IN_ROW):
                 edges: tuple[FloatArray, ...] = extremes(path, _SWINGS_IN_ROW)
                 places = (np.arange(len(edges[0])) + 0.5) / len(edges[0])
             else:
-                some = _drawn(len(path), _POINTS_IN_HIGH_ROW if high else _POINTS_IN_ROW)
+                some = _drawn(len(path), _POINTS_IN_ROW)
                 edges, places = (path[some],), (some + 0.5) / len(path)
             for edge in edges:
                 x = np.clip((edge - line.field[0]) / line.pixel_width, 0, line.pixels)
                 strips.append(np.stack([x, row + places], axis=1))
-        width = 0.8 if high else 1.5
-        _send_strips(drawing, f"{PAGE}/path/{name}", timebase, [at], [strips], colour_of(name), width)
+        _send_strips(drawing, f"{PAGE}/path/{name}", timebase, [at], [strips], colour_of(name), 1.5)
 
 
 def _log_profile_axes(drawing: Drawing, sensor: Sensor, top: float, names: Sequence[str]) -> None:
@@ -189,12 +184,11 @@ def _log_profile_axes(drawing: Drawing, sensor: Sensor, top: float, names: Seque
 
     The key has the colour of each of ``names`` and of the measured profile; they are the same in all views.
     """
-    low, high = drawing.near or sensor.field
-    place = Panels(sensor, top, drawing.near)
+    low, high = sensor.field
+    place = Panels(sensor, top)
     slopes, heights = _ticks(low, high), _ticks(0.0, top)[1:]
-    panels = [2] if drawing.near else [0, 1, 2]
-    grid = [place(np.array([(x, 0.0), (x, 1.0)]), k) for k in panels for x in slopes]
-    grid += [place(np.array([(low, y), (high, y)]), k) for k in panels for y in (0.0, 1.0)]
+    grid = [place(np.array([(x, 0.0), (x, 1.0)]), k) for k in range(3) for x in slopes]
+    grid += [place(np.array([(low, y), (high, y)]), k) for k in range(3) for y in (0.0, 1.0)]
     grid += [place(np.array([(low, y / top), (high, y / top)])) for y in heights]
     fine = rr.Radius.ui_points(0.5)
     drawing.log(f"{PROFILE}/axes", rr.LineStrips2D(grid, colors=(90, 90, 90), radii=fine, draw_order=1.0))
@@ -215,10 +209,10 @@ def _log_profile(drawing: Drawing, timebase: Timebase, blurs: Sequence[Blur], to
     a path, its histogram, and the intensity that the kernel makes of it.
 
     ``/profile/path/NAME`` (time runs upwards), ``/profile/histogram/NAME`` and ``/profile/predicted/NAME``, both as
-    densities over the same slopes; the last one alone for a layout that is about one exposure.
+    densities over the same slopes.
     """
     line = blurs[0].line
-    place = Panels(line, top, drawing.near)
+    place = Panels(line, top)
 
     def send(what: str, known: Sequence[Blur], strips: list[FloatArray], colour: Colour, width: float) -> None:
         exposures, of_each = [each.exposure for each in known], [[strip] for strip in strips]
@@ -240,18 +234,15 @@ def _log_profile(drawing: Drawing, timebase: Timebase, blurs: Sequence[Blur], to
     send("measured", blurs, seen, MEASURED, 1.0)
     for name in dict.fromkeys(name for each in blurs for name in each.paths):
         known, colour = [each for each in blurs if name in each.paths], colour_of(name)
-        if drawing.near is None:
-            send(f"path/{name}", known, [path_of(each.paths[name]) for each in known], colour, 1.2)
-            send(f"histogram/{name}", known, [histogram_of(*each.histogram(name)) for each in known], colour, 1.2)
+        send(f"path/{name}", known, [path_of(each.paths[name]) for each in known], colour, 1.2)
+        send(f"histogram/{name}", known, [histogram_of(*each.histogram(name)) for each in known], colour, 1.2)
         predicted = [intensity_of(line.centres, each.predicted(name)) for each in known]
         send(f"predicted/{name}", known, predicted, colour, 1.5)
 
 
-def profile_bounds(
-    sensor: Sensor, top: float, names: int, near: tuple[float, float] | None = None
-) -> tuple[tuple[float, float], tuple[float, float]]:
+def profile_bounds(sensor: Sensor, top: float, names: int) -> tuple[tuple[float, float], tuple[float, float]]:
     """Range of the profile's plot with a key of a number of names, in its drawing units: x, and y downwards."""
-    (low, high), place = near or sensor.field, Panels(sensor, top, near)
+    (low, high), place = sensor.field, Panels(sensor, top)
     bottom = place(np.array([(low, -place.depth / top - 0.22)]))[0, 1]
     upper = float(place.key(names - 1)[1]) - 0.08 * (high - low)
     return (low - 0.1 * (high - low), high + 0.05 * (high - low)), (upper, float(bottom))
@@ -260,25 +251,24 @@ def profile_bounds(
 class Panels:
     """The places of the three panels of the profile's plot in its drawing units: slope to the right, y downwards.
 
-    The path is on top, its time running upwards, then its histogram, and the intensity's zero is at y = 0. The
-    intensity is alone where a part of the field is given, ``near``.
+    The path is on top, its time running upwards, then its histogram, and the intensity's zero is at y = 0.
     """
 
-    def __init__(self, sensor: Sensor, top: float, near: tuple[float, float] | None = None) -> None:
-        self._low, high = near or sensor.field
-        self._width, self._heights = high - self._low, _ALONE if near else _PANELS
+    def __init__(self, sensor: Sensor, top: float) -> None:
+        self._low, high = sensor.field
+        self._width = high - self._low
         self.depth = max(0.08 * top, 2.5 * pixel_noise_sd(sensor))
         """How far the noise reaches below zero, in density; labels under the plot stand below that."""
 
     def __call__(self, points: FloatArray, panel: int = 2) -> FloatArray:
         """The places of points (slope, height from 0 to 1), (n, 2), of a panel: path 0, histogram 1, intensity 2."""
-        base = -self._width * (sum(self._heights[panel + 1 :]) + (2 - panel) * _GAP)
-        return np.stack([points[:, 0], base - self._heights[panel] * self._width * points[:, 1]], axis=1)
+        base = -self._width * (sum(_PANELS[panel + 1 :]) + (2 - panel) * _GAP)
+        return np.stack([points[:, 0], base - _PANELS[panel] * self._width * points[:, 1]], axis=1)
 
     def key(self, number: int) -> FloatArray:
         """Middle of the ``number``-th name, above the panels, (2,)."""
         row, column = divmod(number, _KEY_COLUMNS)
-        above = -(sum(self._heights) + 2 * _GAP + (row + 1) * _KEY_ROW) * self._width
+        above = -(sum(_PANELS) + 2 * _GAP + (row + 1) * _KEY_ROW) * self._width
         return np.array([self._low + (column + 0.5) / _KEY_COLUMNS * self._width, above])
 
 

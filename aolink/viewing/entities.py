@@ -50,8 +50,6 @@ LOG = _of(topics.LOG)
 STATUS = "status"
 WARNINGS = "warnings"
 SESSION = "session"
-COMPARED = "compared/"
-"""Root of all entities of the recording that is compared."""
 
 
 def mean(path: str) -> str:

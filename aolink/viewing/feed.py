@@ -55,7 +55,7 @@ def show(recording: Recording, look: Look | None = None, *, progress: Callable[[
     Parameters
     ----------
     look:
-        A part of it, another spot, or another recording beside it; by default the whole recording alone.
+        A part of it, or another spot; by default the whole recording.
     progress:
         Called with the number of exposures that have been sent.
 

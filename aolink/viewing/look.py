@@ -22,11 +22,6 @@ class Look:
     step."""
     spot: int = 0
     """Number of the spot whose lines, profile and pages are shown."""
-    compared: Recording | None = None
-    """Another recording that is shown beside it, from its own first exposure on."""
-    about: int | None = None
-    """Number of an exposure that the layout is about, in a few large views, though all of them are there. Its paths,
-    too, are shown at every fast step."""
     loops: Mapping[str, Recording] = field(default_factory=dict)
     """Recordings of one disturbance by the names of what closed their loops, this one among them: their residual
     slopes are drawn in one plot, each from its own first exposure on."""
@@ -36,8 +31,6 @@ def identity(recording: Recording, look: Look) -> str:
     """The name by which Rerun knows a recording with this `Look`."""
     if look == Look():
         return recording.digest
-    exposures, spot, other = look.exposures, look.spot, look.compared
-    part = f"{exposures.start}-{exposures.stop}" if exposures else "all"
+    part = f"{look.exposures.start}-{look.exposures.stop}" if look.exposures else "all"
     loops = "".join(f"/{name}={loop.digest}" for name, loop in look.loops.items())
-    about = "" if look.about is None else f"/about {look.about}"
-    return f"{recording.digest}/{part}/{spot}/{other.digest if other else ''}{about}{loops}"
+    return f"{recording.digest}/{part}/{look.spot}{loops}"

@@ -22,32 +22,24 @@ from urllib.parse import quote
 
 import rerun_cli  # type: ignore[import-untyped] # it has only its program
 
-from aolink.errors import RendererError, ViewerError
+from aolink.errors import ViewerError
 from aolink.numerics.workers import end_with
-from aolink.viewing.vulkan import has_vulkan
 
 HOST = "127.0.0.1"
 WEB_PORT = 9090
 """Port of the web viewer's page, if no other program uses it."""
-POLL_S = 0.05
 
+_POLL_S = 0.05
 _START_S = 30.0
 """How long a viewer may take to answer; a software renderer on a busy machine needs a few seconds."""
 _STOP_S = 5.0
 """How long a viewer may take to end by itself, s."""
-_LAST_WORDS_S = 2.0
-"""How long a viewer that has failed may take to end."""
 _MAGIC = b"RRF"
 """The first bytes of every Rerun file; the version of the format follows."""
 
-_NO_DRIVER = (
-    "this machine has no Vulkan driver, which the Rerun viewer needs to draw;"
-    " on Debian: apt-get install mesa-vulkan-drivers"
-)
-
 
 def check_display(
-    instead: str = "there is no display: use `aolink view --web` for a browser, or -o X.png for a picture",
+    instead: str = "there is no display: use `aolink view --web` for a browser, or `aolink report`",
 ) -> None:
     """Raise `ViewerError` where a window cannot be opened."""
     if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
@@ -102,39 +94,27 @@ class Server:
 
     def listen(self) -> None:
         """Wait until it listens, which takes some time after its start. Raises `ViewerError` if it never does."""
-        self.wait_for(lambda: not any(is_free(port) for port in (self.page_port, self.data_port) if port is not None))
-
-    def wait_for(self, ready: Callable[[], bool]) -> None:
-        """Wait until it is ready. Raises `ViewerError` if it never is."""
         deadline = time.monotonic() + _START_S
-        while not ready():
+        while any(is_free(port) for port in (self.page_port, self.data_port) if port is not None):
             if self.process.poll() is not None:
                 raise self.why_it_ended()
             if time.monotonic() > deadline:
                 raise ViewerError(f"Rerun did not answer within {_START_S:g} s")
-            time.sleep(POLL_S)
+            time.sleep(_POLL_S)
 
     def wait(self) -> None:
         """Wait until it ends. Raises `ViewerError` if it ends by itself."""
         if self.process.wait() != 0:
             raise self.why_it_ended()
 
-    def has_ended(self) -> bool:
-        """Whether it has ended, or ends soon: a viewer that fails writes its error before it ends."""
-        try:
-            self.process.wait(_LAST_WORDS_S)
-        except subprocess.TimeoutExpired:
-            return False
-        return True
-
     def why_it_ended(self) -> ViewerError:
-        """The reason why it ended by itself: a driver that the machine lacks, or else Rerun's own first error."""
-        if sys.platform == "linux" and not has_vulkan():
-            return RendererError(_NO_DRIVER)
+        """The reason why it ended by itself: Rerun's own first error; most often a driver that the machine lacks."""
         self.said.seek(0)
         lines = [line.strip() for line in self.said.read().decode(errors="replace").splitlines() if line.strip()]
         causes = [line for line in lines if "panicked at" in line or "ERROR" in line or line.startswith("Error")]
-        return ViewerError(f"Rerun ended: {(causes or lines)[0]}" if lines else "Rerun ended without saying why")
+        why = f"Rerun ended: {(causes or lines)[0]}" if lines else "Rerun ended without saying why"
+        driver = "; its window needs a Vulkan driver, on Debian mesa-vulkan-drivers" if self.page_port is None else ""
+        return ViewerError(why + driver)
 
 
 @contextmanager

@@ -15,7 +15,7 @@ from aolink.colours import by_rank
 from aolink.errors import ViewerError
 from aolink.estimation.score import Scorer, score_table
 from aolink.exposure import Exposure
-from aolink.gathered import Blur, lacks
+from aolink.gathered import lacks
 from aolink.recording import topics
 from aolink.recording.reader import Restorations
 from aolink.recording.side_files import check_stands_alone
@@ -58,7 +58,7 @@ def save_rrd(
     path:
         The file to write; it appears only when it is whole.
     look:
-        A part of it, another spot, or another recording beside it; by default the whole recording alone.
+        A part of it, or another spot; by default the whole recording.
     overwrite:
         Whether a file of that name may be replaced.
     progress:
@@ -70,8 +70,7 @@ def save_rrd(
         The file exists already or cannot be written, or the recording has nothing to show.
     """
     path, look = Path(path), look or Look()
-    beside = [*([look.compared] if look.compared else ()), *look.loops.values()]
-    sources = [file for each in (recording, *beside) for file in each.files]
+    sources = [file for each in (recording, *look.loops.values()) for file in each.files]
     with new_rrd(APPLICATION, path, overwrite=overwrite, sources=sources, identity=identity(recording, look)) as stream:
         for done in sent_parts(stream, recording, look):
             if progress:
@@ -94,56 +93,34 @@ def sent_parts(
         It is a side file.
     """
     sender = RecordingSender(stream, recording, look)
-    other = None
-    if look.compared is not None:
-        beside = Look(exposures=look.exposures, spot=look.spot)
-        other = RecordingSender(stream, look.compared, beside, root=entities.COMPARED)
     stream.send_recording_name(f"{recording.rig.name} · {recording.path.name}")
 
     def lay_out() -> None:
-        layout = blueprint(
-            sender.drawing, other.drawing if other else None, about=sender.row, alone=len(sender.numbers) == 1
-        )
+        layout = blueprint(sender.drawing, alone=len(sender.numbers) == 1)
         # Active too: a viewer that gets the data over the network would otherwise keep a layout of its own.
         stream.send_blueprint(layout, make_active=True, make_default=True)
 
-    theirs = other.parts() if other else iter(())
     for done in sender.parts():
-        next(theirs, None)
         if at_once:
             lay_out()
             at_once = False
         yield done
-    for _ in theirs:
-        pass
     lay_out()
 
 
 class RecordingSender(Sender):
     """Sends a recording to a stream, part by part, so that the memory does not grow with its length."""
 
-    def __init__(self, stream: rr.RecordingStream, recording: Recording, look: Look, root: str = "") -> None:
+    def __init__(self, stream: rr.RecordingStream, recording: Recording, look: Look) -> None:
         check_stands_alone(recording)
         names = by_rank(list(recording.estimators))
-        super().__init__(Drawing(stream=stream, rig=recording.rig, estimators=names, spot=look.spot, root=root))
-        self._recording, self._look, drawing = recording, look, self.drawing
+        super().__init__(Drawing(stream=stream, rig=recording.rig, estimators=names, spot=look.spot))
+        self._recording, self._look = recording, look
         self.numbers = range(len(recording)) if look.exposures is None else look.exposures
-        self._about: Exposure | None = None
-        if look.about is not None:
-            (step,) = recording[look.about : look.about + 1].steps(names)
-            self._about = step.exposure
-            drawing.near = Blur.of(recording.rig, step, drawing.outputs[0]).limits
-        if self._about is not None or len(self.numbers) <= 2 * PATH_WINDOW + 1:
-            drawing.points = None
+        if len(self.numbers) <= 2 * PATH_WINDOW + 1:
+            self.drawing.points = None
         self._scorers = {name: Scorer() for name in names}
         self._skipped: Counter[str] = Counter()
-
-    @property
-    def row(self) -> int | None:
-        """The row, on its page, of the exposure that the layout is about."""
-        if self._about is None or self.timebase is None:
-            return None
-        return (self._about.frame_id - self.timebase.frame_id) % camera.HISTORY
 
     def parts(self) -> Iterator[int]:
         """Send the exposures with all that belongs to them, then the devices; gives after each part how many exposures
@@ -251,8 +228,6 @@ class RecordingSender(Sender):
         if self._skipped:
             counts = ", ".join(f"{name} {count}" for name, count in self._skipped.items())
             lines += ["", f"Exposures skipped for want of time: {counts}"]
-        if look.compared is not None:
-            lines += ["", f"Fainter lines are of {look.compared.path.name}, from its own first exposure on."]
         return "\n".join([*lines, "", " ".join(lacks(recording)), "", rig.summary])
 
 

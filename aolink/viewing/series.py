@@ -22,7 +22,7 @@ PERCENTILES = (5, 50, 95)
 POINTS = 32
 """Points that a path is drawn with in a long session: more than its exposure has columns on a screen."""
 _SECOND = 0.55
-"""Opacity of the second of two lines that belong together, and of the lines of a recording that is compared."""
+"""Opacity of the second of two lines that belong together."""
 
 
 @dataclass(kw_only=True)
@@ -36,13 +36,8 @@ class Drawing:
     """The estimators in rank order; the band of the last one is shown first."""
     spot: int = 0
     """Number of the spot, of many, that is drawn as lines."""
-    root: str = ""
-    """Prefix of every entity's name, with its slash, where a recording is shown beside another."""
     points: int | None = POINTS
     """Points with which a path of one exposure is drawn; None: every fast step."""
-    near: tuple[float, float] | None = None
-    """The part of the field that is drawn of one exposure's intensity profile, where the layout is about that exposure:
-    its path and histogram are then not drawn beside it."""
     sent: set[str] = field(default_factory=set)
     """The entities that have data."""
     top: float | None = None
@@ -74,12 +69,12 @@ class Drawing:
 
     def log(self, path: str, what: Any) -> None:
         """Log data that is valid for the whole session."""
-        self.stream.log(self.root + path, what, static=True)
+        self.stream.log(path, what, static=True)
         self.sent.add(path)
 
     def send_columns(self, path: str, times: Sequence[rr.TimeColumn], columns: Iterable[Any]) -> None:
         """Send rows of an entity."""
-        self.stream.send_columns(self.root + path, times, columns)
+        self.stream.send_columns(path, times, columns)
         self.sent.add(path)
 
     def has(self, entity: str) -> bool:
@@ -118,8 +113,7 @@ def send_line(
     if not len(columns):
         return
     lines = 1 if columns.ndim == 1 else columns.shape[1]
-    alpha = round(style.alpha * (_SECOND if drawing.root else 1.0))
-    faint = [alpha if k == 0 or not labels else round(_SECOND * alpha) for k in range(lines)]
+    faint = [style.alpha if k == 0 or not labels else round(_SECOND * style.alpha) for k in range(lines)]
     look = rr.SeriesLines(
         names=[style.name + label for label in (labels or [""] * lines)],
         colors=[(*style.colour, each) for each in faint],

@@ -59,7 +59,6 @@ def scene_psnrs(recording: Recording) -> tuple[float, float]:
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("without_vulkan")
 def test_the_demo_ends_with_what_its_recording_says(
     aolink: Callable[..., subprocess.CompletedProcess[str]], tmp_path: Path
 ) -> None:
@@ -82,8 +81,6 @@ def test_the_demo_ends_with_what_its_recording_says(
     assert {row.strip() for row in rows.partition("\n\n")[0].splitlines()[1:]} <= {
         line.strip() for line in done.stdout.splitlines()
     }
-    moved = [float(np.std(each.truth.path)) for each in recording.exposures() if each.truth is not None]
-    assert f"exposure {int(np.argmax(moved))}, the largest blur" in done.stdout
     assert "agree bit for bit" in done.stdout
     assert {"rig.toml", "session.mcap", "session.rrd", "session.png"} <= {each.name for each in folder.iterdir()}
     for never in ("discarded", "superseded", "late", "parked", "latency"):
@@ -91,7 +88,6 @@ def test_the_demo_ends_with_what_its_recording_says(
 
 
 @pytest.mark.rare
-@pytest.mark.usefixtures("without_vulkan")
 def test_the_demo_runs_the_estimators_that_are_named(
     aolink: Callable[..., subprocess.CompletedProcess[str]], tmp_path: Path
 ) -> None:

@@ -1,10 +1,9 @@
-"""The picture of an exposure where the viewer cannot draw: what is in it, and when the demo makes it."""
+"""The demo's picture of an exposure: what is in it."""
 
 from __future__ import annotations
 
 import subprocess
 import sys
-from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
 
@@ -86,40 +85,18 @@ def test_what_cannot_be_drawn_or_written_is_one_clear_error(tmp_path: Path) -> N
         draw_session(Recording(LIVELY), tmp_path / "absent" / "a.png")
 
 
-@pytest.mark.rare
-@pytest.mark.usefixtures("without_vulkan")
-def test_the_demo_draws_it_and_names_the_package(
-    aolink: Callable[..., subprocess.CompletedProcess[str]], tmp_path: Path
-) -> None:
-    result = aolink("demo", "--rig", "single-lenslet", "--exposures", "4", "-o", tmp_path)
-    assert result.returncode == 0, result.stderr
-    (folder,) = tmp_path.glob("demo-*")
-    (line,) = [each for each in result.stdout.splitlines() if each.startswith("picture")]
-    assert line == (
-        f"picture   {folder / 'session.png'}, drawn with matplotlib: this machine has no Vulkan driver, which the"
-        " Rerun viewer needs to draw; on Debian: apt-get install mesa-vulkan-drivers"
-    )
-    assert coloured(pixels(folder / "session.png"), estimator_colour("moments")).sum() > 200
-
-
 @pytest.mark.slow
-@pytest.mark.usefixtures("without_vulkan")
 def test_without_matplotlib_the_demo_says_what_to_install(tmp_path: Path) -> None:
     code = "import sys; sys.modules['matplotlib'] = None; from aolink.cli import main; main()"
     command = [
         sys.executable,
         "-c",
         code,
-        "demo",
-        "--rig",
-        "single-lenslet",
-        "--exposures",
-        "4",
-        "-o",
+        *["demo", "--rig", "single-lenslet", "--exposures", "4", "-o"],
         str(tmp_path),
     ]
     result = subprocess.run(command, capture_output=True, text=True, timeout=120)
     assert result.returncode == 0, result.stderr
     (line,) = [each for each in result.stdout.splitlines() if each.startswith("picture")]
-    assert line.startswith("picture   none: this machine has no Vulkan driver")
-    assert line.endswith(f"a picture without the viewer needs matplotlib: {install_command('plot')}")
+    assert line.startswith("picture   none")
+    assert line.endswith(install_command("plot"))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 import subprocess
 import sys
@@ -104,20 +103,11 @@ def test_a_word_that_no_row_has_is_an_error() -> None:
 @pytest.mark.parametrize(
     "name", ["method", *(pytest.param(each, marks=pytest.mark.rare) for each in ("demo", "scene", "pupil", "loop"))]
 )
-def test_pictures_are_made_and_are_those_of_the_pages(name: str, tmp_path: Path) -> None:
-    """Short ones; README and the gallery show the repository's own, which are small."""
+def test_pictures_are_made(name: str, tmp_path: Path) -> None:
     done = run(TOOLS / "pictures", name, "--short", "--out", tmp_path)
-    if "no Vulkan driver" in done.stderr and not os.environ.get("AOLINK_REQUIRE_ALL"):
-        pytest.skip(done.stderr)
     assert done.returncode == 0, done.stderr
-    pictures = ROOT / "recordings" / "pictures"
-    for made in (tmp_path / f"{name}.png", pictures / f"{name}.png"):
-        assert made.stat().st_size <= 300_000
-        with Image.open(made) as picture:
-            assert picture.format == "PNG"
-            assert len(picture.convert("RGB").getcolors(1 << 24)) > 50
-    assert f"recordings/pictures/{name}.png" in (ROOT / "README.md").read_text()
-    assert f"({name}.png)" in (pictures / "README.md").read_text()
+    with Image.open(tmp_path / f"{name}.png") as picture:
+        assert len(picture.convert("RGB").getcolors(1 << 24)) > 50
 
 
 def test_links_of_the_pages_lead_somewhere() -> None:

@@ -33,6 +33,12 @@ _SLICE_S = 0.5
 Picture = npt.NDArray[np.uint8]
 
 
+def columns_with(picture: Picture, colour: tuple[int, int, int]) -> float:
+    """Share of the picture's columns in which a colour appears."""
+    near = np.abs(picture.astype(int) - colour).max(axis=2) < 30
+    return float(near.any(axis=0).mean())
+
+
 def program() -> str | None:
     """The browser's, or None where there is none."""
     return shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")

@@ -1,4 +1,4 @@
-"""A part of a recording, one of many spots, two recordings beside each other: the command and what it draws."""
+"""A part of a recording, one of many spots, side files: the command and what it draws."""
 
 from __future__ import annotations
 
@@ -10,12 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from aolink.optics.kernel import exposure_density
 from aolink.recording.reader import Recording
-from aolink.recording.reestimate import write_reestimated
 from aolink.rig import load_rig
 from aolink.session import record
-from aolink.viewing import Look, save_rrd
+from aolink.viewing import save_rrd
 from tests.commands import simulated_rig
 from tests.needs import needed
 from tests.viewing.rrd import read_blueprint, read_rrd, scalars
@@ -41,38 +39,6 @@ def test_one_exposure_has_every_step_of_its_paths_and_nothing_of_others(aolink: 
 
 
 @pytest.mark.slow
-def test_a_layout_about_an_exposure_has_a_few_views_of_it_and_all_exposures_are_there(tmp_path: Path) -> None:
-    recording = Recording(RECORDINGS / "moving-scene.mcap")
-    path = save_rrd(recording, tmp_path / "about.rrd", look=Look(about=9))
-    entities, layout = read_rrd(path), read_blueprint(path)
-    assert len(entities["/camera/image"]["frame"]) == len(recording)
-    estimates = recording.estimates("o1")
-    np.testing.assert_array_equal(
-        scalars(entities["/path/o1/mean"])[:, 0], np.concatenate([e.path[0] for e in estimates])
-    )
-    assert "/profile/path/o1" not in entities
-    drawn = np.array(entities["/profile/predicted/o1"]["LineStrips2D:strips"][-len(recording) :][9][0])
-    kernel, sensor = recording.rig.sensor.profile.kernel, recording.rig.sensor.profile
-    expected = exposure_density(kernel, sensor.edges, estimates[9].path[0])
-    np.testing.assert_allclose(-drawn[:, 1] / -drawn[:, 1].min(), expected / expected.max(), atol=1e-3)
-    names = [str(name) for view in layout.values() for name in view.get("ViewBlueprint:display_name", [])]
-    assert sorted(names) == [
-        "['Camera: 8 exposures (pixels), paths in their blur']",
-        "['Intensity (1/slope unit) over slope: measured, and predicted']",
-        *[f"['Path, {name}, 95 % band (slope units)']" for name in ("moments", "o1", "o2", "o3", "open-loop")],
-        "['Scene as it came (pixels)']",
-        "['Scene at rest (truth) (pixels)']",
-    ]
-    truth = recording[9].truth
-    assert truth is not None
-    columns = (truth.path[0] - sensor.field[0]) / sensor.pixel_width
-    bounds = [each for view in layout.values() for row in view.get("VisualBounds2D:range", []) for each in row]
-    near = [each for each in bounds if each["y_range"] == [5.0, 13.0]]  # rows of the page
-    assert len(near) == 1
-    assert near[0]["x_range"][0] <= columns.min() < columns.max() <= near[0]["x_range"][1] < sensor.pixels
-
-
-@pytest.mark.slow
 def test_a_lenslet_has_its_own_lines_as_x_and_y(tmp_path: Path, aolink: Aolink) -> None:
     recording = Recording(RECORDINGS / "tip-tilt.mcap")
     done = aolink("view", recording.path, "--lenslet", "0,0", "-o", "spot.rrd")
@@ -85,27 +51,6 @@ def test_a_lenslet_has_its_own_lines_as_x_and_y(tmp_path: Path, aolink: Aolink) 
     assert scalars(entities["/mirror/command"]).shape[1] == 2
     for options, why in ((("--lenslet", "4,4"), "the grid has"), (("--lenslet", "one"), "row and column")):
         assert why in " ".join(aolink("view", recording.path, *options, "-o", "x.rrd").stderr.split())
-
-
-@pytest.mark.slow
-def test_two_estimates_and_two_recordings_are_drawn_in_the_same_plots(tmp_path: Path) -> None:
-    """The second in fainter lines, from its own first exposure on."""
-    recording = Recording(LIVELY)
-    again = tmp_path / "again.mcap"
-    write_reestimated(recording, ["o1"], again)
-    path = save_rrd(recording, tmp_path / "both.rrd", look=Look(compared=Recording(again)))
-    entities = read_rrd(path)
-    first, second = (entities[f"{root}/path/o1/mean"] for root in ("", "/compared"))
-    np.testing.assert_allclose(scalars(first), scalars(second), rtol=1e-9)
-    assert first["time"] == second["time"]
-    opacities = [
-        [colour & 255 for row in each["SeriesLines:colors"] for colour in row or []] for each in (first, second)
-    ]
-    assert opacities[0] == [255]
-    assert opacities[1][0] < 200
-    layout = str(read_blueprint(path))
-    assert "+ /compared/path/o1/**" in layout
-    assert "Compared" in layout
 
 
 def test_an_exposure_that_is_not_there_is_one_clear_error(aolink: Aolink, tmp_path: Path) -> None:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import asyncio
+import signal
+import subprocess
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from urllib.parse import parse_qs, urlsplit
@@ -18,8 +20,9 @@ from aolink.viewing.process import Server, serving
 from aolink.viewing.save import save_rrd
 from tests.needs import missing
 from tests.viewing import browser
+from tests.viewing.browser import columns_with
 from tests.viewing.stand_in import StandIn, as_recording
-from tests.viewing.test_viewer import columns_with, listening
+from tests.viewing.test_viewer import listening
 
 if browser.program() is None:
     missing("chromium", FileNotFoundError("chromium: apt-get install chromium"))
@@ -52,10 +55,10 @@ def views(picture: browser.Picture) -> dict[str, browser.Picture]:
     }
 
 
-async def shown(server: Server, wanted: Sequence[Wanted]) -> tuple[browser.Picture, list[str]]:
+async def shown(address: str, wanted: Sequence[Wanted]) -> tuple[browser.Picture, list[str]]:
     """The page once views have the colours that they are to have, and the errors in its console."""
     async with browser.browser() as tab:
-        await tab.open(f"{server.address}&renderer=webgl")
+        await tab.open(f"{address}&renderer=webgl")
         return await tab.once(lambda seen: not lacking(seen, wanted), SHOWN_S), tab.errors
 
 
@@ -79,11 +82,25 @@ def test_every_view_shows_its_colours_in_a_browser_and_nothing_is_wrong(full: Se
         ("camera", TRUTH), ("profile", best), ("path", TRUTH), ("path", best), ("errors", best), ("errors", baseline),
         ("nis", best), ("states", TRUTH), ("input", APPLIED),
     ]  # fmt: skip
-    picture, errors = asyncio.run(shown(full, wanted))
+    picture, errors = asyncio.run(shown(full.address, wanted))
     assert lacking(picture, wanted) == []
     assert columns_with(views(picture)["nis"], baseline) == 0  # it measures nothing
     ours = [error for error in errors if not any(host in error for host in ELSEWHERE)]
     assert [error for error in ours if "Failed to fetch" not in error] == []
+
+
+@pytest.mark.slow
+def test_a_recording_is_served_while_it_is_read(start_aolink: Callable[..., subprocess.Popen[str]]) -> None:
+    recording = Path(__file__).parents[2] / "recordings" / "section-vi-lively.mcap"
+    process = start_aolink("view", recording, "--web")
+    assert process.stdout is not None
+    best = estimator_colour("moments")
+    wanted = [("path", best), ("errors", best), ("nis", best), ("input", APPLIED)]
+    picture, _ = asyncio.run(shown(process.stdout.readline().strip(), wanted))
+    process.send_signal(signal.SIGINT)
+    process.communicate(timeout=60)
+    assert lacking(picture, wanted) == []
+    assert process.returncode == 130
 
 
 @pytest.mark.rare
@@ -91,7 +108,7 @@ def test_what_a_recording_lacks_has_no_colour_in_a_browser(tmp_path: Path) -> No
     bare = StandIn(n=12, names=(), with_truth=False)
     with serving([str(save_rrd(as_recording(bare), tmp_path / "bare.rrd"))]) as server:
         server.listen()
-        picture, _ = asyncio.run(shown(server, [("bare", APPLIED)]))
+        picture, _ = asyncio.run(shown(server.address, [("bare", APPLIED)]))
     assert lacking(picture, [("bare", APPLIED)]) == []
     for colour in (TRUTH, estimator_colour("open-loop")):
         assert columns_with(picture, colour) < 0.01

@@ -190,12 +190,10 @@ def demo_summary(result: DemoResult, command: str) -> list[str]:
     lines = lines or ["online and offline estimates agree bit for bit"]
     if result.deblurred is not None:
         lines += [f"{count} not restored: {reason}" for reason, count in result.deblurred.reasons.items()]
-    picture = "none" if result.picture is None else str(result.picture)
-    if result.not_of_viewer:
-        picture += f"{'' if result.picture is None else ', drawn with matplotlib'}: {result.not_of_viewer}"
+    picture = result.picture or f"none: {result.no_picture}"
     return [
         *lines, "times     " + ", ".join(f"{name} {seconds:.1f} s" for name, seconds in result.seconds.items()),
-        f"shown     {result.shown}", f"picture   {picture}", f"next      {command} view {result.recording}",
+        f"picture   {picture}", f"next      {command} view {result.recording}",
         f"          {command} estimate {result.recording} --estimator profile", "", demo_sentence(result),
     ]  # fmt: skip
 
