@@ -13,10 +13,8 @@ from aolink.rig.device_tables import Delay
 
 
 class Adapted:
-    """The common part of both adapters: a clock that is read at once, and events that wait to be taken.
-
-    An adapter gives `read_clock`, and `clock_doubt_ns` where its driver corrects the clock.
-    """
+    """The common part of both adapters: a clock that is read at once by `read_clock`, and events that wait to be
+    taken."""
 
     def __init__(self, name: str, driver: SimpleCamera | SimpleMirror, delay: Delay, now_ns: Callable[[], int]) -> None:
         self.name = name
@@ -31,15 +29,11 @@ class Adapted:
         """The device's clock, ns."""
         raise NotImplementedError
 
-    def clock_doubt_ns(self) -> int:
-        """The largest correction that the driver may make to the clock that it reads, ns."""
-        return 0
-
     def query_clock(self, now_ns: int) -> None:
-        doubt_ns, sent_ns = self.clock_doubt_ns(), self.now_ns()
+        sent_ns = self.now_ns()
         with calling(self.name, "when it was asked for the time"):
             device_ns = self.read_clock()
-        exchange = ClockExchange(sent_ns - doubt_ns, device_ns, device_ns, self.now_ns() + doubt_ns)
+        exchange = ClockExchange(sent_ns, device_ns, device_ns, self.now_ns())
         self.waiting.append(ClockSampled.add(self.clock, exchange))
 
     def host_ns(self, device_ns: int, since_zero_ns: int, now_ns: int) -> tuple[int, float]:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from aolink.devices.adapted import Adapted
 from aolink.devices.drivers import calling
 from aolink.devices.gate import converter_margin, printable
-from aolink.devices.interfaces import CommandAnswered, Event, Lacks
+from aolink.devices.interfaces import CommandAnswered, Event
 from aolink.devices.limits import CommandLimits
 from aolink.devices.simple import Held, SimpleMirror
 from aolink.errors import AolinkError, DeviceError
@@ -80,29 +80,15 @@ class AdaptedMirror(Adapted):
         super().query_clock(now_ns)
         self.last_sent_ns = now_ns
 
-    def clock_doubt_ns(self) -> int:
-        # A driver that infers its device's clock corrects it by up to this much. Without a queue the clock is the
-        # host's.
-        return 0 if Lacks.QUEUE in self.lacks else round(self._driver_sigma_ns())
-
     def since_zero_ns(self, host_ns: int) -> int:
         return self.clock.device_ns(host_ns)[0] - self.delay_ns
 
     def step_sigma_ns(self, host_ns: int) -> float:
-        clock_ns, driver_ns = self.clock.device_ns(host_ns)[1], self._driver_sigma_ns()
-        if Lacks.QUEUE in self.lacks:
-            return math.hypot(clock_ns, self.delay_sd_ns, driver_ns)
-        return math.hypot(max(clock_ns, driver_ns), self.delay_sd_ns)  # the first has part of the second
-
-    def _driver_sigma_ns(self) -> float:
-        """The driver's own standard deviation of the inputs' times, ns.
-
-        For a mirror without a queue, that is how late its inputs are; the rig file may give it instead.
-        """
-        if self.delay_ns and Lacks.QUEUE in self.lacks:
-            return 0.0
-        with self._call("when it was asked for its timing"):
-            return float(getattr(self._driver, "timing_sigma_ns", 0.0))
+        lateness_ns = 0.0
+        if not self.delay_ns:  # otherwise the rig file says how late inputs are
+            with self._call("when it was asked for its timing"):
+                lateness_ns = float(getattr(self._driver, "timing_sigma_ns", 0.0))
+        return math.hypot(self.clock.device_ns(host_ns)[1], self.delay_sd_ns, lateness_ns)
 
     def start_step(self, now_ns: int) -> int:
         return self.since_zero_ns(now_ns) // self._step_ns

@@ -83,7 +83,6 @@ class Lacks(StrEnum):
     ANSWER = "acknowledges nothing: what was sent counts as taken"
     READ_BACK = "does not say what it holds: what was sent counts as held"
     WATCHDOG = "has no watchdog: while the host's program runs, the host parks it"
-    STOP = "cannot empty its queue: parking waits for what is queued"
 
 
 def lacks_of(driver: Any) -> list[Lacks]:

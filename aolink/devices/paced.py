@@ -5,7 +5,6 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,67 +18,6 @@ _LATE = 0.5
 """A step whose input was taken only after this part of the step is late: it held the previous input for longer."""
 _LEAST_PERIOD_NS = 1_000_000
 """Least period of checking whether the host is held up, ns: more frequent checks would cost more than they show."""
-
-
-class Played:
-    """The common part of mirrors whose inputs a thread of the host plays: `send`, `applied`, and the thread's error.
-
-    An input may be kept as the device takes it, (n,); `_inputs` gives the inputs of a run of steps.
-    """
-
-    def __init__(self) -> None:
-        self._queue: dict[int, NDArray[Any]] = {}
-        """Inputs by fast step."""
-        self._next = 0
-        """The first step that has not been played."""
-        self._held: list[tuple[NDArray[Any], bool]] = []
-        """Inputs of the steps that were not reported yet, and whether they were late."""
-        self._reported = 0
-        """The first step of ``_held``."""
-        self._changed = threading.Condition()
-        """Guards all of the above."""
-        self._failure: Exception | None = None
-        self._thread = threading.Thread(target=self._run, name=f"aolink-{type(self).__name__}", daemon=True)
-
-    def send(self, first_step: int, u: NDArray[Any]) -> int:
-        with self._changed:
-            self._check()
-            late = min(max(self._next - first_step, 0), len(u))
-            self._queue.update(enumerate(u[late:], first_step + late))
-        return late
-
-    def applied(self) -> list[Held]:
-        with self._changed:
-            self._check()
-            n_steps = self._n_over()
-            held, self._held = self._held[:n_steps], self._held[n_steps:]
-            first, self._reported = self._reported, self._reported + n_steps
-        if not held:
-            return []
-        return [Held(first, self._inputs(np.array([u for u, _ in held])), np.array([late for _, late in held]))]
-
-    def _n_over(self) -> int:
-        """How many of the steps in ``_held`` are over."""
-        return len(self._held)
-
-    def _inputs(self, held: NDArray[Any]) -> NDArray[np.float64]:
-        return held
-
-    def _check(self) -> None:
-        """Raise the error that has ended the thread, if there is one."""
-        if self._failure is not None:
-            raise self._failure
-
-    def _play(self) -> None:
-        """Play inputs until the mirror is closed."""
-        raise NotImplementedError
-
-    def _run(self) -> None:
-        try:
-            self._play()
-        except Exception as error:  # the session gets it when it asks next
-            with self._changed:
-                self._failure = error
 
 
 class Outages:
@@ -115,7 +53,7 @@ class Outages:
                 self._seen_ns = time.monotonic_ns()
 
 
-class PacedMirror(Played):
+class PacedMirror:
     """A `SimpleMirror` made of a `DirectMirror`: the host queues the inputs, and sends each when its step begins.
 
     The scheduler and the serial line limit how exact this is. A step for which the device took its input later than
@@ -125,7 +63,17 @@ class PacedMirror(Played):
     """
 
     def __init__(self, rig: Rig, driver: DirectMirror) -> None:
-        super().__init__()
+        self._queue: dict[int, NDArray[np.float64]] = {}
+        """Inputs by fast step."""
+        self._next = 0
+        """The first step that has not been played."""
+        self._held: list[tuple[NDArray[np.float64], bool]] = []
+        """Inputs of the steps that were not reported yet, and whether they were late."""
+        self._reported = 0
+        """The first step of ``_held``."""
+        self._changed = threading.Condition()
+        """Guards all of the above."""
+        self._failure: Exception | None = None
         self.description = driver.description
         self.lacks = lacks_of(driver)
         self._driver, self._park, self._step_ns = driver, rig.mirror.park, rig.timing.fast_step_ns
@@ -138,6 +86,7 @@ class PacedMirror(Played):
         """Times from the beginning of a step until the device's answer to its input was read, for the newest inputs."""
         self._outages = Outages(max(rig.timing.fast_step_ns // 8, _LEAST_PERIOD_NS))
         self._parked = self._closed = False
+        self._thread = threading.Thread(target=self._run, name="aolink-mirror", daemon=True)
         self._thread.start()
 
     def time_ns(self) -> int:
@@ -152,8 +101,25 @@ class PacedMirror(Played):
 
     def send(self, first_step: int, u: NDArray[np.float64]) -> int:
         with self._changed:
+            self._check()
             self._parked = False
-            return super().send(first_step, u)
+            late = min(max(self._next - first_step, 0), len(u))
+            self._queue.update(enumerate(u[late:], first_step + late))
+        return late
+
+    def applied(self) -> list[Held]:
+        with self._changed:
+            self._check()
+            held, self._held = self._held, []
+            first, self._reported = self._reported, self._reported + len(held)
+        if not held:
+            return []
+        return [Held(first, np.array([u for u, _ in held]), np.array([late for _, late in held]))]
+
+    def _check(self) -> None:
+        """Raise the error that has ended the thread, if there is one."""
+        if self._failure is not None:
+            raise self._failure
 
     def park(self) -> int:
         with self._changed:
@@ -175,6 +141,13 @@ class PacedMirror(Played):
         self._thread.join()
         self._outages.close()
         self._driver.close()
+
+    def _run(self) -> None:
+        try:
+            self._play()
+        except Exception as error:  # the session gets it when it asks next
+            with self._changed:
+                self._failure = error
 
     def _play(self) -> None:
         """Put out each step's input when it begins: the safe input where nothing is queued for it."""

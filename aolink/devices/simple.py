@@ -186,11 +186,7 @@ class Held(NamedTuple):
 
 
 class SimpleMirror(Protocol):
-    """A mirror that takes a queue of inputs, one for each fast step. For the entry point see `SimpleCamera`.
-
-    A property ``timing_sigma_ns`` may give the standard deviation of the time at which inputs take effect, as far as
-    reading ``time_ns`` does not show it, ns.
-    """
+    """A mirror that takes a queue of inputs, one for each fast step. For the entry point see `SimpleCamera`."""
 
     description: str
 

@@ -36,7 +36,6 @@ def arguments(name: str, **keys: Any) -> dict[str, Any]:
         ("optotune", {"port": "a", "unit_rad": "1"}, "unit_rad: expected a number or a list of numbers, found '1'"),
         ("pi_gcs2", {"port": "a", "axes": "1 2"}, "axes: expected a list of texts or whole numbers, found '1 2'"),
         ("pi_gcs2", {"port": "a", "axes": [1, 2], "baud_rate": "x"}, "baud_rate: expected a whole number, found 'x'"),
-        ("playzerx", {"port": "a", "laser": True}, "devices.mirror.laser: expected a whole number, found True"),
         ("thorlabs_piezo", {"port": [1, 2]}, "devices.mirror.port: expected a text or a list of texts, found [1, 2]"),
         ("microscope", {"device": "a", "unit": [0.5, True]}, "devices.mirror.unit: expected a number or a list of num"),
         ("folder", {}, "devices.camera: the driver folder cannot take these keys: missing a required"),

@@ -54,7 +54,6 @@ class Bench:
 
     def __init__(self) -> None:
         self.host_ns = EPOCH_NS
-        self.clock_set_ns = 0
         self.parks = 0
         self.parked = threading.Event()
         self.late = 0
@@ -67,7 +66,7 @@ class Bench:
         return self.host_ns
 
     def time_ns(self) -> int:
-        return self.host_ns - EPOCH_NS + self.clock_set_ns
+        return self.host_ns - EPOCH_NS
 
     def send(self, first_step: int, u: NDArray[np.float64]) -> int:
         if self.refusal:
@@ -457,29 +456,13 @@ def test_a_command_that_changes_too_fast_is_refused() -> None:
         mirror.send_block(4, np.array([[0.0]]), 0, 0)
 
 
-@pytest.mark.parametrize(("lacks", "expected"), [((), 3e6), ((Lacks.QUEUE,), 0.0)])
-def test_a_delay_says_how_late_inputs_are_and_not_how_well_a_queues_time_is_known(
-    lacks: tuple[Lacks, ...], expected: float
-) -> None:
+@pytest.mark.parametrize(("delay_s", "expected"), [(0.0, 3e6), (0.001, 0.0)])
+def test_a_delay_of_the_rig_file_stands_for_how_late_inputs_are(delay_s: float, expected: float) -> None:
     bench = Bench()
-    bench.lacks, bench.timing_sigma_ns = lacks, 3e6  # type: ignore[attr-defined] # most benches lack nothing
-    mirror = AdaptedMirror(RIG, bench, Delay(mean_s=0.001, sd_s=0.0), bench.now_ns)
+    bench.timing_sigma_ns = 3e6
+    mirror = AdaptedMirror(RIG, bench, Delay(mean_s=delay_s, sd_s=0.0), bench.now_ns)
     mirror.query_clock(bench.host_ns)
     assert mirror.step_sigma_ns(bench.host_ns) == pytest.approx(expected, abs=2e3)
-
-
-def test_a_clock_that_a_driver_corrects_by_as_much_as_it_doubts_it_was_not_set() -> None:
-    """The PlayzerX's driver infers its device's clock from counts of samples."""
-    bench = Bench()
-    bench.timing_sigma_ns = 1e6
-    mirror, events = AdaptedMirror(RIG, bench, Delay(), bench.now_ns), []
-    for k in range(40):
-        bench.host_ns += 10**9
-        bench.clock_set_ns = 150_000 * (k // 20)
-        mirror.query_clock(bench.host_ns)
-        events += mirror.poll()
-    assert all(event.accepted and event.step is None for event in events if isinstance(event, ClockSampled))
-    assert not mirror.clock.suspected
 
 
 class CameraWithoutTime(CameraBench):

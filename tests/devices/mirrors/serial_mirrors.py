@@ -17,7 +17,6 @@ from tests.devices.mirrors import bench
 from tests.devices.simulators import spot_camera
 from tests.devices.simulators.optotune import OptotuneSimulator
 from tests.devices.simulators.pi_gcs2 import PiSimulator
-from tests.devices.simulators.playzerx import PlayzerX
 from tests.devices.simulators.serial_device import SerialDevice
 from tests.devices.simulators.thorlabs import Aligner, Piezo
 from tests.needs import needed
@@ -45,8 +44,7 @@ class SerialMirror:
 
     def rig(self, device: SerialDevice, camera: str = "", watchdog_s: float = 30.0) -> Rig:
         """A rig with it, and with a camera that sees it, unless it has another one."""
-        seen = device.inputs_at if isinstance(device, PlayzerX) else bench.seen(device.held, self.inputs)
-        spot_camera.mirrors[device.port] = seen
+        spot_camera.mirrors[device.port] = bench.seen(device.held, self.inputs)
         camera = camera or f'driver = "spot"\nsees = "{device.port}"'
         tables = f'[devices.camera]\n{camera}\n[devices.mirror]\n{self.keys}\nport = "{device.port}"'
         changed = f"dac_bits = 12\nqueue_steps = 150\npark = {[*PARK]}\nwatchdog_s = {watchdog_s}"
@@ -65,9 +63,6 @@ class SerialMirror:
         return self.holds_the_safe_input(device)
 
     def holds_the_safe_input(self, device: SerialDevice) -> bool:
-        if isinstance(device, PlayzerX):
-            rest = device.at_rest()
-            return rest is not None and bool(np.allclose(np.array(rest[:2]) / 2047.5 - 1, PARK, atol=5e-4))
         return bool(np.allclose(self.inputs(np.array(device.now())), PARK, atol=5e-4))
 
 
@@ -86,7 +81,6 @@ MIRRORS = {
         'driver = "pi_gcs2"\naxes = ["1", "2"]\nscale = 10\noffset = 17.5',
         lambda positions: (positions[:2] - 17.5) / 10,
     ),
-    "playzerx": SerialMirror(PlayzerX, 'driver = "playzerx"\nahead_s = 0.4\nlaser = 200', lambda u: u),
     "thorlabs_aligner": SerialMirror(
         Aligner, 'driver = "thorlabs_aligner"\nunit = 5.0\nzero = 1.0', lambda volts: (volts - 1) / 5
     ),

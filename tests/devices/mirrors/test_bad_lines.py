@@ -8,7 +8,7 @@ from aolink.errors import AolinkError
 from tests.devices.mirrors.serial_mirrors import MIRRORS, with_each
 from tests.devices.simulators.serial_device import Faults
 
-NAMED = r"(Optotune mirror driver|PI controller|PlayzerX|Thorlabs (unit|aligner)|/dev/pts/)"
+NAMED = r"(Optotune mirror driver|PI controller|Thorlabs (unit|aligner)|/dev/pts/)"
 
 
 @pytest.mark.parametrize(
@@ -47,8 +47,6 @@ def test_a_line_at_another_speed() -> None:
 
 
 def test_a_mirror_that_refuses_its_safe_input_is_not_opened() -> None:
-    """The PlayzerX acknowledges nothing, and so refuses nothing."""
-
     def check(name: str) -> None:
         with MIRRORS[name].make(faults=Faults(refused=frozenset({0}))) as device:
             with pytest.raises(AolinkError, match=r"answers XY=.* with 'NO'|its error 53|reports an error .* code 7"):
@@ -56,7 +54,7 @@ def test_a_mirror_that_refuses_its_safe_input_is_not_opened() -> None:
             MIRRORS[name].opened(device).close()  # the port was given back
             assert MIRRORS[name].is_parked(device)
 
-    with_each(check, MIRRORS.keys() - {"playzerx"})
+    with_each(check)
 
 
 def test_a_slow_line_in_pieces_opens_a_mirror_at_its_safe_input_wherever_it_was() -> None:

@@ -20,7 +20,7 @@ import tempfile
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -40,8 +40,6 @@ STREAM_PORT, STREAM_ADDRESS, CLOCK_CONTROL, CLOCK_VALUE = 0x0D00, 0x0D18, 0x0944
 TRIGGER = 0x030C
 """Register of the fake camera, not of the standard."""
 LEADER, TRAILER, PAYLOAD = 1, 2, 3
-Show = Callable[[int, int], NDArray[np.uint8]]
-"""Gives the bytes of the picture with a frame id that is taken at a time, ns since 1970: the end of its exposure."""
 KINDS = {LEADER: "leaders", TRAILER: "trailers", PAYLOAD: "payloads"}
 
 
@@ -180,14 +178,8 @@ class Relay:
                 self._stream.sendto(kept, (self._host, self._port))
 
 
-def serve(
-    show: Show, formats: dict[str, int], faults: Faults, beside: str = "", told: Callable[[], dict[str, Any]] = dict
-) -> None:
-    """Run the camera until standard input ends.
-
-    It prints ``beside``, what else there is in this process, when it is ready, and answers each line on standard input
-    with the relay's counts and what ``told`` gives.
-    """
+def serve(pictures: NDArray[np.uint8], formats: dict[str, int], faults: Faults) -> None:
+    """Run the camera until standard input ends; each line there is answered with the relay's counts."""
     aravis = ctypes.CDLL(LIBRARY)
     pointer = ctypes.c_void_p
     for name, result, arguments in (
@@ -199,7 +191,6 @@ def serve(
         ("arv_fake_camera_write_register", ctypes.c_int, [pointer, ctypes.c_uint32, ctypes.c_uint32]),
         ("arv_fake_camera_set_fill_pattern", None, [pointer, pointer, pointer]),
         ("arv_buffer_get_frame_id", ctypes.c_uint64, [pointer]),
-        ("arv_buffer_get_timestamp", ctypes.c_uint64, [pointer]),
         ("arv_buffer_get_data", pointer, [pointer, pointer]),
     ):
         function = getattr(aravis, name)
@@ -222,15 +213,15 @@ def serve(
     inner = aravis.arv_gv_fake_camera_get_fake_camera(camera)
 
     def fill(buffer: int, _data: int, _exposure_us: int, _gain: int, _format: int) -> None:
-        picture = show(aravis.arv_buffer_get_frame_id(buffer), aravis.arv_buffer_get_timestamp(buffer))
+        picture = pictures[(aravis.arv_buffer_get_frame_id(buffer) - FIRST_ID) % 65535 % len(pictures)]
         ctypes.memmove(aravis.arv_buffer_get_data(buffer, None), picture.ctypes.data, picture.nbytes)
 
     callback = ctypes.CFUNCTYPE(None, pointer, pointer, *[ctypes.c_uint32] * 3)(fill)
     aravis.arv_fake_camera_set_fill_pattern(inner, ctypes.cast(callback, pointer), None)
     relay = Relay(faults, lambda register, value: aravis.arv_fake_camera_write_register(inner, register, value))
-    print(f"ready {beside}", flush=True)
+    print("ready", flush=True)
     for _ in sys.stdin:
-        print(json.dumps({"counts": relay.counts, "dropped": relay.dropped, **told()}), flush=True)
+        print(json.dumps({"counts": relay.counts, "dropped": relay.dropped}), flush=True)
 
 
 class Camera:
@@ -238,8 +229,7 @@ class Camera:
 
     def __init__(self, process: subprocess.Popen[str]) -> None:
         self._process = process
-        ready, _, self.beside = self.asked().strip().partition(" ")
-        assert ready == "ready"
+        assert self.asked() == "ready\n"
 
     def asked(self) -> str:
         """Its answer to a line."""
@@ -256,9 +246,16 @@ class Camera:
 
 
 @contextmanager
-def camera_process(module: str, **arguments: Any) -> Iterator[Camera]:
-    """Run a module that serves a camera, with these arguments; one at a time on a machine has the port."""
-    command = [sys.executable, "-m", module, json.dumps(arguments)]
+def gige_camera(
+    folder: Path, pictures: NDArray[np.uint8], formats: dict[str, int], faults: Faults | None = None
+) -> Iterator[Camera]:
+    """Run a camera that sends ``pictures`` (frames, bytes) over and over; one at a time on a machine has the port.
+
+    ``formats`` are the codes of pixel formats that it offers besides Mono8 and Mono16.
+    """
+    np.save(folder / "pictures.npy", pictures)
+    given = {"pictures": str(folder / "pictures.npy"), "formats": formats, "faults": asdict(faults or Faults())}
+    command = [sys.executable, "-m", __name__, json.dumps(given)]
     with (
         open(Path(tempfile.gettempdir()) / "aolink-gige.lock", "w") as lock,
         subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process,
@@ -270,25 +267,7 @@ def camera_process(module: str, **arguments: Any) -> Iterator[Camera]:
             process.kill()
 
 
-@contextmanager
-def gige_camera(
-    folder: Path, pictures: NDArray[np.uint8], formats: dict[str, int], faults: Faults | None = None
-) -> Iterator[Camera]:
-    """Run a camera that sends ``pictures`` (frames, bytes) over and over.
-
-    ``formats`` are the codes of pixel formats that it offers besides Mono8 and Mono16.
-    """
-    np.save(folder / "pictures.npy", pictures)
-    where = str(folder / "pictures.npy")
-    with camera_process(__name__, pictures=where, formats=formats, faults=asdict(faults or Faults())) as camera:
-        yield camera
-
-
-def _serve_pictures(pictures: NDArray[np.uint8], formats: dict[str, int], faults: Faults) -> None:
-    serve(lambda frame_id, _: pictures[(frame_id - FIRST_ID) % 65535 % len(pictures)], formats, faults)
-
-
 if __name__ == "__main__":
     given = json.loads(sys.argv[1])
     sys.stdin.readline()  # it is its turn
-    _serve_pictures(np.load(given["pictures"]), given["formats"], Faults(**given["faults"]))
+    serve(np.load(given["pictures"]), given["formats"], Faults(**given["faults"]))
