@@ -48,7 +48,6 @@ _MODULES = (
     "aolink.cli.tables.sessions",
     "aolink.estimation.pixels.filter",
     "aolink.estimation.pixels.profile",
-    "aolink.estimation.pixels.sampled",
     "typer._adapters",  # with which it reads options
 )
 """What most commands load; nothing that starts threads."""

@@ -126,12 +126,6 @@ def profile(rig: Rig, options: Options) -> Filter:
     return _blur_filter(rig, options, JointProfile(_spots(rig), rig.plant.n_outputs))
 
 
-def sampled(rig: Rig, options: Options) -> Filter:
-    from aolink.estimation.pixels.sampled import TemperedUpdater
-
-    return _of_pixels(rig, options, TemperedUpdater(options.particles, options.seed))
-
-
 def _of_pixels(rig: Rig, options: Options, updates: Any) -> Filter:
     """The filters that use every pixel; their compiled code is loaded when the first one is made."""
     from aolink.estimation.pixels.filter import MixtureFilter

@@ -12,8 +12,6 @@ from aolink.estimation.kalman.predict import Noise
 Engine = Literal["aolink", "filterpy"]
 
 _HIGHEST_ORDER = 8
-# Fewer particles than this do not describe a posterior of a dozen coefficients and more.
-_FEWEST_PARTICLES = 100
 _MOST_DRAWS = 400
 
 
@@ -41,18 +39,13 @@ class Options:
     """Points that `profile` draws for importance sampling, in per cent of the usual number: the budget of work. With 5
     an exposure takes a sixth of the time, the estimates have larger errors, and the log-evidence, which is not from
     these points, still tells models that differ much apart."""
-    particles: int | None = None
-    """Number of particles of `sampled`. None: 500 to 2000, fewer where the pixels and coefficients of a rig make each
-    more work, so that an exposure takes about a second at most."""
-    seed: int = 0
-    """Seed of `sampled`: the same one gives the same estimates, bit for bit."""
 
 
 _NAMES = tuple(Options.__dataclass_fields__)
 
 
 def with_options(text: str) -> tuple[str, dict[str, Any]]:
-    """An estimator's name and options from a text such as ``o3:second_order`` or ``sampled:particles=500,seed=2``.
+    """An estimator's name and options from a text such as ``o3:second_order`` or ``o1:engine=filterpy,gate=false``.
 
     ``orders`` are digits, ``orders=012``; an option without a value is switched on. Raises EstimatorError.
     """
@@ -97,8 +90,6 @@ def checked_options(**options: Any) -> Options:
     for key, kind in get_type_hints(Options).items():
         if get_origin(kind) is Literal and getattr(chosen, key) not in (values := get_args(kind)):
             raise EstimatorError(f"{key} = {getattr(chosen, key)!r} is not known: use one of {', '.join(values)}")
-    if chosen.particles is not None and chosen.particles < _FEWEST_PARTICLES:
-        raise EstimatorError(f"particles = {chosen.particles}: use at least {_FEWEST_PARTICLES}")
     if not 1 <= chosen.draws <= _MOST_DRAWS:
         raise EstimatorError(f"draws = {chosen.draws}: use 1 to {_MOST_DRAWS} per cent of the usual points")
     if chosen.second_order and chosen.engine == "filterpy":

@@ -132,28 +132,20 @@ def _many_spots_refusal(rig: Rig, name: str = "moments") -> str | None:
     return None
 
 
-def _pixels_refusal(name: str) -> Callable[[Rig], str | None]:
-    """Why a filter that uses every pixel cannot work on a rig; profile has another form for many equal systems."""
-
-    def refusal(rig: Rig) -> str | None:
-        if name == "profile" and alike_systems(rig.plant) is not None:
-            return None
-        if rig.plant.n_states > MANY_STATES:
-            alike = " that does not consist of equal systems side by side" if name == "profile" else ""
-            return (
-                f"{name} takes at most {MANY_STATES} states of one plant, {rig.name} has"
-                f" {rig.plant.n_states}{alike}: use {'o3' if alike else 'profile or moments'}"
-            )
-        if reason := _many_spots_refusal(rig, name):  # its widest Gaussian is found by windowed moments
-            return reason
-        if rig.sensor.spot_light is not None:
-            return (
-                f"{name} takes each spot to have the whole light, but {rig.name} has partly lit lenslets:"
-                " use moments or o3"
-            )
+def _pixels_refusal(rig: Rig) -> str | None:
+    """Why profile cannot work on a rig; it has another form for many equal systems."""
+    if alike_systems(rig.plant) is not None:
         return None
-
-    return refusal
+    if rig.plant.n_states > MANY_STATES:
+        return (
+            f"profile takes at most {MANY_STATES} states of a plant that is not of equal systems side by side,"
+            f" {rig.name} has {rig.plant.n_states}: use o3"
+        )
+    if reason := _many_spots_refusal(rig, "profile"):  # its widest Gaussian is found by windowed moments
+        return reason
+    if rig.sensor.spot_light is not None:
+        return f"profile takes each spot to have all its light, {rig.name} has partly lit lenslets: use moments or o3"
+    return None
 
 
 def _shared_loops(rig: Rig) -> tuple[str, ...]:
@@ -192,11 +184,7 @@ _OURS = {
         ),
         EstimatorRow(
             name="profile", rank=50, colour=(140, 210, 80), build=_built("profile"),
-            refusal=_pixels_refusal("profile"), loops=_pixels_loops,
-        ),
-        EstimatorRow(
-            name="sampled", rank=70, colour=(190, 130, 80), build=_built("sampled"),
-            refusal=_pixels_refusal("sampled"), loops=_pixels_loops,
+            refusal=_pixels_refusal, loops=_pixels_loops,
         ),
     )
 }  # fmt: skip

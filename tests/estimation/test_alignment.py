@@ -150,7 +150,7 @@ def in_words(estimate: Estimate) -> dict[str, np.ndarray]:
     return {name: getattr(estimate, name) for name in (*names, "path")}
 
 
-@pytest.mark.parametrize("name", [name for name in ESTIMATOR_NAMES if name != "sampled"])
+@pytest.mark.parametrize("name", ESTIMATOR_NAMES)
 def test_batches_and_recordings_give_the_same_bits(rig: Rig, name: str) -> None:
     exposures = list(misaligned(rig, 3, 5))
     exposures[0] = replace(exposures[0], alignment_sigma_ns=0.0)  # the clocks' comparison came later

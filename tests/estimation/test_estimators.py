@@ -30,8 +30,7 @@ from aolink.simulation.model import simulate
 from tests.kinds import must_be
 
 PAPER = ("o1", "o2", "o3")
-# `sampled` takes a second for an exposure: it has tests of its own.
-NAMES = tuple(name for name in ESTIMATOR_NAMES if name != "sampled")
+NAMES = ESTIMATOR_NAMES
 
 
 @pytest.fixture(scope="module")

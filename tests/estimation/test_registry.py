@@ -19,21 +19,21 @@ from tests.commands import simulated_rig
 
 
 def test_names_come_by_rank():
-    assert ESTIMATOR_NAMES == ("open-loop", "o1", "o2", "o3", "moments", "profile", "sampled")
+    assert ESTIMATOR_NAMES == ("open-loop", "o1", "o2", "o3", "moments", "profile")
     assert [row.rank for row in estimator_rows()] == sorted(row.rank for row in estimator_rows())
 
 
 def test_hundreds_of_spots_of_one_plant_are_refused_by_all_that_compare_every_two():
     rig = load_rig("sh-30x30")
-    for name in ("moments", "profile", "sampled"):
+    for name in ("moments", "profile"):
         with pytest.raises(EstimatorError, match=f"{name} takes at most 128 spots .* sh-30x30 has 900: use o3"):
             make_estimator(rig, name)
 
 
 def test_a_row_refuses_what_making_the_estimator_refuses():
-    rig = load_rig("sh-8x8")
+    rig = load_rig("sh-30x30")
     refused = {row.name: reason for row in estimator_rows() if (reason := row.refusal(rig))}
-    assert refused.keys() == {"sampled"}
+    assert refused.keys() == {"moments", "profile"}
     for name, reason in refused.items():
         with pytest.raises(EstimatorError) as raised:
             make_estimator(rig, name)
@@ -48,7 +48,7 @@ def test_options_may_follow_the_name():
         ours, theirs = named.step(exposure), given.step(exposure)
         assert ours.estimator == "o3:second_order,flux=measured"
         assert np.array_equal(ours.end_state, theirs.end_state)
-    assert with_options("sampled:particles=500,seed=2") == ("sampled", {"particles": 500, "seed": 2})
+    assert with_options("profile:draws=50,gate=false") == ("profile", {"draws": 50, "gate": False})
     assert with_options("moments:orders=012,gate=false") == ("moments", {"orders": (0, 1, 2), "gate": False})
     assert by_rank(["moments", "o3:second_order", "o3", "o1"]) == ["o1", "o3", "o3:second_order", "moments"]
     assert estimator_colour("o3:second_order") != estimator_colour("o3")
@@ -60,8 +60,7 @@ def test_options_may_follow_the_name():
         ("o3:tuning=3", "o3:tuning=3: estimators have no option 'tuning': use gain, process_noise"),
         ("o3:", "no estimator 'o3:': after the colon"),
         ("o3:second_order=maybe", "second_order = 'maybe', expected true or false"),
-        ("sampled:particles=many", "particles = 'many', expected a whole number"),
-        ("sampled:particles=5", "particles = 5: use at least 100"),
+        ("profile:draws=many", "draws = 'many', expected a whole number"),
         ("moments:orders=0-2", "orders = '0-2', expected digits, such as 012"),
         ("o3:flux=some", "flux = 'some' is not known"),
         ("o4:second_order", "no estimator 'o4': use one of open-loop, o1"),

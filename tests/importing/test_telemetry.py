@@ -83,7 +83,7 @@ def test_o1_takes_slopes_without_pictures_as_it_takes_centroids(name: str, tmp_p
 
 def test_other_estimators_say_that_there_are_slopes_only(tmp_path: Path) -> None:
     recording, _ = imported(others.write_aot(tmp_path / "a.fits", None), small_rig(20, 20), rate_hz=50)
-    for name in ("o2", "o3", "moments", "profile", "sampled"):
+    for name in ("o2", "o3", "moments", "profile"):
         with pytest.raises(
             EstimatorError, match="exposure 1 holds slopes only, no pixels: o1 and open-loop can use it"
         ):

@@ -15,7 +15,6 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -35,28 +34,21 @@ from aolink.session import Report, record
 from aolink.session.estimating import BesideTheLoop, Outcome
 from aolink.session.report import LatencyBook
 from aolink.session.waiting import Aside, Waiting, most_waiting
-from aolink.simulation.model import simulate
 from aolink.wire import messages_pb2 as wire
 from tests.commands import simulated_rig
 from tests.conftest import Session
 from tests.kinds import messages_of
+from tests.session.slow import SLOW, slow_installed
 
 FAST = load_rig("section-vi-lively").toml.replace("exposure_steps = 200", "exposure_steps = 50")
 """A rig whose camera has 20 exposures a second."""
 EXPOSURES = 40
 
 
-@cache
-def slow() -> str:
-    """An estimator with as many particles as take some frame periods for an exposure on this machine."""
-    rig, few = parse_rig(FAST), 1000
-    estimator, took_s = make_estimator(rig, "sampled", particles=few), []
-    for each in simulate(rig, 9, seed=1):
-        start = time.perf_counter()
-        estimator.step(each)
-        took_s.append(time.perf_counter() - start)
-    # The least, because other processes can only make it longer.
-    return f"sampled:particles={max(few, int(few * 0.25 / min(took_s)))}"
+@pytest.fixture(scope="module", autouse=True)
+def with_slow(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    with slow_installed(tmp_path_factory.mktemp("installed")):
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -69,7 +61,7 @@ def rig_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def loaded(rig_file: Path, tmp_path_factory: pytest.TempPathFactory) -> Session:
     """A session in real time with an estimator that is slower than the camera."""
-    path, names = tmp_path_factory.mktemp("loaded") / "session.mcap", [slow(), "o3"]
+    path, names = tmp_path_factory.mktemp("loaded") / "session.mcap", [SLOW, "o3"]
     with simulated_rig(rig_file, "--real-time") as ports:
         report = record(parse_rig(FAST), *ports, path, estimators=names, exposures=EXPOSURES)
     return Session(path, report)
@@ -94,7 +86,7 @@ def skipped_by(recording: Recording, name: str) -> set[int]:
 @pytest.mark.slow
 def test_what_it_had_no_time_for_is_counted_and_recorded(loaded: Session) -> None:
     recording, metadata = Recording(loaded.path), Recording(loaded.path).metadata
-    for name in (slow(), "o3"):
+    for name in (SLOW, "o3"):
         counted = loaded.report.estimation[name]
         accounts = messages_of(pb.Estimation, recording, topics.estimation_topic(name))
         assert counted.estimated + counted.skipped == len(accounts) == EXPOSURES
@@ -106,15 +98,15 @@ def test_what_it_had_no_time_for_is_counted_and_recorded(loaded: Session) -> Non
         assert all(bool(each.reason) == each.skipped for each in accounts)
         assert skipped_by(recording, name) == {each.frame_id for each in accounts if each.skipped}
         assert metadata[f"skipped_{name}"] == str(counted.skipped)
-    assert loaded.report.estimation[slow()].skipped > loaded.report.estimation["o3"].skipped
-    assert loaded.report.exposures_skipped[slow()] == loaded.report.estimation[slow()].skipped > 0
+    assert loaded.report.estimation[SLOW].skipped > loaded.report.estimation["o3"].skipped
+    assert loaded.report.exposures_skipped[SLOW] == loaded.report.estimation[SLOW].skipped > 0
 
 
 @pytest.mark.slow
 def test_what_was_estimated_online_is_the_same_offline_with_the_same_exposures_skipped(loaded: Session) -> None:
     recording = Recording(loaded.path)
-    again = reestimate(recording, [slow(), "o3"], as_recorded=True)
-    for name in (slow(), "o3"):
+    again = reestimate(recording, [SLOW, "o3"], as_recorded=True)
+    for name in (SLOW, "o3"):
         assert first_difference(recording.estimates(name), again[name]) is None
 
 
@@ -122,28 +114,28 @@ def test_what_was_estimated_online_is_the_same_offline_with_the_same_exposures_s
 def test_compare_replay_and_estimate_know_of_the_skipped(
     loaded: Session, aolink: Callable[..., subprocess.CompletedProcess[str]], tmp_path: Path
 ) -> None:
-    skipped = loaded.report.estimation[slow()].skipped
-    compared = aolink("compare", loaded.path)
+    skipped = loaded.report.estimation[SLOW].skipped
+    compared = aolink("compare", loaded.path, env=dict(os.environ))
     assert (compared.returncode, compared.stderr) == (0, "")
     assert compared.stdout.endswith("the same\n")
-    replayed = aolink("replay", loaded.path, "-e", "o3", "--json")
+    replayed = aolink("replay", loaded.path, "-e", "o3", "--json", env=dict(os.environ))
     assert replayed.returncode == 0, replayed.stderr
-    done = aolink("estimate", loaded.path, "-e", slow(), "-o", "whole.mcap")
+    done = aolink("estimate", loaded.path, "-e", SLOW, "-o", "whole.mcap", env=dict(os.environ))
     assert done.returncode == 0, done.stderr
     assert f"no time for {skipped} exposures, all are estimated here" in " ".join(done.stdout.split())
     whole = Recording(tmp_path / "whole.mcap")
-    assert len(whole.estimates(slow())) == EXPOSURES
+    assert len(whole.estimates(SLOW)) == EXPOSURES
     # The exposures that were skipped tell it more: it is not the same.
-    last = Recording(loaded.path).estimates(slow())[-1]
-    assert not np.array_equal(whole.estimates(slow())[last.frame_id - 1].end_state, last.end_state)
-    assert not skipped_by(whole, slow())
-    facts = json.loads(aolink("info", loaded.path, "--json").stdout)
-    assert facts["losses"][f"skipped_{slow()}"] == skipped
+    last = Recording(loaded.path).estimates(SLOW)[-1]
+    assert not np.array_equal(whole.estimates(SLOW)[last.frame_id - 1].end_state, last.end_state)
+    assert not skipped_by(whole, SLOW)
+    facts = json.loads(aolink("info", loaded.path, "--json", env=dict(os.environ)).stdout)
+    assert facts["losses"][f"skipped_{SLOW}"] == skipped
 
 
 def test_latencies_stay_in_order_beside_a_slow_estimator(loaded: Session) -> None:
     """A frame is estimated when its first estimate is there, and then a command knows it."""
-    skipped = skipped_by(Recording(loaded.path), slow()) & skipped_by(Recording(loaded.path), "o3")
+    skipped = skipped_by(Recording(loaded.path), SLOW) & skipped_by(Recording(loaded.path), "o3")
     assert len(loaded.report.latencies) == EXPOSURES
     for each in loaded.report.latencies:
         assert 0 < each.first_byte_ns <= each.complete_ns
@@ -170,13 +162,13 @@ def outcome_of(beside: BesideTheLoop, name: str, frame_id: int) -> Outcome:
 @pytest.mark.rare
 def test_a_slow_estimator_makes_no_fast_one_skip(recorded: Session) -> None:
     rig, exposures = load_rig("section-vi-lively"), exposures_of(recorded)
-    with BesideTheLoop(rig, [slow(), "o3"]) as beside:
+    with BesideTheLoop(rig, [SLOW, "o3"]) as beside:
         beside.get_ready(lambda: False)
         for exposure in exposures:
             beside.offer(exposure)
             assert outcome_of(beside, "o3", exposure.frame_id).message is not None
         rest = beside.finish(0.0)
-    assert {each.estimator for each in rest} <= {slow()}
+    assert {each.estimator for each in rest} <= {SLOW}
     assert all(each.message is None and "the session was over" in each.reason for each in rest)
 
 
@@ -295,7 +287,7 @@ def until(true: Callable[[], bool]) -> None:
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="it reads /proc")
 def test_a_killed_session_takes_its_estimators_along(rig_file: Path, tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
-    with recording_process(rig_file, path, "-e", slow(), "-e", "o3", stderr=subprocess.DEVNULL) as process:
+    with recording_process(rig_file, path, "-e", SLOW, "-e", "o3", stderr=subprocess.DEVNULL) as process:
         until(lambda: path.exists() and path.stat().st_size > 20_000)
         estimators = children(process.pid, "estimator_process")
         assert len(estimators) == 2
@@ -315,7 +307,7 @@ def is_running(process: int) -> bool:
 def test_ctrl_c_waits_for_what_is_under_way_and_records_the_rest_as_skipped(rig_file: Path, tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     with recording_process(
-        rig_file, path, "-e", slow(), stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True,
+        rig_file, path, "-e", SLOW, stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True,
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
     ) as process:  # fmt: skip
         until(lambda: path.exists() and path.stat().st_size > 20_000)
@@ -325,10 +317,10 @@ def test_ctrl_c_waits_for_what_is_under_way_and_records_the_rest_as_skipped(rig_
     recording = Recording(path)
     assert recording.complete
     exposures = {each.frame_id for each in recording.exposures()}
-    estimated = {each.frame_id for each in recording.estimates(slow())}
-    assert estimated | skipped_by(recording, slow()) == exposures
-    assert not estimated & skipped_by(recording, slow())
-    assert f"{slow()}: {len(estimated)} of {len(exposures)} exposures".encode() in output
+    estimated = {each.frame_id for each in recording.estimates(SLOW)}
+    assert estimated | skipped_by(recording, SLOW) == exposures
+    assert not estimated & skipped_by(recording, SLOW)
+    assert f"{SLOW}: {len(estimated)} of {len(exposures)} exposures".encode() in output
 
 
 @pytest.mark.slow

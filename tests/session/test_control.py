@@ -28,6 +28,7 @@ from tests.control.rigs import DRIFT, VIBRATION, small_rig
 from tests.control.test_fall_back import played, vibration
 from tests.kinds import messages_of, must_be
 from tests.session.simulated_time import Run, SimulatedTimeHub, run_session
+from tests.session.slow import SLOW, slow_installed
 
 FAULTS = """
 [simulation.faults]
@@ -175,9 +176,10 @@ def test_in_real_time_every_step_is_accounted_for_and_within_limits(tmp_path: Pa
 
 @pytest.mark.slow
 def test_an_estimator_that_is_too_slow_to_control_opens_the_loop_and_costs_nothing_else(tmp_path: Path) -> None:
-    """`sampled` takes longer for an exposure than six of them last: the mirror holds, and the recording has it all."""
+    """It takes longer for an exposure than six of them last: the mirror holds, and the recording has it all."""
     path = rig_file(tmp_path, small_rig(DRIFT))
-    report = close(path, tmp_path, "lqg", "sampled", exposures=60, how=("--real-time",))
+    with slow_installed(tmp_path):
+        report = close(path, tmp_path, "lqg", SLOW, exposures=60, how=("--real-time",))
     assert (report.ended, report.exposures) == ("complete", report.frames_received)
     assert report.steps_applied + report.steps_parked + report.steps_not_reported == 60 * 40
     assert report.control is not None

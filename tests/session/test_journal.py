@@ -50,7 +50,7 @@ def test_warnings_that_differ_in_their_numbers_are_said_once_with_their_count(tm
         for frame in range(512):
             journal.warn(f"the model no longer fits (frame {frame}): NIS {frame / 7:.2f}, correlation {frame / 9:+.2g}")
             journal.warn(f"the model fits again (frame {frame})")
-        for name in ("o1", "o3", "sampled:particles=10", "sampled:particles=20"):
+        for name in ("o1", "o3", "profile:draws=10", "profile:draws=20"):
             journal.warn(f"the estimator {name} failed: after {len(name)} s")
         writer.close(report.counts())
     fits, again, *others = report.warnings

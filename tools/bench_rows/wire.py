@@ -97,19 +97,17 @@ def commands_at_1_khz(effort: Effort) -> Row:
 def slow_estimator(effort: Effort) -> Row:
     """A session in real time with an estimator that is slower than the camera, and one without: what it costs
     besides."""
-    # 20 exposures a second, of which each takes `sampled` some tenths of a second.
-    text = load_rig("section-vi-lively").toml.replace("exposure_steps = 200", "exposure_steps = 50")
+    rig = load_rig("tip-tilt")  # 20 exposures a second, of which each takes `profile` a tenth of a second
     reports, count = [], effort.of(_SLOW_EXPOSURES, 20)
     with tempfile.TemporaryDirectory() as folder:
-        (source := Path(folder) / "fast.toml").write_text(text)
-        for names in ([], ["sampled"]):
-            with simulated_rig(source, "--real-time") as ports:
+        for names in ([], ["profile"]):
+            with simulated_rig(rig.name, "--real-time") as ports:
                 path = Path(folder) / f"{len(names)}.mcap"
-                reports.append(record(parse_rig(text), *ports, path, estimators=names, exposures=count))
+                reports.append(record(rig, *ports, path, estimators=names, exposures=count))
     lost, with_slow = (
         each.frames_lost + each.frames_incomplete + each.steps_commanded - each.steps_applied for each in reports
     )
-    counted = reports[1].estimation["sampled"]
+    counted = reports[1].estimation["profile"]
     return Row(
         f"live session, an estimate takes {statistics.median(counted.took_ms):.0f} ms of a frame period of 50 ms:"
         f" {counted.estimated} estimated, {counted.skipped} skipped",

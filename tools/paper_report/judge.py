@@ -13,8 +13,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from judging.sampled import NAME as LIMIT
+from judging.sampled import estimator as estimator_named
 
-from aolink.estimation import Estimate, make_estimator, smooth
+from aolink.estimation import Estimate, smooth
 from aolink.exposure import Exposure
 from aolink.numerics.arrays import FloatArray
 from aolink.optics.sensor import SpotSensor
@@ -24,7 +26,6 @@ from paper_report.family import SEEDS, Scene, draw, exposures_of
 
 QUICK_NAMES = ("open-loop", "o1", "o3", "moments")
 PIXEL_NAMES = ("profile",)
-LIMIT = "sampled"
 NAMES = (*QUICK_NAMES, *PIXEL_NAMES, LIMIT)
 RECORDED = Path(__file__).with_name("family.jsonl")
 """Rows that the repository keeps, since they take hours: of reporting seeds, made by the commits that they name."""
@@ -100,8 +101,7 @@ def judge(scene: Scene, names: Sequence[str], size: Size) -> Iterator[Row]:
     for name in names:
         runs = size.runs_of(name)
         some = first_runs(rig, exposures, runs)
-        options = {"particles": size.particles} if name == LIMIT else {}
-        estimator = make_estimator(some[0], name, **options)
+        estimator = estimator_named(some[0], name, particles=size.particles)
         start = time.process_time()
         estimates, several = [], []
         for exposure in some[1]:

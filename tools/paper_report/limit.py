@@ -9,10 +9,11 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from judging.sampled import estimator as estimator_named
 from numpy.typing import NDArray
 from scipy import special
 
-from aolink.estimation import Estimate, make_estimator
+from aolink.estimation import Estimate
 from aolink.exposure import Exposure
 from aolink.numerics.arrays import FloatArray
 from aolink.optics.sensor import SpotSensor
@@ -97,8 +98,8 @@ def limit_table(effort: Effort) -> list[Scene]:
         seconds: dict[str, float] = {}
         single: list[NDArray[np.bool_]] = []
         for each in (*NAMES, "again"):
-            options = {"particles": effort.particles, "seed": int(each == "again")}
-            estimator = make_estimator(rig, "sampled" if each == "again" else each, **options)
+            name, seed = ("sampled", 1) if each == "again" else (each, 0)
+            estimator = estimator_named(rig, name, particles=effort.particles, seed=seed)
             start = time.perf_counter()
             estimates[each] = []
             for exposure in exposures:

@@ -13,8 +13,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from judging.sampled import estimator as estimator_named
 
-from aolink.estimation import make_estimator, smooth
+from aolink.estimation import smooth
 from aolink.exposure import Exposure
 from aolink.films.film import array_film
 from aolink.importing.first_rig import first_rig
@@ -165,7 +166,7 @@ def made_film(
         for found, one in zip((held, interpolated), centroids(rig, series), strict=True):
             found.append(squares(one))
         for name in names:
-            estimator = make_estimator(rig, name, **({"particles": particles} if name == "sampled" else {}))
+            estimator = estimator_named(rig, name, particles=particles)
             estimates = [estimator.step(each) for each in series]
             after = smooth(rig.plant, series, estimates)
             paths = np.array([each.path for each in estimates])

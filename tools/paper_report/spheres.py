@@ -12,8 +12,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from judging.sampled import NAME as LIMIT
+from judging.sampled import estimator as estimator_named
 
-from aolink.estimation import ESTIMATOR_NAMES, make_estimator, smooth
+from aolink.estimation import ESTIMATOR_NAMES, smooth
 from aolink.exposure import Exposure
 from aolink.films.formats import open_film
 from aolink.importing.first_rig import first_rig
@@ -34,6 +36,7 @@ from paper_report.judge import BEYOND_95
 from paper_report.numbers import Effort
 
 FILE = Path(__file__).parents[2] / "tests" / "data" / "diffusing_spheres.npz"
+NAMES = (*ESTIMATOR_NAMES, LIMIT)
 _RATE_HZ = 24.0
 _SKIP = 1
 """Exposures that are not scored, because the spheres' motion before is not known."""
@@ -134,9 +137,8 @@ def _film_of(frames: int, effort: Effort) -> Film:
 
     held, interpolated = (squares(each[scored]) for each in centroids(rig, exposures))
     path, smoothed, coverage = {"centroid, held": held}, {"centroid, interpolated": interpolated}, {}
-    for name in ESTIMATOR_NAMES:
-        options = {"particles": effort.particles} if name == "sampled" else {}
-        estimator = make_estimator(rig, name, **options)
+    for name in NAMES:
+        estimator = estimator_named(rig, name, particles=effort.particles)
         estimates = [estimator.step(exposure) for exposure in exposures]
         some = [estimates[k] for k in scored]
         after = smooth(rig.plant, exposures, estimates)
@@ -192,8 +194,8 @@ def film_section(found: Sequence[Film]) -> list[Block]:
         Text("With the exposures that do not count, filtered over held and smoothed over interpolated:"),
         Table(
             ["estimator", *across, *(f"{each}, smoothed" for each in across)],
-            [[name, *(of[name].interval for of in over_all)] for name in ESTIMATOR_NAMES],
+            [[name, *(of[name].interval for of in over_all)] for name in NAMES],
         ),
         Text("Share of the path inside the estimate's 95 % intervals, with the tracker's own error added:"),
-        table("estimator", ESTIMATOR_NAMES, lambda each, name: f"{each.coverage[name]:.3f}"),
+        table("estimator", NAMES, lambda each, name: f"{each.coverage[name]:.3f}"),
     ]

@@ -1,0 +1,1 @@
+"""What judges estimators, verdicts and films."""
