@@ -11,6 +11,7 @@ from typing import Any
 
 import matplotlib as mpl
 import numpy as np
+from judging.sampled import NAME as LIMIT
 from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -26,7 +27,7 @@ from aolink.optics.camera import to_density
 from aolink.rig import Rig
 from paper_report.ensemble import Cell, IntervalEstimate, clean_exposures, errors, side_by_side, with_pixel_noise
 from paper_report.family import SWINGS, draw
-from paper_report.judge import LIMIT, Row
+from paper_report.judge import Row
 from paper_report.limit import NAMES, SceneErrors
 from paper_report.limit import Scene as LimitScene
 from paper_report.numbers import Effort, Remark1, Remark2

@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from judging.sampled import NAME as LIMIT
 from numpy.typing import NDArray
 from scipy import stats
 
@@ -15,7 +16,7 @@ from aolink.numerics.arrays import FloatArray
 from paper_report.blocks import Block, Heading, PageFigure, Points, Table, Text
 from paper_report.ensemble import IntervalEstimate, measured
 from paper_report.family import SEEDS
-from paper_report.judge import LIMIT, NAMES, Row
+from paper_report.judge import NAMES, Row
 
 Rows = Mapping[str, Mapping[int, Row]]
 """Rows by estimator and seed."""
