@@ -67,7 +67,7 @@ def read(path: str | Path, side: Sequence[str | Path] = (), *, rig: Rig | str | 
     Parameters
     ----------
     path:
-        A file, or a URL that fsspec knows (``pip install 'aolink[remote]'``).
+        The file.
     side:
         Side files of the recording, whose estimates replace its own by the same names.
     rig:

@@ -85,7 +85,7 @@ class Series(Sequence[Exposure]):
         self._numbers = numbers
         self.rig = source.rig
         self.path = source.path
-        """The file of the exposures: a path, or the location of one behind a URL."""
+        """The file of the exposures."""
         self.metadata = source.metadata
         """Facts about the session."""
 

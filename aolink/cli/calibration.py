@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.markup import escape
 
-from aolink.cli.common import JsonOption, OverwriteOption, app, local_file, progress, stderr, stdout
+from aolink.cli.common import JsonOption, OverwriteOption, app, progress, stderr, stdout
 from aolink.cli.terminal import ask, progress_bar
 from aolink.errors import AolinkError, CalibrationError
 from aolink.files import check_target, writing
@@ -40,7 +40,6 @@ def calibrate(
         typer.Argument(
             metavar="[FILE]...",
             help="Recordings made with `aolink record --calibration`, or with pokes.",
-            parser=local_file,
         ),
     ] = None,
     camera: Annotated[

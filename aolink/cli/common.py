@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from aolink.estimation import Score
     from aolink.optics.sensor import BaseSensor
     from aolink.recording.reader import Recording
-    from aolink.recording.remote import Url
     from aolink.rig import Rig
 
 
@@ -67,17 +66,7 @@ _opened: "list[tuple[Recording, str]]" = []
 RigArgument = Annotated[str, typer.Argument(help="A rig file, or the name of a rig that comes with aolink.")]
 
 
-def local_file(text: str) -> Path:
-    """The path of a file of this machine. Raises typer.BadParameter for a URL."""
-    from aolink.recording.remote import Url, location
-
-    place = location(text)
-    if isinstance(place, Url):
-        raise typer.BadParameter(f"{place} is a URL, and this command reads files of this machine: copy it here first")
-    return place
-
-
-FileArgument = Annotated[Path, typer.Argument(help="A recording.", metavar="FILE", parser=local_file)]
+FileArgument = Annotated[Path, typer.Argument(help="A recording.", metavar="FILE")]
 EstimatorOption = Annotated[
     list[str] | None,
     typer.Option(
@@ -125,7 +114,7 @@ def load_checked(path_or_name: str) -> "Rig":
     return loaded
 
 
-def open_recording(file: "str | Path | Url", *, check: bool = False, side: "Sequence[Path | Url]" = ()) -> "Recording":
+def open_recording(file: str | Path, *, check: bool = False, side: Sequence[str | Path] = ()) -> "Recording":
     """Open a recording with its side files, and print a warning where it is not whole."""
     from aolink.recording.reader import Recording
 
@@ -168,7 +157,7 @@ def spot_of(sensor: "BaseSensor", lenslet: str) -> int:
     return int(found[0])
 
 
-def check_measured(file: "Path | Url", scores: "Mapping[str, Score]") -> None:
+def check_measured(file: Path, scores: "Mapping[str, Score]") -> None:
     """Raise EstimatorError if an estimator that takes measurements could not use a single exposure."""
     for name, score in scores.items():
         if score.nothing_measured:

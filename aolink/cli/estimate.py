@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     "  |  aolink estimate *.mcap -e moments --set plant.process_noise=0.2,0.4 --jobs 2 -o results/"
 )
 def estimate(
-    files: Annotated[list[str], typer.Argument(metavar="FILE...", help="One recording or many, or their URLs.")],
+    files: Annotated[list[str], typer.Argument(metavar="FILE...", help="One recording or many.")],
     estimator: EstimatorOption = None,
     target: Annotated[
         str | None,
@@ -83,7 +83,6 @@ def estimate(
     from aolink.estimation.registry import DEFAULT_ESTIMATOR
     from aolink.jobs import batch
     from aolink.jobs.tables import parquet as load_parquet
-    from aolink.recording.remote import Url, location
 
     if table is not None:
         if table.suffix.lower() == ".parquet":  # any other name is refused, and needs no folder
@@ -92,7 +91,7 @@ def estimate(
         load_parquet()
     sources = batch.shard(files, shard) if shard else files
     if scheduler:  # the workers run in other folders
-        sources = [each if isinstance(location(each), Url) else str(Path(each).absolute()) for each in sources]
+        sources = [str(Path(each).absolute()) for each in sources]
         output = output.absolute()
     todo = batch.jobs(
         sources, models, estimator or [DEFAULT_ESTIMATOR], output,

@@ -5,12 +5,12 @@ from typing import Annotated
 
 import typer
 
-from aolink.cli.common import OverwriteOption, app, open_recording, progress, stdout
+from aolink.cli.common import FileArgument, OverwriteOption, app, open_recording, progress, stdout
 
 
 @app.command(epilog="Example: aolink export session.mcap -o session.parquet -e moments")
 def export(
-    file: Annotated[str, typer.Argument(metavar="FILE", help="A recording: a file or a URL.")],
+    file: FileArgument,
     output: Annotated[
         Path,
         typer.Option(
@@ -33,10 +33,9 @@ def export(
     NumPy, NetCDF and AOT telemetry hold the frames and the paths; a table has a row for each exposure and axis.
     """
     from aolink.exporting.files import export as export_series
-    from aolink.recording.remote import location
     from aolink.recording.side_files import check_stands_alone
 
-    recording = open_recording(location(file))
+    recording = open_recording(file)
     check_stands_alone(recording)
     with progress("export", recording.n_frames) as tell:
         export_series(recording, output, estimator, overwrite=overwrite, progress=tell)

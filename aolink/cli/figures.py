@@ -115,7 +115,7 @@ def _with_sides(files: list[str]) -> "list[Recording]":
 
 
 def _in_folders(files: list[str]) -> list[str]:
-    """Files and URLs as they are; for a folder, its recordings by name."""
+    """Files as they are; for a folder, its recordings by name."""
     found: list[str] = []
     for each in files:
         if Path(each).is_dir():

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
-from aolink.cli.common import JsonOption, OutputOption, OverwriteOption, app, local_file, progress, stdout
+from aolink.cli.common import JsonOption, OutputOption, OverwriteOption, app, progress, stdout
 from aolink.errors import ImportingError
 
 if TYPE_CHECKING:
@@ -156,7 +156,6 @@ def import_(
         Path,
         typer.Argument(
             metavar="SOURCE",
-            parser=local_file,
             help="A film: .npy, .npz, HDF5, SER, TIFF, FITS, video, MCAP, ROS bag, AOT telemetry, or a folder of"
             " pictures or stacks.",
         ),

@@ -17,7 +17,6 @@ from aolink.files import check_target, writing
 if TYPE_CHECKING:
     from aolink.jobs.follow import News, Offer
     from aolink.jobs.identify import IdentifiedModel, Wanted
-    from aolink.recording.remote import Url
     from aolink.rig import Rig
 
 _LOOK_S = 0.2
@@ -38,7 +37,7 @@ class Fitted(StrEnum):
     "  |  aolink identify *.mcap -o rig.toml  |  aolink identify session.mcap --follow -o identified.toml"
 )
 def identify(
-    files: Annotated[list[str], typer.Argument(metavar="FILE...", help="Recordings of one rig, or their URLs.")],
+    files: Annotated[list[Path], typer.Argument(metavar="FILE...", help="Recordings of one rig.")],
     output: Annotated[Path, typer.Option("--output", "-o", metavar="RIG.toml", help="The rig file to write.")],
     model: Annotated[
         list[str] | None,
@@ -82,11 +81,9 @@ def identify(
     """
     from aolink.identification import CANDIDATES
     from aolink.jobs import identify as job
-    from aolink.recording.remote import location, only_paths
     from aolink.rig import load_rig
 
-    places = [location(file) for file in files]
-    sources = [*only_paths(places), *([Path(rig)] if rig else [])]
+    sources = [*files, *([Path(rig)] if rig else [])]
     check_target(output, overwrite=overwrite, sources=sources, suffix=".toml", error=IdentificationError)
     fitted = set(fit or ())
     if len(kinds := [each.value for each in (Fitted.FIRST_ORDER, Fitted.SECOND_ORDER) if each in fitted]) > 1:
@@ -98,15 +95,15 @@ def identify(
         highest_hz=highest or None,
     )  # fmt: skip
     if follow:
-        if len(places) > 1:
+        if len(files) > 1:
             raise typer.BadParameter("--follow is for one recording")
         if fitted or overwrite:
             raise typer.BadParameter(
                 "--follow fits the disturbance alone and never overwrites: leave out --fit and --overwrite"
             )
-        _follow(places[0], output, load_rig(rig) if rig else None, wanted, sources, as_json=as_json)
+        _follow(files[0], output, load_rig(rig) if rig else None, wanted, sources, as_json=as_json)
         return
-    recordings = [open_recording(place) for place in places]
+    recordings = [open_recording(file) for file in files]
     with progress("identify", None) as tell:
 
         def on_progress(what: str, done: int, of: int) -> None:
@@ -129,7 +126,7 @@ def identify(
 
 
 def _follow(
-    place: "Path | Url", output: Path, rig: "Rig | None", wanted: "Wanted", sources: list[Path], *, as_json: bool
+    place: Path, output: Path, rig: "Rig | None", wanted: "Wanted", sources: list[Path], *, as_json: bool
 ) -> None:
     from aolink.control.drift import WINDOW
     from aolink.jobs.follow import Following, Offer, offer_path

@@ -22,10 +22,10 @@ _LOOK_S = 0.1
 @app.command(epilog="Example: aolink view session.mcap  |  aolink view session.mcap --frame 7 -o one.rrd")
 def view(
     recorded: Annotated[
-        str, typer.Argument(metavar="FILE", help="A recording, or a Rerun file (.rrd) that -o has written.")
+        Path, typer.Argument(metavar="FILE", help="A recording, or a Rerun file (.rrd) that -o has written.")
     ],
     side: Annotated[
-        list[str] | None,
+        list[Path] | None,
         typer.Argument(metavar="[SIDE...]", help="Its side files: their estimates instead of its own."),
     ] = None,
     output: Annotated[
@@ -49,7 +49,6 @@ def view(
     For five exposures or fewer, paths are shown at every fast step; for more, at 32 places of each exposure.
     """
     from aolink import viewing
-    from aolink.recording.remote import location, only_paths
 
     choices = (frame, lenslet)
     if follow:
@@ -57,12 +56,12 @@ def view(
             raise typer.BadParameter("--follow shows the whole session as it comes, alone or with --web")
         _follow(recorded, web=web)
         return
-    file, *sides = map(location, [recorded, *(side or ())])
+    sides = side or []
     if output is not None:
-        check_target(output, overwrite=overwrite, sources=only_paths([file, *sides]), suffix=".rrd")
-    recording = None if file.suffix == ".rrd" else open_recording(file, side=sides)
+        check_target(output, overwrite=overwrite, sources=[recorded, *sides], suffix=".rrd")
+    recording = None if recorded.suffix == ".rrd" else open_recording(recorded, side=sides)
     if recording is None and (output is not None or side or any(each is not None for each in choices)):
-        raise typer.BadParameter(f"{file} is a Rerun file already: -o X.rrd, side files and choices need a recording")
+        raise typer.BadParameter(f"{recorded} is a Rerun file: -o X.rrd, side files and choices need a recording")
     if not (web or output):
         viewing.check_display()
     if recording is None:
@@ -94,7 +93,7 @@ def _targets(output: list[Path] | None) -> tuple[Path | None, Path | None]:
     return next(iter(usual), None), next(iter(others), None)
 
 
-def _follow(file: str, *, web: bool) -> None:
+def _follow(file: Path, *, web: bool) -> None:
     import time
 
     from aolink import viewing
@@ -124,9 +123,7 @@ def _number(recording: "Recording", exposure: int) -> range:
 def slopes(
     frame: Annotated[
         Path,
-        typer.Argument(
-            metavar="FRAME", help="A Shack-Hartmann frame: .fits, .fits.gz or .npy.", parser=common.local_file
-        ),
+        typer.Argument(metavar="FRAME", help="A Shack-Hartmann frame: .fits, .fits.gz or .npy."),
     ],
     reference: Annotated[Path, typer.Option(metavar="FILE", help="A frame of the same camera with a flat wavefront.")],
     written: Annotated[

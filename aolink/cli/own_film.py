@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from aolink.cli.common import JsonOption, OverwriteOption, app, local_file, program, progress, stderr, stdout
+from aolink.cli.common import JsonOption, OverwriteOption, app, program, progress, stderr, stdout
 from aolink.cli.films import FilmOfLook, RateOption, film_file, film_settings
 from aolink.errors import ExportError, ImportingError, RecordingError
 from aolink.files import writing
@@ -22,7 +22,7 @@ from aolink.signals import Interrupted
 def look(
     source: Annotated[
         Path,
-        typer.Argument(metavar="FILM", parser=local_file, help="A film of spots, as `aolink import` takes."),
+        typer.Argument(metavar="FILM", help="A film of spots, as `aolink import` takes."),
     ],
     rate: RateOption = None,
     exposure: Annotated[

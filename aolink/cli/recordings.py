@@ -8,8 +8,16 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from aolink.cli import common
-from aolink.cli.common import JsonOption, OutputOption, OverwriteOption, app, open_recording, progress, stdout
+from aolink.cli.common import (
+    FileArgument,
+    JsonOption,
+    OutputOption,
+    OverwriteOption,
+    app,
+    open_recording,
+    progress,
+    stdout,
+)
 from aolink.errors import RecordingError
 
 if TYPE_CHECKING:
@@ -22,7 +30,7 @@ CutTime = Annotated[float | None, typer.Option(metavar="S", help="Seconds from t
 
 @app.command(epilog="Example: aolink info session.mcap --json")
 def info(
-    file: Annotated[str, typer.Argument(help="A recording: a file, or a URL.", metavar="FILE")],
+    file: FileArgument,
     check: Annotated[bool, typer.Option("--check", help="Read every byte, not the index alone.")] = False,
     every: Annotated[bool, typer.Option("--all", help="Print all facts.")] = False,
     log: Annotated[bool, typer.Option("--log", help="Print what the session said while it ran, line by line.")] = False,
@@ -132,7 +140,7 @@ def _tolerances(text: str) -> tuple[float, float]:
 def copy(
     files: Annotated[
         list[Path],
-        typer.Argument(metavar="FILE...", help="A recording, or the parts of one session.", parser=common.local_file),
+        typer.Argument(metavar="FILE...", help="A recording, or the parts of one session."),
     ],
     output: OutputOption,
     start: CutTime = None,

@@ -11,7 +11,7 @@ import typer
 from typer.core import TyperCommand, TyperOption
 
 from aolink.cli import common
-from aolink.cli.common import JsonOption, OverwriteOption, app, check_measured, local_file, open_recording, stdout
+from aolink.cli.common import JsonOption, OverwriteOption, app, check_measured, open_recording, stdout
 from aolink.errors import RestorationError
 from aolink.files import check_target
 
@@ -55,7 +55,6 @@ def deblur(
             help="A recording, all of whose exposures are restored; or with --psf or --path a blurred picture, or a"
             " stack of them, of any kind that `aolink import` reads. Pixels that are not numbers, or saturated, are"
             " left out.",
-            parser=local_file,
         ),
     ] = None,
     estimator: Annotated[

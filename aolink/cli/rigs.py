@@ -41,7 +41,6 @@ def rig(
         typer.Option(
             "--from",
             metavar="FILM",
-            parser=common.local_file,
             help="Write a first rig file for the objects of a film, RIG or FILM's name with .toml, and end.",
         ),
     ] = None,

@@ -19,7 +19,6 @@ from aolink.files import remove_unfinished
 from aolink.jobs.tables import COLUMNS
 from aolink.jobs.unit import Model, Settings, aolink_version, estimated
 from aolink.numerics.workers import processes
-from aolink.recording.remote import location
 
 _POLL_S = 0.2
 """Time between two checks whether the user wants to stop, s."""
@@ -31,7 +30,6 @@ class Job:
     """One recording with one model and one estimator, whose result is a side file."""
 
     source: str
-    """A file or a URL."""
     output: Path
     settings: Settings
 
@@ -105,7 +103,7 @@ def jobs(
     made = {}
     for source, model, name in itertools.product(dict.fromkeys(sources), each, dict.fromkeys(estimators)):
         suffix = re.sub(r"[^\w=.-]", "-", model.name.replace("plant.", ""))
-        output = folder / f"{'-'.join(filter(None, [location(source).stem, suffix]))}.{name}.mcap"
+        output = folder / f"{'-'.join(filter(None, [Path(source).stem, suffix]))}.{name}.mcap"
         if output in made:
             raise RigError(f"two recordings would be written as {output.name}: give them different names")
         settings = Settings(estimator=name, model=model, table=table, overwrite=overwrite)

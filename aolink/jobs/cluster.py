@@ -22,7 +22,7 @@ def workers_of(address: str) -> Iterator[Executor]:
     """The executor of a scheduler, whose workers may come and go. At the end jobs that no worker has begun are taken
     back; workers finish those under way, but this does not wait for them.
 
-    Recordings and results are where the workers find them: on a file system that all share, or behind URLs.
+    Recordings and results are where the workers find them: on a file system that all share.
 
     Raises
     ------

@@ -74,7 +74,7 @@ class Settings:
     file."""
 
 
-def estimate_file(url: str | Path, out: str | Path, settings: Settings | None = None) -> dict[str, Any]:
+def estimate_file(source: str | Path, out: str | Path, settings: Settings | None = None) -> dict[str, Any]:
     """Estimate one recording and write a side file: its estimates alone, which refer to the recording.
 
     A recording that was done before with the same settings and version of aolink is not done again. The recording is
@@ -83,8 +83,8 @@ def estimate_file(url: str | Path, out: str | Path, settings: Settings | None = 
 
     Parameters
     ----------
-    url:
-        The recording: a file, or a URL that fsspec knows.
+    source:
+        The recording's file.
     out:
         The side file to write, such as ``session.moments.mcap``: `Recording` takes it as ``side``, and `aolink view`
         beside the recording.
@@ -103,13 +103,13 @@ def estimate_file(url: str | Path, out: str | Path, settings: Settings | None = 
     RigError, EstimatorError
         The model does not fit the recording, or the estimator cannot work with it.
     """
-    return estimated(url, Path(out), settings or Settings())[0]
+    return estimated(source, Path(out), settings or Settings())[0]
 
 
-def estimated(url: str | Path, out: Path, settings: Settings) -> tuple[dict[str, Any], bool]:
+def estimated(source: str | Path, out: Path, settings: Settings) -> tuple[dict[str, Any], bool]:
     """The row of `estimate_file`, and whether it had been done before."""
     begin = time.perf_counter()
-    recording = settings.model.applied_to(Recording(url))
+    recording = settings.model.applied_to(Recording(source))
     digest = _digest(recording, settings)
     if not settings.overwrite and (before := _row_before(out, digest, settings)) is not None:
         return {**before, "recording": str(recording.path), "output": out.name}, True

@@ -14,7 +14,6 @@ from aolink.errors import RecordingError
 from aolink.recording import topics
 from aolink.recording.messages import END_OF_TIME, RawMessage
 from aolink.recording.reader import Recording
-from aolink.recording.remote import Url, location
 from aolink.recording.scan import MAGIC, Loss, grown, open_recording
 from aolink.rig import Rig
 
@@ -35,17 +34,15 @@ class GrowingRecording(Recording):
     Raises
     ------
     RecordingError
-        As for `Recording`; or the file is behind a URL, or does not begin with its rig file.
+        As for `Recording`; or the file does not begin with its rig file.
     """
 
-    def __init__(self, path: str | Path | Url, wait: Callable[[], None], *, rig: Rig | None = None) -> None:
-        if isinstance(place := location(path), Url):
-            raise RecordingError(f"{place} is a URL: what is followed while it is written is a file of this machine")
+    def __init__(self, path: str | Path, wait: Callable[[], None], *, rig: Rig | None = None) -> None:
         self._wait = wait
-        self._coming: Iterator[McapRecord] = self._written(place)
+        self._coming: Iterator[McapRecord] = self._written(Path(path))
         self._names: dict[int, str] = {}
         """Names of the schemas by their ids."""
-        super().__init__(place, rig=rig)
+        super().__init__(path, rig=rig)
 
     def survey(self, *, check: bool) -> str | None:
         """Read up to the rig file and the session's facts, which are written before any message."""

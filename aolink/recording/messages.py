@@ -8,7 +8,7 @@ from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from google.protobuf.message import Message
 from mcap.records import Attachment, Channel, ChunkIndex, McapRecord, Metadata, Schema
@@ -18,7 +18,6 @@ from aolink.errors import RecordingError
 from aolink.limits import Budget, exceeded, limits
 from aolink.recording import topics
 from aolink.recording.mcap_file import unsealed
-from aolink.recording.remote import Url, location
 from aolink.recording.scan import Loss, Summary, chunk_at, open_recording, read_summary, record_at, scan
 
 END_OF_TIME = 1 << 64
@@ -61,8 +60,8 @@ class RecordedMessages:
     ``channels`` and with `note_metadata` and `lose`.
     """
 
-    def __init__(self, path: str | Path | Url, *, check: bool) -> None:
-        self.path: Any = location(path)
+    def __init__(self, path: str | Path, *, check: bool) -> None:
+        self.path = Path(path)
         self.metadata: dict[str, str] = {}
         """Facts about the session, from its start and its end."""
         self.end_metadata: dict[str, str] = {}
@@ -130,7 +129,7 @@ class RecordedMessages:
     @cached_property
     def size(self) -> int:
         """Bytes of the file."""
-        return self.path.size if isinstance(self.path, Url) else self.path.stat().st_size
+        return self.path.stat().st_size
 
     def own_messages(
         self, wanted: Collection[str], low: int = 0, high: int = END_OF_TIME, chunks: slice = slice(None)
@@ -193,7 +192,7 @@ class RecordedMessages:
         for record in (*summary.schemas.values(), *summary.channels.values()):
             yield record, True
         others, budget = sorted(summary.others, key=lambda each: each.offset), Budget(str(self.path), self.size)
-        with open_recording(self.path, [(each.offset, each.length) for each in others]) as file:
+        with open_recording(self.path) as file:
             for each in others:
                 if (found := record_at(file, each, self.lose, budget)) is not None:
                     yield found, True
@@ -234,7 +233,7 @@ class RecordedMessages:
             and (not (held := index.message_index_offsets) or not held.keys().isdisjoint(channels))
         ]
         budget = Budget(str(self.path), self.size)
-        with open_recording(self.path, [(each.chunk_start_offset, each.chunk_length) for each in wanted]) as file:
+        with open_recording(self.path) as file:
             for index in wanted:
                 yield from chunk_at(file, index, self.lose, budget)
 

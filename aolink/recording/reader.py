@@ -22,7 +22,6 @@ from aolink.recording import convert, schemas_pb2, topics
 from aolink.recording.exposures import ASSEMBLED, BESIDE, Walk
 from aolink.recording.frame_index import FrameIndex, StepRun
 from aolink.recording.messages import END_OF_TIME, RawMessage, RecordedMessage, RecordedMessages, in_time
-from aolink.recording.remote import Url, only_paths
 from aolink.recording.scan import Loss
 from aolink.recording.side_files import check_is_side_of
 from aolink.recording.sound import what_is_wrong
@@ -47,7 +46,7 @@ class Recording(RecordedMessages, Series):
     Parameters
     ----------
     path:
-        The file, or a URL that fsspec knows: of a URL, only the ranges that are needed are read.
+        The file.
     rig:
         A rig to use instead of the one in the file, so that new estimates are made with another model. Estimates in the
         file cannot be read with it.
@@ -66,8 +65,8 @@ class Recording(RecordedMessages, Series):
     """
 
     def __init__(
-        self, path: str | Path | Url, *, rig: Rig | None = None, check: bool = False,
-        side: Sequence[str | Path | Url] = (),
+        self, path: str | Path, *, rig: Rig | None = None, check: bool = False,
+        side: Sequence[str | Path] = (),
     ) -> None:  # fmt: skip
         super().__init__(path, check=check)
         rig_text = self.rig_text
@@ -106,8 +105,8 @@ class Recording(RecordedMessages, Series):
 
     @property
     def files(self) -> list[Path]:
-        """The files of this machine that it is read from: no file made from it may replace them."""
-        return only_paths([self.path, *(side.path for side in self._side)])
+        """The files that it is read from: no file made from it may replace them."""
+        return [self.path, *(side.path for side in self._side)]
 
     @property
     def estimators(self) -> list[str]:
@@ -354,7 +353,7 @@ class Restorations:
             yield convert.restored_from_messages(info, scene, spots)
 
 
-def _check_replaces(rig: Rig | None, recorded: Rig, path: Path | Url) -> None:
+def _check_replaces(rig: Rig | None, recorded: Rig, path: Path) -> None:
     """Raise RigError where another rig cannot stand in for the one that a recording was made with."""
     if rig is None:
         return

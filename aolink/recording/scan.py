@@ -13,7 +13,7 @@ import os
 import stat
 import struct
 import zlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from io import BytesIO
 from pathlib import Path
@@ -30,7 +30,6 @@ from mcap.records import Message as McapMessage
 
 from aolink.errors import RecordingError
 from aolink.limits import Budget, exceeded, limits
-from aolink.recording.remote import Url
 from aolink.recording.search import HEAD, MESSAGE_HEAD, Search, begins_a_record, is_plausible
 
 _MOST_READINGS = 4
@@ -114,13 +113,8 @@ class Summary:
         )
 
 
-def open_recording(path: Path | Url, expected: Sequence[tuple[int, int]] = ()) -> IO[bytes]:
+def open_recording(path: Path) -> IO[bytes]:
     """Open a file that should be a recording.
-
-    Parameters
-    ----------
-    expected:
-        First byte and length of the ranges that will be read, in ascending order, for a file behind a URL.
 
     Raises
     ------
@@ -128,12 +122,9 @@ def open_recording(path: Path | Url, expected: Sequence[tuple[int, int]] = ()) -
         The file cannot be read, or is neither an MCAP file nor a part of one.
     """
     try:
-        if isinstance(path, Url):
-            file: IO[bytes] = path.open(expected)  # type: ignore[assignment] # a RawIOBase is one in all but name
-        else:
-            if not stat.S_ISREG(mode := path.stat().st_mode) and not stat.S_ISDIR(mode):
-                raise RecordingError(f"{path} is a pipe or a device: a recording must be a file, copy it into one")
-            file = path.open("rb")
+        if not stat.S_ISREG(mode := path.stat().st_mode) and not stat.S_ISDIR(mode):
+            raise RecordingError(f"{path} is a pipe or a device: a recording must be a file, copy it into one")
+        file = path.open("rb")
         head = file.read(len(MAGIC) + HEAD.size)
     except OSError as error:
         raise RecordingError(f"cannot read {path}: {os.strerror(error.errno or 0).lower()}") from None

@@ -128,7 +128,6 @@ def test_too_short_a_recording_is_one_line(aolink, tmp_path):
     ("arguments", "code", "says"),
     [
         (["none.mcap", "-o", "new.toml"], 5, "cannot read none.mcap: no such file"),
-        (["s3://bucket/session.mcap", "-o", "new.toml"], 5, "s3://bucket/session.mcap is a URL"),
         (["steady", "-o", "there.toml"], 14, "there.toml exists and is not overwritten"),
         (["steady", "-o", "old.toml"], 14, "old-2.toml exists, and further offers would have such names"),
         (["steady", "-o", "new.mcap"], 14, "what is written is a .toml file"),

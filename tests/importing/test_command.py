@@ -253,12 +253,6 @@ def test_a_first_rig_file_is_refused_in_one_line(source, options, says, aolink, 
     assert not (tmp_path / "a.toml").exists()
 
 
-def test_a_first_rig_file_of_a_url_is_refused(aolink):
-    refused = aolink("rig", "a.toml", "--from", "s3://films/a.npz", "--track", "1")
-    assert refused.returncode == 2
-    assert "is a URL" in " ".join(refused.stderr.split())
-
-
 def test_a_start_other_than_the_films_is_noted(aolink, rig, tmp_path):
     source = others.write_fits(tmp_path / "a.fits", FRAMES, DATE_OBS="2026-09-21T10:30:00")
     made = aolink("import", source, "-o", "a.mcap", "--rig", rig, "--rate", "50", "--film", "start=2026-09-22")

@@ -196,12 +196,3 @@ def test_a_start_after_the_end_of_a_recording_is_said(aolink: Run, recorded: Ses
     refused = aolink("copy", recorded.path, "-o", "c.mcap", "--start", "100")
     assert refused.returncode == 5
     assert "has no exposure between 100 s and the end" in refused.stderr
-
-
-def test_a_url_is_not_taken_for_a_path(aolink: Run, tmp_path: Path) -> None:
-    url = "https://127.0.0.1:1/a.mcap"
-    for command in (["copy", url, url, "-o", "m.mcap"], ["calibrate", "section-vi", url, "-o", "r.toml"]):
-        refused = aolink(*command)
-        assert refused.returncode == 2
-        assert url in refused.stderr.replace("\n", "")
-        assert "URL" in refused.stderr

@@ -118,7 +118,6 @@ def test_what_cannot_be_followed_is_one_error(recorded: Session, tmp_path: Path)
     (tmp_path / "empty.mcap").touch()
     (tmp_path / "text.mcap").write_text("not a recording, although it is long enough")
     for name, says in (
-        ("s3://bucket/session.mcap", "only|file of this machine"),
         (tmp_path / "none.mcap", "no such file"),
         (tmp_path / "empty.mcap", "empty or too short"),
         (tmp_path / "text.mcap", "not an MCAP file"),

@@ -135,4 +135,4 @@ def test_what_is_no_rerun_file_is_one_clear_error(aolink: Callable[..., Any], rr
         assert result.stderr.startswith(f"aolink: {message}")
     result = aolink("view", rrd, "-o", "again.rrd")
     assert result.returncode == 2
-    assert "is a Rerun file already" in " ".join(result.stderr.replace("│", " ").split())
+    assert "is a Rerun file" in " ".join(result.stderr.replace("│", " ").split())

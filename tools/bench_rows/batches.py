@@ -1,18 +1,16 @@
-"""Figures of batches: many small recordings, recordings behind URLs, a cluster."""
+"""Figures of batches: many small recordings, a cluster."""
 
 from __future__ import annotations
 
 import json
-import logging
 import math
 import os
 import statistics
 import subprocess
 import sys
 import tempfile
-import threading
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import ExitStack, contextmanager, nullcontext
 from pathlib import Path
@@ -21,8 +19,6 @@ from typing import Any
 from aolink.batch import Settings, estimate_file
 from aolink.jobs import batch
 from aolink.numerics.workers import processes as pool_of
-from aolink.recording import topics
-from aolink.recording.reader import Recording
 from bench_rows.recording import record_long
 from bench_rows.row import Effort, Row, resident_mb, timed
 
@@ -68,102 +64,6 @@ def tiny_recordings(effort: Effort) -> list[Row]:
         ),
         Row(f"memory over {count} recordings", f"+{growth:.1f} MB", "limit 10 MB", 10 / max(growth, 0.1), 1.0),
     ]  # fmt: skip
-
-
-def read_over_needed(effort: Effort) -> list[Row]:
-    """Bytes that a server on this machine that speaks S3 sends, against those that are needed.
-
-    To estimate, all of the file is needed; to read a tenth of its time or a slice of a tenth, a tenth of its chunks and
-    its index.
-    """
-    import s3fs
-
-    with tempfile.TemporaryDirectory() as name, _serving_s3() as sent:
-        source = Path(name) / "a.mcap"
-        record_long(source, effort.of(20_000, 200))
-        s3fs.S3FileSystem.clear_instance_cache()
-        storage = s3fs.S3FileSystem()
-        storage.mkdir("bench")
-        storage.put(str(source), "bench/a.mcap")
-        sent.clear()
-        estimate_file("s3://bench/a.mcap", Path(name) / "a.o3.mcap")
-        whole, requests, size = sum(sent), len(sent), source.stat().st_size
-        sent.clear()
-        recording, local = Recording("s3://bench/a.mcap"), Recording(source)
-        span = (local.end_ns - local.start_ns) // 10
-        times = {"start_ns": local.start_ns + 4 * span, "end_ns": local.start_ns + 5 * span}
-        found = sum(1 for _ in recording.messages(topics.IMAGE, **times))
-        part = sum(sent)
-        needed = size / 10 + _index_bytes(source)
-        assert found
-        sent.clear()
-        count = local.n_frames // 10
-        assert sum(1 for _ in Recording("s3://bench/a.mcap")[4 * count : 5 * count]) == count
-        slice_ = sum(sent)
-        s3fs.S3FileSystem.clear_instance_cache()
-    return [
-        Row(
-            "bytes read of S3, estimated", f"{whole / 1e6:.2f} MB in {requests}",
-            f"needed {size / 1e6:.2f} MB: {whole / size:.2f} times", 1.3 * size / whole, 1.0,
-        ),
-        Row(
-            "bytes read of S3, a tenth of the time", f"{part / 1e6:.2f} MB",
-            f"needed {needed / 1e6:.2f} MB: {part / needed:.2f} times", 1.3 * needed / part, 1.0,
-        ),
-        Row(
-            "bytes read of S3, a slice of a tenth", f"{slice_ / 1e6:.2f} MB",
-            f"needed {needed / 1e6:.2f} MB: {slice_ / needed:.2f} times", 1.3 * needed / slice_, 1.0,
-        ),
-    ]  # fmt: skip
-
-
-def _index_bytes(path: Path) -> int:
-    from mcap.reader import make_reader
-
-    with path.open("rb") as file:
-        summary = make_reader(file).get_summary()
-        assert summary is not None
-        return path.stat().st_size - max(each.chunk_start_offset + each.chunk_length for each in summary.chunk_indexes)
-
-
-@contextmanager
-def _serving_s3() -> Iterator[list[int]]:
-    """A server; gives the bytes of its answers to requests for objects."""
-    from moto.moto_server.werkzeug_app import DomainDispatcherApplication, create_backend_app
-    from werkzeug.serving import make_server
-
-    logging.getLogger("werkzeug").setLevel(logging.ERROR)  # requests are no news
-    sent: list[int] = []
-    answer: Callable[..., Iterable[bytes]] = DomainDispatcherApplication(create_backend_app)
-
-    def counted(environment: dict[str, Any], start_response: Callable[..., Any]) -> Iterable[bytes]:
-        def start(status: str, headers: list[tuple[str, str]], *rest: Any) -> Any:
-            if environment["REQUEST_METHOD"] == "GET" and status[:3] in ("200", "206"):
-                sent.append(int(dict(headers).get("Content-Length", 0)))
-            return start_response(status, headers, *rest)
-
-        return answer(environment, start)
-
-    server = make_server("127.0.0.1", 0, counted, threaded=True)
-    thread = threading.Thread(target=server.serve_forever)
-    thread.start()
-    known = {
-        "AWS_ENDPOINT_URL": f"http://127.0.0.1:{server.server_port}", "AWS_ACCESS_KEY_ID": "me",
-        "AWS_SECRET_ACCESS_KEY": "secret", "AWS_DEFAULT_REGION": "us-east-1",
-    }  # fmt: skip
-    before = {name: os.environ.get(name) for name in known}
-    os.environ.update(known)
-    try:
-        yield sent
-    finally:
-        server.shutdown()
-        thread.join()
-        server.server_close()
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
 
 
 def cluster_workers(effort: Effort) -> Row:

@@ -20,7 +20,7 @@ ROWS = {
         "truncation", "flipped_bits", "batch_workers", "rrd_of_ten_minutes", "rrd_size", "view_first",
     ),
     "start": ("command_start", "first_profile", "view_start"),
-    "batches": ("tiny_recordings", "read_over_needed", "cluster_workers"),
+    "batches": ("tiny_recordings", "cluster_workers"),
     "restoration": ("restoration_quality", "restoration_uncertainty", "restoration_time"),
     "shaken": ("shaken",),
     "moving_scene": ("moving_scene",),
