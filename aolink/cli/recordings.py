@@ -82,14 +82,14 @@ def compare(
     ] = "1e-9",
     as_json: JsonOption = False,
 ) -> None:
-    """List field by field how two recordings differ. Exit code 1 if they do.
+    """Say where two recordings differ first, topic by topic. Exit code 1 if they differ.
 
     A side file is compared with the recording's own estimates by the same names.
     """
     from aolink.cli.tables import recordings as tables
     from aolink.recording import topics
     from aolink.recording.compare import compare as compare_recordings
-    from aolink.recording.compare import first_parting, is_wanted
+    from aolink.recording.compare import is_wanted
     from aolink.recording.reestimate import Reestimated
     from aolink.recording.side_files import check_is_side_of
 
@@ -110,13 +110,13 @@ def compare(
     same_rig = one.rig.digest == two.rig.digest
     same = same_rig and all(each.same for each in found.values())
     if as_json:
-        print(json.dumps(tables.comparison_as_json(found, same_rig=same_rig), allow_nan=False))
+        by_topic = {name: asdict(each) for name, each in found.items()}
+        print(json.dumps({"same": same, "same_rig": same_rig, "topics": by_topic}))
     else:
         stdout.print(tables.comparison(found))
         if not same_rig:
             stdout.print("the rig files differ")
-        parting = first_parting(found)
-        stdout.print("the same" if same else f"they part in {parting}" if parting else "they differ")
+        stdout.print("the same" if same else "they differ")
     if not same:
         raise typer.Exit(1)
 

@@ -52,9 +52,6 @@ class Topic:
     ``first_step`` on), or only its time. `cut` selects messages by it, and `compare` finds their counterparts by it."""
     after: str = ""
     """Topic of the message that comes before a picture and names its exposure, which the picture itself does not."""
-    repeatable: bool = False
-    """Whether a rig that gets the same commands again gives the same messages: `aolink replay` to a rig compares
-    these."""
     shown_by: str = ""
     """The module of `aolink.viewing` and its function that shows the topic; '' for one that is not in the table.
     Functions of `devices` get the messages themselves, other ones the exposures, estimates and pictures that the reader
@@ -62,15 +59,15 @@ class Topic:
 
 
 TOPICS = (
-    Topic(EXPOSURE, pb.ExposureInfo, "exposure", repeatable=True, shown_by="devices.log_drops"),
-    Topic(IMAGE, RawImage, "exposure", after=EXPOSURE, repeatable=True, shown_by="camera.log_frames"),
-    Topic(COMMAND, wire.CommandBlock, "steps", repeatable=True, shown_by="devices.log_commands"),
-    Topic(APPLIED, wire.Applied, "steps", repeatable=True, shown_by="devices.log_applied"),
+    Topic(EXPOSURE, pb.ExposureInfo, "exposure", shown_by="devices.log_drops"),
+    Topic(IMAGE, RawImage, "exposure", after=EXPOSURE, shown_by="camera.log_frames"),
+    Topic(COMMAND, wire.CommandBlock, "steps", shown_by="devices.log_commands"),
+    Topic(APPLIED, wire.Applied, "steps", shown_by="devices.log_applied"),
     Topic(ANSWER, pb.CommandAnswer, "steps", shown_by="devices.log_answers"),
     Topic(SCENE_EXPOSURE, pb.ExposureInfo, "exposure", shown_by="scene.log_scenes"),
     Topic(SCENE, RawImage, "exposure", after=SCENE_EXPOSURE, shown_by="scene.log_scenes"),
-    Topic(TRUTH, wire.Truth, "exposure", repeatable=True, shown_by="motion.log_truth"),
-    Topic(ESTIMATE, pb.Estimate, "exposure", repeatable=True, shown_by="motion.log_estimates"),
+    Topic(TRUTH, wire.Truth, "exposure", shown_by="motion.log_truth"),
+    Topic(ESTIMATE, pb.Estimate, "exposure", shown_by="motion.log_estimates"),
     Topic(ESTIMATION, pb.Estimation, "exposure", shown_by="devices.log_estimation"),
     Topic(RESTORATION, pb.Restoration, "exposure", shown_by="scene.log_restored"),
     Topic(RESTORED_SCENE, RawImage, "exposure", after=RESTORATION, shown_by="scene.log_restored"),

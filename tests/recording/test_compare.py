@@ -1,14 +1,12 @@
-"""What two recordings differ in is said field by field, and nothing else is."""
+"""Where two recordings differ first is said topic by topic, and nothing else is."""
 
 from __future__ import annotations
 
 import resource
-import sqlite3
 import subprocess
 from collections.abc import Callable
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
 
 import numpy as np
 import pytest
@@ -17,10 +15,10 @@ from google.protobuf.message import Message
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from aolink.errors import RecordingError
+from aolink.recording import compare as compare_module
 from aolink.recording import schemas_pb2 as pb
 from aolink.recording import topics
-from aolink.recording.compare import compare, first_parting
+from aolink.recording.compare import compare
 from aolink.recording.reader import Recording
 from aolink.recording.reestimate import Reestimated
 from aolink.recording.writer import RecordingWriter
@@ -56,24 +54,28 @@ def test_one_number_is_found_with_its_frame_and_field(recorded: Session, tmp_pat
 
     one, two = Recording(recorded.path), rewritten(recorded.path, tmp_path / "b.mcap", change)
     found = compare(one, two)
-    (field,) = found["/estimate/o3"].fields.items()
-    assert (field[0], field[1].messages, field[1].first.frame_id) == ("coefficients", 1, 5)
-    assert "[1] " in field[1].first.text
-    assert first_parting(found) == "frame 5: coefficients of /estimate/o3"
-    np.testing.assert_allclose(field[1].largest, 1e-6, rtol=1e-3)
+    differing = found["/estimate/o3"]
+    assert (differing.differ, differing.frame_id) == (1, 5)
+    was, now = (each.coefficients[1] for each in estimates_of_frame_5(one, two))
+    assert differing.first == f"frame 5: coefficients[1]: {was} against {now}"
     assert all(each.same for topic, each in found.items() if topic != "/estimate/o3")
     assert all(each.same for each in compare(one, two, absolute=2e-6).values())
     assert not compare(one, two, only=["/camera/"]).keys() - {topics.IMAGE, topics.EXPOSURE}
 
 
+def estimates_of_frame_5(*recordings: Recording) -> list[pb.Estimate]:
+    return [messages_of(pb.Estimate, each, "/estimate/o3")[4] for each in recordings]
+
+
 def test_one_pixel_is_found(recorded: Session, tmp_path: Path) -> None:
     def change(topic: str, message: Message) -> list[Message]:
-        if isinstance(message, RawImage) and message.data[10] != 255:
-            message.data = message.data[:10] + bytes([message.data[10] + 1]) + message.data[11:]
+        if isinstance(message, RawImage):
+            message.data = message.data[:10] + bytes([message.data[10] ^ 1]) + message.data[11:]
         return [message]
 
     found = compare(Recording(recorded.path), rewritten(recorded.path, tmp_path / "b.mcap", change))
-    assert found[topics.IMAGE].fields["data"].first == (1, "byte 10 of 80 differs")
+    assert (found[topics.IMAGE].frame_id, found[topics.IMAGE].differ) == (1, EXPOSURES)
+    assert "data[10]: " in found[topics.IMAGE].first
 
 
 def test_missing_and_added_messages_are_named_and_shift_nothing(recorded: Session, tmp_path: Path) -> None:
@@ -81,11 +83,10 @@ def test_missing_and_added_messages_are_named_and_shift_nothing(recorded: Sessio
         return [] if isinstance(message, Truth) and message.frame_id == 3 else [message]
 
     one, two = Recording(recorded.path), rewritten(recorded.path, tmp_path / "b.mcap", without_frame_3)
-    found = compare(one, two)[topics.TRUTH]
-    assert (found.compared, found.missing, found.added, found.first_missing) == (EXPOSURES - 1, 1, 0, "frame 3")
-    assert not found.fields
-    found = compare(two, one)[topics.TRUTH]
-    assert (found.missing, found.added, found.first_added) == (0, 1, "frame 3")
+    for pair, where in (((one, two), "first"), ((two, one), "second")):
+        found = compare(*pair)[topics.TRUTH]
+        assert (found.compared, found.differ) == (EXPOSURES - 1, 1)
+        assert found.first == f"frame 3: only in the {where}"
 
 
 numbers = st.lists(st.floats(width=64), min_size=1, max_size=6)
@@ -148,7 +149,7 @@ def test_a_recording_is_compared_with_itself_without_a_copy(aolink: Run, recorde
     assert differs.returncode == 1, differs.stderr
     assert aolink("compare", "wrong.mcap", "--tolerance", "0.6").returncode == 0
     assert "/estimate/o1" in differs.stdout
-    assert "frame 1: " in differs.stdout
+    assert "frame 1: nis" in differs.stdout
     refused = aolink("compare", "wrong.mcap", "-t", "/camera/")
     assert refused.returncode == 5
     assert "holds no such estimates to make again" in refused.stderr
@@ -174,20 +175,21 @@ def test_exposures_that_were_skipped_are_skipped_again(recorded: Session, tmp_pa
 
     recording = write(tmp_path / "skipped.mcap")
     found = compare(recording, Reestimated(recording, ["o1"]), only=["/estimate/o1"])["/estimate/o1"]
-    assert (found.missing, found.added, found.compared) == (0, 0, EXPOSURES - 1)
+    # From the next exposure on they differ: in the session it was not skipped.
+    assert (found.compared, found.frame_id) == (EXPOSURES - 1, 6)
 
 
 def test_a_topic_that_nobody_has_is_an_error_not_the_same(aolink: Run, recorded: Session) -> None:
     result = aolink("compare", recorded.path, recorded.path, "--topic", "/estimat/")
     assert result.returncode == 5
-    assert "there is nothing of /estimat/ to compare" in result.stderr
+    assert "/estimat/" in result.stderr
 
 
 @pytest.mark.parametrize("tolerance", ["close", "", "1e-9,", "1,2,3", "-1", "1e-9,-1", "nan"])
 def test_a_tolerance_that_is_none_is_refused(aolink: Run, recorded: Session, tolerance: str) -> None:
     result = aolink("compare", recorded.path, recorded.path, "--tolerance", tolerance)
     assert result.returncode == 2
-    assert f"--tolerance {tolerance}: give a relative and" in " ".join(result.stderr.replace("│", " ").split())
+    assert "--tolerance" in result.stderr
 
 
 def test_messages_of_unknown_kinds_are_compared_as_bytes(recorded: Session, tmp_path: Path) -> None:
@@ -205,7 +207,7 @@ def test_messages_of_unknown_kinds_are_compared_as_bytes(recorded: Session, tmp_
     one, two = Recording(tmp_path / "a.mcap"), Recording(tmp_path / "b.mcap")
     assert one.counts == {"/mine": 1}
     assert compare(one, one)["/mine"].same
-    assert compare(one, two)["/mine"].fields["value"].messages == 1
+    assert compare(one, two)["/mine"].first == "message 1: value[0]: 111 against 116"
 
 
 def test_messages_far_from_their_counterparts_are_found(recorded: Session, tmp_path: Path) -> None:
@@ -221,8 +223,16 @@ def test_messages_far_from_their_counterparts_are_found(recorded: Session, tmp_p
     assert found[topics.COMMAND].same
     # A picture does not say its exposure: all of them come after the last one.
     assert found[topics.IMAGE].compared == 1
-    # What one of them alone has is counted, not kept.
-    assert found["/estimate/o3"].missing == one.counts["/estimate/o3"]
+    assert found["/estimate/o3"].differ == one.counts["/estimate/o3"]
+
+
+def test_what_waits_for_its_counterpart_has_a_limit(recorded: Session, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Beyond it the oldest message counts as one without a counterpart; what comes soon is still found."""
+    recording = Recording(recorded.path)
+    monkeypatch.setattr(compare_module, "_WAITING_BYTES", 20_000)
+    assert all(each.same for each in compare(recording, recording).values())
+    monkeypatch.setattr(compare_module, "_WAITING_BYTES", 0)
+    assert not any(each.compared for each in compare(recording, recording).values())
 
 
 def test_what_has_no_counterpart_is_counted(recorded: Session, tmp_path: Path) -> None:
@@ -241,39 +251,10 @@ def test_what_has_no_counterpart_is_counted(recorded: Session, tmp_path: Path) -
     found = compare(one, two, only=["/camera/"])
     of = found[topics.EXPOSURE]
     odd = sum(message.frame_id % 2 for message in exposure_infos(one))
-    assert (of.compared, of.missing, of.added) == (EXPOSURES - odd, odd, EXPOSURES + odd)
-    assert not of.fields, "the first of each name is compared with the first"
-    assert of.first_missing == "frame 1"
-    assert of.first_added == f"frame {2**63 + 1}"
+    alone = odd + (EXPOSURES + odd)
+    assert (of.compared, of.differ) == (EXPOSURES - odd, alone), "the first of each name is compared with the first"
+    assert of.first == "frame 1: only in the first"
 
 
 def exposure_infos(recording: Recording) -> list[pb.ExposureInfo]:
     return messages_of(pb.ExposureInfo, recording, topics.EXPOSURE)
-
-
-def test_a_full_temporary_folder_is_said(recorded: Session, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    connect = sqlite3.connect
-
-    def of_few_pages(*args: Any, **kwargs: Any) -> sqlite3.Connection:
-        file: sqlite3.Connection = connect(*args, **kwargs)
-        file.execute("PRAGMA max_page_count = 3")
-        return file
-
-    monkeypatch.setattr(sqlite3, "connect", of_few_pages)
-    with pytest.raises(RecordingError, match=r"full.*SQLITE_TMPDIR"):
-        compare(Recording(recorded.path), Recording(recorded.path))
-
-
-def test_of_two_sessions_of_a_rig_clock_times_are_left_out(recorded: Session, tmp_path: Path) -> None:
-    def change(topic: str, message: Message) -> list[Message]:
-        for name in ("device_ns", "device_start_ns", "host_start_ns"):
-            if hasattr(message, name):
-                setattr(message, name, getattr(message, name) + 12345)
-        if isinstance(message, RawImage):
-            message.timestamp.nanos += 1
-        return [message]
-
-    one, two = Recording(recorded.path), rewritten(recorded.path, tmp_path / "b.mcap", change)
-    assert {*compare(one, two)[topics.EXPOSURE].fields} == {"device_start_ns", "host_start_ns"}
-    assert {*compare(one, two)[topics.IMAGE].fields} == {"timestamp"}
-    assert all(each.same for each in compare(one, two, relative_to_start=True).values())

@@ -184,8 +184,7 @@ def test_compare_names_the_exposure_of_a_scene(session: Path, tmp_path: Path) ->
             writer.write(each.topic, each.message, each.log_time_ns)
     found = compare(one, Recording(tmp_path / "b.mcap"))
     assert {topic for topic, each in found.items() if not each.same} == {topics.SCENE}
-    differing = found[topics.SCENE].fields["data"]
-    assert (differing.first.frame_id, differing.messages) == (3, EXPOSURES - 2)
+    assert (found[topics.SCENE].frame_id, found[topics.SCENE].differ) == (3, EXPOSURES - 2)
 
 
 def test_restored_pictures_come_close_to_the_true_scene(session: Path, sharp: Path) -> None:

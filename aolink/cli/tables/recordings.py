@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,7 +10,6 @@ from rich import box
 from rich.markup import escape
 from rich.table import Table
 
-from aolink.cli.tables.json import without_nan
 from aolink.estimation.score import Unused
 from aolink.recording.answers import Answers
 from aolink.units import duration, with_unit
@@ -127,26 +125,10 @@ def batch(rows: Sequence[Mapping[str, Any]]) -> Table:
 def comparison(found: Mapping[str, TopicComparison]) -> Table:
     """The comparison topic by topic: how many messages were compared, and the first difference."""
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
-    for name in ("topic", "field"):
-        table.add_column(name, no_wrap=True)
-    for name in ("compared", "differ", "largest", "relative"):
+    table.add_column("topic", no_wrap=True)
+    for name in ("compared", "differ"):
         table.add_column(name, justify="right", no_wrap=True)
-    table.add_column("first")
+    table.add_column("first difference")
     for topic, each in found.items():
-        if each.same:
-            table.add_row(topic, "", str(each.compared), "0", "", "", "")
-        for name, field in each.fields.items():
-            frame = f"frame {field.first.frame_id}: " if field.first.frame_id is not None else ""
-            numbers = str(each.compared), str(field.messages), f"{field.largest:.2g}", f"{field.largest_relative:.2g}"
-            table.add_row(topic, name, *numbers, escape(frame + field.first.text))
-        ends = ((each.missing, "missing", each.first_missing), (each.added, "added", each.first_added))
-        for count, what, first in ends:
-            if count:
-                table.add_row(topic, what, str(each.compared), str(count), "", "", escape(first))
+        table.add_row(topic, str(each.compared), str(each.differ), escape(each.first))
     return table
-
-
-def comparison_as_json(found: Mapping[str, TopicComparison], *, same_rig: bool) -> dict[str, Any]:
-    """The comparison as JSON, for scripts; a difference without a size is null."""
-    same = same_rig and all(each.same for each in found.values())
-    return dict(without_nan({"same": same, "same_rig": same_rig, "topics": {k: asdict(v) for k, v in found.items()}}))
