@@ -81,7 +81,7 @@ def record(
             metavar="KIND:NAME=VALUE,...|FILE",
             help="Play this, not the rig's drive: sine:amplitude=0.2,frequency=5; chirp:amplitude=0.2,from=1,to=40;"
             " prbs:amplitude=0.2,to=40,seed=3; step:amplitude=0.2,at=1; column=0 for one input only;"
-            " or inputs from a .csv, .npy, .npz or .mcap file.",
+            " or inputs from a .npy or .mcap file.",
         ),
     ] = None,
     reconnect: Annotated[

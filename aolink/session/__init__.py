@@ -2,7 +2,7 @@
 
 `SessionLoop._take` is the one place that tells the events of devices apart. A new count of a session is a field of
 `report.Report`; where it counts losses, its name in ``_LOSSES`` of `aolink.recording.facts` shows it in `aolink info`.
-A new kind of ``--input`` has its numbers in ``_NUMBERS`` of `excitation`, and its shape in ``_part``.
+A new kind of ``--input`` has its numbers in ``_NUMBERS`` of `excitation`, and its shape in ``_signal``.
 """
 
 from __future__ import annotations
