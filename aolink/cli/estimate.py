@@ -1,12 +1,12 @@
 """The command `estimate`: one recording, or many."""
 
 import json
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Executor
 from contextlib import AbstractContextManager
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -156,8 +156,6 @@ def _estimate_many(
     else:
         if len(rows) <= _MOST_ROWS_SHOWN:
             stdout.print(tables.batch(rows))
-            if any(row["estimator"] for row in rows):
-                _draw(rows, folder / "results.png")
         failed, skipped = sum(bool(each.error) for each in done), sum(each.skipped for each in done)
         text = f"{len(done)} of {len(todo)} done, {skipped} of them before, {failed} failed; table: {table}"
         stdout.print(text, markup=False)
@@ -189,17 +187,6 @@ def _printed(each_done: "Iterable[Done]") -> "list[Done]":
         for warning in each.warnings:
             warn(f"{of}: {warning}")
     return done
-
-
-def _draw(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
-    from aolink.cli.plotting import batch_picture
-
-    try:
-        batch_picture(rows, path)
-    except AolinkError as error:
-        stderr.print(f"aolink: no picture: {error}", markup=False)
-    else:
-        stdout.print(f"picture: {path}", markup=False)
 
 
 def _estimate_one(

@@ -1,13 +1,10 @@
 """Figures of recordings with matplotlib, on given axes or figures or new ones; and a report of them.
 
 `overview` reads a series once; figures of the whole session are drawn from it, figures of one exposure from the series.
-`save_figure` writes one in a paper's size, `write_report` puts them on one page.
-
-To add a figure: a function like `plot_nis`, a row in `files.FIGURES`, its name here and in ``Figure`` of
-`aolink.cli.figures`, and a word in `aolink/pages/view_and_report.md`.
+`save_figure` writes one of the latter in a paper's size, `write_report` puts figures on one page.
 """
 
-from aolink.plotting.devices import incidents, plot_latency, plot_losses
+from aolink.plotting.devices import plot_latency, plot_losses
 from aolink.plotting.exposure import plot_exposure
 from aolink.plotting.files import FIGURES, save_figure
 from aolink.plotting.overview import Overview, overview
@@ -19,7 +16,7 @@ from aolink.plotting.session import plot_blur, plot_errors, plot_nis
 from aolink.plotting.style import new_figure, paper
 
 __all__ = [
-    "FIGURES", "Overview", "draw_session", "incidents", "new_figure", "overview", "paper", "plot_blur",
+    "FIGURES", "Overview", "draw_session", "new_figure", "overview", "paper", "plot_blur",
     "plot_errors", "plot_exposure", "plot_latency", "plot_losses", "plot_nis", "plot_pupil", "plot_scene",
     "save_figure", "write_report",
 ]  # fmt: skip

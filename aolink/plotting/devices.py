@@ -8,10 +8,9 @@ import numpy as np
 
 from aolink.errors import ExportError
 from aolink.gathered import LATENCY, REFUSED
-from aolink.numerics.arrays import FloatArray
 from aolink.plotting.overview import Overview, need_exposures
-from aolink.plotting.session import thinned, time_label
-from aolink.plotting.style import TimeUnit, axes_or_new, legend_above
+from aolink.plotting.session import TIME, thinned
+from aolink.plotting.style import axes_or_new, legend_above
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -19,17 +18,8 @@ if TYPE_CHECKING:
 _SHADES = dict(zip(REFUSED.values(), ("tab:orange", "tab:red", "tab:purple", "tab:brown"), strict=True))
 
 
-def incidents(view: Overview) -> dict[str, FloatArray]:
-    """Incidents by their kind, each with its fast steps, counted from the first exposure.
-
-    The kinds are frames lost and incomplete, exposures with inputs that the mirror did not report, estimates that were
-    gated, diverged, began anew or could not use their exposure, and those that the session had no time for.
-    """
-    return view.incidents
-
-
-def plot_losses(view: Overview, axes: Axes | None = None, *, unit: TimeUnit = "s") -> Axes:
-    """Draw what went wrong and when: a row of marks for each kind of incident (`incidents`), with their number.
+def plot_losses(view: Overview, axes: Axes | None = None) -> Axes:
+    """Draw what went wrong and when: a row of marks for each kind of incident, with their number.
 
     Raises
     ------
@@ -37,20 +27,20 @@ def plot_losses(view: Overview, axes: Axes | None = None, *, unit: TimeUnit = "s
         There is no exposure, or matplotlib is missing.
     """
     need_exposures(view)
-    axes, scale, found = axes_or_new(axes), view.scale(unit), view.incidents
+    axes, step_s, found = axes_or_new(axes), view.series.rig.timing.fast_step_s, view.incidents
     for place, (name, at) in enumerate(found.items()):
         shade = _SHADES.get(name.partition(": ")[2], "0.2")
-        axes.vlines(at * scale, place - 0.35, place + 0.35, color=shade, linewidth=1.0, rasterized=len(at) > 500)
+        axes.vlines(at * step_s, place - 0.35, place + 0.35, color=shade, linewidth=1.0, rasterized=len(at) > 500)
     labels = [f"{name} ({len(at)})" for name, at in found.items()]
     axes.set_yticks(range(len(found)), labels)
     if not found:
         axes.text(0.5, 0.5, "nothing was lost, nothing was gated", ha="center", transform=axes.transAxes)
-    end = float(view.steps[-1] + view.n_steps[-1]) * scale
-    axes.set(xlabel=time_label(unit), xlim=(0, end), ylim=(max(len(found), 1) - 0.4, -0.6))
+    end = float(view.steps[-1] + view.n_steps[-1]) * step_s
+    axes.set(xlabel=TIME, xlim=(0, end), ylim=(max(len(found), 1) - 0.4, -0.6))
     return axes
 
 
-def plot_latency(view: Overview, axes: Axes | None = None, *, unit: TimeUnit = "s") -> Axes:
+def plot_latency(view: Overview, axes: Axes | None = None) -> Axes:
     """Draw the time from the end of an exposure until each step of the loop was done, and the time of each estimate,
     ms.
 
@@ -60,7 +50,7 @@ def plot_latency(view: Overview, axes: Axes | None = None, *, unit: TimeUnit = "
         The series holds no latencies, or matplotlib is missing.
     """
     need_exposures(view)
-    by_frame = dict(zip(view.frame_ids.tolist(), (view.steps * view.scale(unit)).tolist(), strict=True))
+    by_frame = dict(zip(view.frame_ids.tolist(), view.times_s.tolist(), strict=True))
     lines = {
         name: np.array([(by_frame[frame], took_ms) for frame, took_ms in points if frame in by_frame])
         for name, points in view.timings.items()
@@ -71,7 +61,7 @@ def plot_latency(view: Overview, axes: Axes | None = None, *, unit: TimeUnit = "
     for name, points in lines.items():
         if len(points):
             axes.plot(*thinned(*points.T), "--" if name.endswith(" takes") else "-", linewidth=0.8, label=name)
-    axes.set(xlabel=time_label(unit), ylabel=f"{LATENCY}, or taken (ms)", yscale="log")
+    axes.set(xlabel=TIME, ylabel=f"{LATENCY}, or taken (ms)", yscale="log")
     axes.grid(alpha=0.3)
     legend_above(axes, 3)
     return axes

@@ -14,7 +14,7 @@ from aolink.estimation.registry import BASELINE_ESTIMATOR
 from aolink.exporting.common import check_frame
 from aolink.gathered import BAND, PER_SLOPE, SLOPES, Blur, extremes, hides_swings, limits_of, paths_of
 from aolink.numerics.arrays import FloatArray
-from aolink.plotting.style import TimeUnit, colour, figure_or_new, is_narrow
+from aolink.plotting.style import colour, figure_or_new, is_narrow
 from aolink.rig import Rig
 from aolink.series import Series, Step
 
@@ -51,7 +51,7 @@ def step_of(series: Series, number: int, estimators: Sequence[str] | None = None
 
 def plot_exposure(
     series: Series, number: int, figure: Figure | SubFigure | None = None, *,
-    estimators: Sequence[str] | None = None, spot: int = 0, unit: TimeUnit = "s",
+    estimators: Sequence[str] | None = None, spot: int = 0,
 ) -> Figure | SubFigure:  # fmt: skip
     """Draw one exposure: the path over its blur, the path's histogram, and the intensity profile beside them.
 
@@ -69,8 +69,6 @@ def plot_exposure(
         Estimators whose paths are drawn; by default the baseline `o1` and the estimator with the highest rank.
     spot:
         Number of the spot, on a sensor with many.
-    unit:
-        Whether the time axis counts milliseconds of the exposure or its fast steps.
 
     Raises
     ------
@@ -79,11 +77,11 @@ def plot_exposure(
     ExportError
         There is no such exposure or spot, its frame is not of the rig's sensor, or matplotlib is missing.
     """
-    return draw_exposure(series.rig, step_of(series, number, estimators), figure, spot=spot, unit=unit)
+    return draw_exposure(series.rig, step_of(series, number, estimators), figure, spot=spot)
 
 
 def draw_exposure(
-    rig: Rig, step: Step, figure: Figure | SubFigure | None = None, *, spot: int = 0, unit: TimeUnit = "s"
+    rig: Rig, step: Step, figure: Figure | SubFigure | None = None, *, spot: int = 0
 ) -> Figure | SubFigure:
     """Draw the figure of `plot_exposure` for an exposure that has been read."""
     sensor = rig.sensor
@@ -103,7 +101,7 @@ def draw_exposure(
         left = figure.add_subplot(grid[row, :] if narrow else grid[row, 0], sharex=first)
         beside = [grid[rows, k] if narrow else grid[row, 1 + k] for k in range(0 if narrow and on_plane else 2)]
         panels = [left, *(figure.add_subplot(place, sharey=left) for place in beside)]
-        _draw_row(panels, rig, step, blur, unit)
+        _draw_row(panels, rig, step, blur)
         left.set_ylabel(("x", f"y ({SLOPES})")[row] if on_plane else f"spot ({SLOPES})")
         if row < rows - 1:
             for panel in panels:
@@ -116,15 +114,15 @@ def draw_exposure(
     return figure
 
 
-def _draw_row(panels: Sequence[Axes], rig: Rig, step: Step, blur: Blur, unit: TimeUnit) -> None:
+def _draw_row(panels: Sequence[Axes], rig: Rig, step: Step, blur: Blur) -> None:
     """Draw path, histogram and intensity profile of one output."""
     over_time, *others = panels
     line, seen = blur.line, blur.measured
     top = float(np.nanmax(seen)) if np.isfinite(seen).any() else line.peak_density
-    ends = [0, step.exposure.n_steps * _length(rig, unit)]
+    ends = [0, step.exposure.n_steps * rig.timing.fast_step_s * 1e3]
     grey: Any = {"cmap": "Greys", "vmin": 0, "vmax": 2.5 * max(top, 1e-12), "rasterized": True}
     over_time.pcolormesh(ends, line.edges, seen[:, None], **grey)
-    draw_paths(over_time, rig, step, [blur.output], unit)
+    draw_paths(over_time, rig, step, [blur.output])
     over_time.set(ylim=blur.limits)
     if not others:
         return
@@ -154,10 +152,10 @@ def draw_intensity(
         axes.stairs(stairs, blur.line.edges, orientation=orientation, color=colour(name), linewidth=width, label=name)
 
 
-def draw_paths(axes: Axes, rig: Rig, step: Step, outputs: Sequence[int], unit: TimeUnit = "s") -> None:
+def draw_paths(axes: Axes, rig: Rig, step: Step, outputs: Sequence[int]) -> None:
     """Draw paths of some outputs inside an exposure with the bands of their estimates; one that swings too fast for a
     line is drawn as its range."""
-    length = _length(rig, unit)
+    length = rig.timing.fast_step_s * 1e3
     times: FloatArray = np.asarray(np.arange(step.exposure.n_steps) * length, dtype=np.float64)
     for name, paths in paths_of(step, outputs).items():
         shade = colour(name)
@@ -173,12 +171,7 @@ def draw_paths(axes: Axes, rig: Rig, step: Step, outputs: Sequence[int], unit: T
                 axes.plot(times, path, color=shade, linewidth=1.2, label=f"{name}, ±{BAND:g} sd")
                 axes.fill_between(times, path - reach, path + reach, color=shade, alpha=0.2, linewidth=0)
     axes.set_xlim(0, step.exposure.n_steps * length)
-    axes.set_xlabel("time in the exposure (ms)" if unit == "s" else "fast step in the exposure")
-
-
-def _length(rig: Rig, unit: TimeUnit) -> float:
-    """The length of a fast step on the time axis of an exposure."""
-    return rig.timing.fast_step_s * 1e3 if unit == "s" else 1.0
+    axes.set_xlabel("time in the exposure (ms)")
 
 
 def _on_line(value: float, slope: float, at: float, place: FloatArray) -> FloatArray:

@@ -11,14 +11,12 @@ import numpy as np
 
 from aolink.colours import by_rank
 from aolink.errors import ExportError
-from aolink.estimation.estimate import Status
 from aolink.estimation.score import Score, Scorer
 from aolink.exporting.common import Progress, check_frame, no_progress
 from aolink.exposure import Exposure
 from aolink.gathered import FRAME_INCIDENTS, LATENCY_STEPS, NO_TIME, REFUSED, Blur, extremes, hides_swings, incidents_of
 from aolink.numerics.arrays import FloatArray, IntArray
 from aolink.numerics.rms import rms
-from aolink.plotting.style import TimeUnit
 from aolink.recording import topics
 from aolink.recording.schemas_pb2 import Estimation, Latency
 from aolink.series import NOTHING, Also, Series, Step
@@ -62,16 +60,12 @@ class Overview:
     moved: FloatArray
     """Motion of the spots: RMS of the path about its mean, slope units, (n,), from the truth or from the last name's
     estimates."""
-    apart: FloatArray
-    """RMS of the last name's path minus the truth, or without a truth minus the first name's, slope units, (n,)."""
     errors: dict[str, FloatArray]
     """RMS of the path minus the truth by estimator, slope units, (n,)."""
     status: dict[str, IntArray]
     """The `Status` by estimator, -1 where there is no estimate, (n,)."""
     nis: dict[str, FloatArray]
-    """NIS of the output's axis by estimator, for those that measure something, (n,)."""
-    mean_nis: dict[str, FloatArray]
-    """Mean NIS over all axes with a measurement, by estimator, (n,)."""
+    """Mean NIS over all axes with a measurement, by estimator, for those that measure something, (n,)."""
     measurements: dict[str, int]
     """Number of measurements of an estimator for an axis."""
     scores: dict[str, Score]
@@ -96,29 +90,15 @@ class Overview:
         """First step of each exposure, from that of the first one on, (n,)."""
         return self.first_steps - self.first_steps[:1]
 
-    def scale(self, unit: TimeUnit) -> float:
-        """The length of a fast step in a unit."""
-        return self.series.rig.timing.fast_step_s if unit == "s" else 1.0
+    @property
+    def times_s(self) -> FloatArray:
+        """Start of each exposure since the first one's, (n,)."""
+        return np.asarray(self.steps * self.series.rig.timing.fast_step_s, dtype=np.float64)
 
-    def telling(self) -> dict[int, str]:
-        """The most telling exposures, by number, each with the reason; fewer where one exposure has several reasons."""
-        reasons: dict[int, list[str]] = {}
-        if np.isfinite(self.moved).any():
-            reasons.setdefault(int(np.nanargmax(self.moved)), []).append("the largest blur")
-        if np.isfinite(self.apart).any():
-            why = f"{self.names[-1]} is furthest from {'the truth' if self.errors else self.names[0]}"
-            reasons.setdefault(int(np.nanargmax(self.apart)), []).append(why)
-        refused = [
-            (int(np.flatnonzero(bad)[0]), name)
-            for name, status in self.status.items()
-            if (bad := np.isin(status, (Status.GATED, Status.DIVERGED))).any()
-        ]
-        if refused:
-            number, name = min(refused)
-            reasons.setdefault(number, []).append(f"the first that was gated, by {name}")
-        if not reasons and len(self):
-            reasons[0] = ["the first"]
-        return {number: "; ".join(why) for number, why in reasons.items()}
+    @property
+    def most_blurred(self) -> int:
+        """Number of the exposure in which the spots moved most; 0 where that is not known."""
+        return int(np.nanargmax(self.moved)) if np.isfinite(self.moved).any() else 0
 
 
 def overview(
@@ -169,9 +149,9 @@ class _Gathered:
         self.series, self.names, self.output = series, names, output
         self.stride = max(1, -(-len(series) // _COLUMNS))
         self.points = _POINTS if self.stride == 1 else 1
-        self.facts: list[tuple[int, int, int, float, float]] = []
-        self.of_names: list[list[tuple[float, float, float, float]]] = []
-        """Of each exposure and estimator: status, NIS of the output's axis, mean NIS, error."""
+        self.facts: list[tuple[int, int, int, float]] = []
+        self.of_names: list[list[tuple[float, float, float]]] = []
+        """Of each exposure and estimator: status, mean NIS, error."""
         self.measurements: dict[str, int] = {}
         self.scorers = {name: Scorer() for name in names}
         self.incidents: dict[str, list[int]] = {}
@@ -202,7 +182,7 @@ class _Gathered:
             taken.append((message.frame_id, message.took_ns / 1e6))
 
     def add(self, step: Step) -> None:
-        e, estimates, axis = step.exposure, step.estimates, self.output // self.series.rig.plant.n_outputs
+        e, estimates = step.exposure, step.estimates
         for kind, _ in incidents_of(self.last, step):
             self.incidents.setdefault(kind, []).append(e.first_step)
         self.last = e
@@ -210,7 +190,7 @@ class _Gathered:
         known = slice(None) if e.truth is None else e.truth.known
         rows = []
         for name in self.names:
-            status, nis, mean_nis, error = float(_NONE), np.nan, np.nan, np.nan
+            status, nis, error = float(_NONE), np.nan, np.nan
             if (estimate := estimates.get(name)) is not None:
                 status = float(estimate.status)
                 error = np.nan if truth is None else rms((estimate.path - truth)[known])
@@ -218,15 +198,13 @@ class _Gathered:
                 if estimate.innovation.shape[1]:
                     self.measurements[name] = estimate.innovation.shape[1]
                     seen = estimate.nis[estimate.nis > 0]
-                    nis, mean_nis = float(estimate.nis[axis]), float(seen.mean()) if len(seen) else np.nan
-            rows.append((status, nis, mean_nis, error))
+                    nis = float(seen.mean()) if len(seen) else np.nan
+            rows.append((status, nis, error))
         self.of_names.append(rows)
-        found = [estimates[name].path if name in estimates else None for name in self.names]
-        last = found[-1] if found else None
-        about, other = (last, found[0] if len(found) > 1 else None) if truth is None else (truth, truth)
-        moved = np.nan if about is None else rms((about - about.mean(axis=1, keepdims=True))[known])
-        apart = np.nan if other is None or last is None else rms((last - other)[known])
-        self.facts.append((e.frame_id, e.first_step, e.n_steps, moved, apart))
+        last = estimates.get(self.names[-1]) if self.names else None
+        path = truth if truth is not None or last is None else last.path
+        moved = np.nan if path is None else rms((path - path.mean(axis=1, keepdims=True))[known])
+        self.facts.append((e.frame_id, e.first_step, e.n_steps, moved))
         self.column.append(Blur.of(self.series.rig, step, self.output))
         if len(self.column) == self.stride:
             self._close_column()
@@ -254,9 +232,9 @@ class _Gathered:
 
     def result(self) -> Overview:
         self._close_column()
-        frame_ids, first_steps, n_steps, moved, apart = np.array(self.facts, dtype=np.float64).reshape(-1, 5).T
-        of_names = np.array(self.of_names).reshape(len(self.facts), len(self.names), 4).transpose(2, 1, 0)
-        status, nis, mean_nis, errors = (dict(zip(self.names, rows, strict=True)) for rows in of_names)
+        frame_ids, first_steps, n_steps, moved = np.array(self.facts, dtype=np.float64).reshape(-1, 4).T
+        of_names = np.array(self.of_names).reshape(len(self.facts), len(self.names), 3).transpose(2, 1, 0)
+        status, nis, errors = (dict(zip(self.names, rows, strict=True)) for rows in of_names)
         spans = np.array(self.spans, dtype=np.float64).reshape(-1, 2)
         steps = n_steps[0] if len(n_steps) else 1
         places = np.linspace(0, (steps - 1) / steps, self.points) if self.points > 1 else np.array([0.5])
@@ -271,11 +249,10 @@ class _Gathered:
         since = first_steps[0] if len(first_steps) else 0
         return Overview(
             series=self.series, names=self.names, output=self.output, frame_ids=frame_ids.astype(np.int64),
-            first_steps=first_steps.astype(np.int64), n_steps=n_steps.astype(np.int64), moved=moved, apart=apart,
+            first_steps=first_steps.astype(np.int64), n_steps=n_steps.astype(np.int64), moved=moved,
             errors=errors if any(np.isfinite(each).any() for each in errors.values()) else {},
             status={name: values.astype(np.int64) for name, values in status.items()},
-            nis={name: nis[name] for name in self.measurements},
-            mean_nis={name: mean_nis[name] for name in self.measurements}, measurements=self.measurements,
+            nis={name: nis[name] for name in self.measurements}, measurements=self.measurements,
             scores={name: scorer.result() for name, scorer in self.scorers.items()},
             incidents={kind: np.array(self.incidents[kind]) - since for kind in kinds if kind in self.incidents},
             timings=self.timings, spans=spans - (spans[0, 0] if len(spans) else 0), blur=np.array(self.blur),

@@ -32,7 +32,7 @@ _STYLE: dict[Any, Any] = {
 
 
 def draw_session(series: Series, path: str | Path) -> Path:
-    """Draw the most telling exposure of a series: the blur with the path through it, the intensity profile with what
+    """Draw the most blurred exposure of a series: the blur with the path through it, the intensity profile with what
     each estimator predicts for it, the path with the band of each estimator, and the scene as it came, restored, and at
     rest.
 
@@ -51,11 +51,11 @@ def draw_session(series: Series, path: str | Path) -> Path:
     plain = needed("matplotlib", "plot", "a picture")
     view = overview(series)
     need_exposures(view)
-    number, why = next(iter(view.telling().items()))
+    number = view.most_blurred
     step, rig = step_of(series, number, view.names), series.rig
     with plain.rc_context(_STYLE):
         figure = new_figure(*_SIZE_MM)
-        figure.suptitle(f"{rig.name}: exposure {number}, {why}", x=0.01, ha="left", fontsize=13)
+        figure.suptitle(f"{rig.name}: exposure {number}, the most blurred", x=0.01, ha="left", fontsize=13)
         has_scene = isinstance(series, Recording) and step.exposure.scene is not None
         shares = [1.0, 1.0, 0.55] if has_scene else [1.0, 1.0]
         columns: Any = figure.subfigures(1, len(shares), width_ratios=shares)
@@ -67,7 +67,7 @@ def draw_session(series: Series, path: str | Path) -> Path:
             near = overview(series[first : number + _NEAR])
             axes = _axes_titled(above, f"The blur of {len(near)} exposures, and the paths through it")
             plot_blur(near, axes)
-            begin, end = near.spans[number - first] * near.scale("s")
+            begin, end = near.spans[number - first] * rig.timing.fast_step_s
             axes.axvspan(begin, end, fill=False, edgecolor="tab:red", linewidth=1.5)
         axes = _axes_titled(below, "The intensity profile, and what each path predicts for it")
         blur = Blur.of(rig, step, 0)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 from aolink.colours import estimator_colour
 from aolink.exporting.common import needed
@@ -13,15 +13,12 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure, SubFigure
 
-TimeUnit = Literal["s", "steps"]
-"""The unit of a time axis: seconds, or fast steps."""
-
 MM = 1 / 25.4
 """A millimetre in inches."""
 _PAPER: dict[Any, Any] = {
     "font.size": 8, "axes.linewidth": 0.6, "lines.linewidth": 1.0, "legend.frameon": False, "legend.fontsize": 7,
     "axes.spines.top": False, "axes.spines.right": False, "pdf.fonttype": 42, "savefig.dpi": 300,
-    "axes.titlesize": 8,
+    "axes.titlesize": 8, "svg.hashsalt": "aolink",
 }  # fmt: skip
 _NARROW_IN = 4.8
 """Figures of less width are narrow, inches."""

@@ -45,35 +45,22 @@ def test_the_overview_has_what_the_series_has() -> None:
         np.testing.assert_allclose(view.scores[name].path_rmse, np.sqrt(np.mean(np.square(errors))))
     moved = [np.std(each.truth.path) for each in series if each.truth is not None]
     np.testing.assert_allclose(view.moved, moved)
-    reasons = view.telling()
-    assert reasons[int(np.argmax(moved))].startswith("the largest blur")
-    assert any("moments is furthest from the truth" in why for why in reasons.values())
+    assert view.most_blurred == np.argmax(moved)
 
 
 def test_the_overview_is_of_a_slice_and_of_some_estimators() -> None:
     view = plotting.overview(reference("tip-tilt")[3:7], ["o3", "o1"], output=1)
     assert (len(view), view.names, set(view.paths)) == (4, ["o1", "o3"], {"truth", "o1", "o3"})
-    with pytest.raises(ExportError, match="there is no output 2"):
+    with pytest.raises(ExportError, match="output 2"):
         plotting.overview(reference("tip-tilt"), output=2)
-    with pytest.raises(RecordingError, match="no estimates of mixture"):
+    with pytest.raises(RecordingError, match="mixture"):
         plotting.overview(reference("tip-tilt"), ["mixture"])
 
 
-def test_time_is_in_seconds_or_in_fast_steps() -> None:
-    view = plotting.overview(reference("section-vi-lively"))
-    axes = Figure().subplots()
-    assert plotting.plot_nis(view, axes) is axes
-    assert axes.get_xlabel().startswith("time (s)")
+def test_nis_over_time_has_the_bounds_of_each_number_of_measurements() -> None:
+    axes = plotting.plot_nis(plotting.overview(reference("section-vi-lively")), Figure().subplots())
     (line,) = [each for each in axes.get_lines() if each.get_label() == "o3"]
     np.testing.assert_allclose(np.asarray(line.get_xdata(), float), 0.2 * np.arange(20))
-    steps = plotting.plot_nis(view, Figure().subplots(), unit="steps")
-    (line,) = [each for each in steps.get_lines() if each.get_label() == "o3"]
-    np.testing.assert_allclose(np.asarray(line.get_xdata(), float), 200 * np.arange(20))
-    assert steps.get_xlabel().startswith("fast step")
-
-
-def test_nis_has_the_bounds_of_each_number_of_measurements() -> None:
-    axes = plotting.plot_nis(plotting.overview(reference("section-vi-lively")), Figure().subplots())
     dashed = [each for each in axes.get_lines() if each.get_linestyle() == "--"]
     heights = sorted(float(np.ravel(each.get_ydata())[0]) for each in dashed)
     np.testing.assert_allclose(heights, sorted(bound for degrees in (1, 2, 4) for bound in nis_bounds(degrees)))
@@ -132,7 +119,6 @@ def test_one_exposure_shows_path_histogram_and_profile_on_one_axis_of_position()
     for share in shares:  # of the time, all of it
         assert np.sum(share.values * np.diff(share.edges)) == pytest.approx(1)
     assert over_time.get_xlim() == (0, 200)
-    assert plotting.plot_exposure(series, 9, Figure(), unit="steps").axes[0].get_xlabel() == "fast step in the exposure"
 
 
 def test_a_spot_on_a_plane_has_a_line_for_x_and_one_for_y() -> None:
@@ -151,13 +137,13 @@ def test_a_spot_on_a_plane_has_a_line_for_x_and_one_for_y() -> None:
 @pytest.mark.parametrize(
     ("draw", "text"),
     [
-        (lambda series: plotting.plot_exposure(series, 20, Figure()), "there is no exposure 20: .* has 20"),
-        (lambda series: plotting.plot_exposure(series, 0, Figure(), spot=1), "there is no spot 1"),
-        (lambda series: plotting.plot_pupil(series, Figure()), "fewer than 4 lenslets"),
-        (lambda series: plotting.plot_scene(series, 0, Figure()), "has no picture"),
-        (lambda series: plotting.plot_latency(plotting.overview(series), Figure().subplots()), "holds no latencies"),
-        (lambda series: plotting.save_figure(series, "nis", "x.jpeg"), "a figure is a .png, .svg, .pdf file"),
-        (lambda series: plotting.save_figure(series, "moon", "x.png"), "no figure 'moon'; there are: blur,"),
+        (lambda series: plotting.plot_exposure(series, 20, Figure()), "exposure 20"),
+        (lambda series: plotting.plot_exposure(series, 0, Figure(), spot=1), "spot 1"),
+        (lambda series: plotting.plot_pupil(series, Figure()), "lenslets"),
+        (lambda series: plotting.plot_scene(series, 0, Figure()), "picture"),
+        (lambda series: plotting.plot_latency(plotting.overview(series), Figure().subplots()), "latencies"),
+        (lambda series: plotting.save_figure(series, "scene", "x.jpeg"), "svg"),
+        (lambda series: plotting.save_figure(series, "moon", "x.png"), "moon"),
     ],
 )
 def test_what_is_not_there_is_one_clear_error(draw: Callable[..., object], text: str) -> None:
@@ -192,16 +178,16 @@ def test_the_pupil_s_maps_have_a_value_for_each_lenslet(pupil: tuple[Path, Path]
 def test_a_dark_recording_and_an_empty_one(tmp_path: Path) -> None:
     dark = aolink.read(write_small(tmp_path / "dark.mcap", 2, "nothing", missing=True))
     view = plotting.overview(dark)
-    assert plotting.incidents(view)["frames incomplete"].tolist() == [0, 200]
+    assert view.incidents["frames incomplete"].tolist() == [0, 200]
     plotting.plot_blur(view, Figure().subplots())
     plotting.plot_losses(view, Figure().subplots())
     plotting.plot_exposure(dark, 0, Figure())
-    with pytest.raises(ExportError, match="holds no NIS"):
+    with pytest.raises(ExportError, match="NIS"):
         plotting.plot_nis(view, Figure().subplots())
     empty = plotting.overview(aolink.read(write_small(tmp_path / "empty.mcap", 0)))
-    assert (len(empty), empty.telling()) == (0, {})
+    assert len(empty) == 0
     for draw in (plotting.plot_blur, plotting.plot_nis, plotting.plot_errors, plotting.plot_losses):
-        with pytest.raises(ExportError, match="holds no exposure"):
+        with pytest.raises(ExportError, match="exposure"):
             draw(empty, Figure().subplots())
 
 

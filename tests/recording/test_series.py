@@ -151,7 +151,7 @@ def test_a_recording_is_read_once(what: str, most: int, tmp_path: Path, monkeypa
         "copy": lambda: write_reestimated(recording, names, tmp_path / "a.mcap"),
         "table": lambda: recording.to_pandas(),
         "csv": lambda: export(recording, tmp_path / "a.csv"),
-        "report": lambda: write_report([recording], tmp_path / "a.html"),
+        "report": lambda: write_report(recording, tmp_path / "a.html"),
         "view": lambda: save_rrd(recording, tmp_path / "a.rrd"),
     }
     read = chunks_read(work[what], monkeypatch)

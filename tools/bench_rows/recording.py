@@ -260,7 +260,7 @@ def chunks_read(effort: Effort) -> list[Row]:
             "walk": lambda: deque(recording.walk(), maxlen=0),
             "estimate -e o3": lambda: scored_and_compared(recording, ["o3"]),
             "export x.csv": lambda: export(recording, folder / "x.csv"),
-            "report": lambda: write_report([recording], folder / "x.html"),
+            "report": lambda: write_report(recording, folder / "x.html"),
             "view -o": lambda: save_rrd(recording, folder / "x.rrd"),
         }
         rows = []
