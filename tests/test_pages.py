@@ -276,7 +276,7 @@ def test_a_block_for_an_engine_works(block: CodeBlock, laboratory: Path, tmp_pat
     (folder / name).write_text(block.text)
     done = run(command, folder)
     assert done.returncode == 0, f"{block}\n{done.stdout}{done.stderr}"
-    assert {each.name for each in folder.glob("results/*.mcap")} == {f"session-{k}.o3.mcap" for k in ("001", "002")}
+    assert {each.name for each in folder.glob("results/**/*.mcap")} == {f"session-{k}.o3.mcap" for k in ("001", "002")}
 
 
 def test_every_block_is_of_a_kind_that_is_tried() -> None:

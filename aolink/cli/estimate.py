@@ -1,7 +1,7 @@
 """The command `estimate`: one recording, or many."""
 
 import json
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from contextlib import AbstractContextManager
 from functools import partial
@@ -13,12 +13,11 @@ import typer
 from aolink.cli import common
 from aolink.cli.common import EstimatorOption, JsonOption, OverwriteOption, app, progress, stderr, stdout, warn
 from aolink.errors import AolinkError, EstimatorError
-from aolink.files import check_target, writing
 from aolink.signals import StopRequest
 
 if TYPE_CHECKING:
-    from aolink.jobs.batch import Done, Job
-    from aolink.jobs.unit import Model
+    from aolink.batch import Model
+    from aolink.jobs.batch import Job
 
 
 @app.command(
@@ -46,16 +45,6 @@ def estimate(
         typer.Option("--set", metavar="KEY=VALUE,...", help="Change a key of the rig file; each value makes a model."),
     ] = None,
     jobs: Annotated[int, typer.Option(min=1, metavar="N", help="How many recordings to estimate at once.")] = 1,
-    table: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="X.parquet",
-            help="With a folder: the table of the recordings, and X.exposures.parquet with a row for each exposure.",
-        ),
-    ] = None,
-    shard: Annotated[
-        str | None, typer.Option(metavar="I/N", help="With a folder: part I of N of the recordings, for a job array.")
-    ] = None,
     scheduler: Annotated[
         str | None, typer.Option(metavar="ADDRESS", help="With a folder: on the workers of this Dask scheduler.")
     ] = None,
@@ -68,46 +57,26 @@ def estimate(
     With many files or models it skips work that was done before and has not changed.
     A file that fails does not stop the others (exit code 1). Exit code 6 if no exposure gave a measurement.
     """
+    from aolink.estimation.registry import DEFAULT_ESTIMATOR
+    from aolink.jobs import batch
+    from aolink.rig import load_rig
+
     output, is_folder = (Path(target), target.endswith("/") or Path(target).is_dir()) if target else (None, False)
     if scheduler and jobs > 1:
         raise typer.BadParameter("--jobs is for this machine: with --scheduler its workers do the work")
     _check_names(estimator or [])
-    models = batch_models(rig, settings)
-    if not (is_folder or table or shard or scheduler) and len(files) == 1 and len(models) == 1:
-        if jobs > 1:
-            raise typer.BadParameter("--jobs is for many files or models, with -o DIR/")
+    models = batch.models(load_rig(rig).toml if rig else None, settings or [], Path(rig).stem if rig else "")
+    if not (is_folder or scheduler or jobs > 1 or len(files) > 1 or len(models) > 1):
         _estimate_one(files[0], models[0], estimator, output, overwrite=overwrite, as_json=as_json)
         return
     if output is None or (output.suffix == ".mcap" and not is_folder):
-        raise typer.BadParameter("many files or models need -o DIR: a folder for the results")
-    from aolink.estimation.registry import DEFAULT_ESTIMATOR
-    from aolink.jobs import batch
-    from aolink.jobs.tables import parquet as load_parquet
-
-    if table is not None:
-        if table.suffix.lower() == ".parquet":  # any other name is refused, and needs no folder
-            _make_folder(table.parent)
-        check_target(table, overwrite=True, suffix=".parquet")
-        load_parquet()
-    sources = batch.shard(files, shard) if shard else files
+        raise typer.BadParameter("many files or models, --jobs and --scheduler need -o DIR/: a folder for the results")
     if scheduler:  # the workers run in other folders
-        sources = [str(Path(each).absolute()) for each in sources]
-        output = output.absolute()
-    todo = batch.jobs(
-        sources, models, estimator or [DEFAULT_ESTIMATOR], output,
-        table=table is not None, overwrite=overwrite,
-    )  # fmt: skip
-    part = f"-{shard.replace('/', '-of-')}" if shard else ""
-    results = table.with_stem(table.stem + part) if table else output / f"results{part}.csv"
-    _estimate_many(todo, output, results, jobs, scheduler, overwrite=overwrite, as_json=as_json)
-
-
-def batch_models(rig: str | None, settings: Sequence[str] | None) -> "list[Model]":
-    """The models that --rig and --set ask for."""
-    from aolink.jobs import batch
-    from aolink.rig import load_rig
-
-    return batch.models(load_rig(rig).toml if rig else None, settings or [], Path(rig).stem if rig else "")
+        files, output = [str(Path(each).absolute()) for each in files], output.absolute()
+    todo = batch.jobs(files, models, estimator or [DEFAULT_ESTIMATOR], output, overwrite=overwrite)
+    at_once = batch.MOST_AT_ONCE if scheduler else min(jobs, len(todo))
+    executor = partial(batch.dask, scheduler) if scheduler else partial(batch.here, at_once)
+    _estimate_many(todo, executor, at_once, output, overwrite=overwrite, as_json=as_json)
 
 
 def _check_names(estimators: Sequence[str]) -> None:
@@ -121,72 +90,46 @@ def _check_names(estimators: Sequence[str]) -> None:
 
 
 def _estimate_many(
-    todo: "Sequence[Job]", folder: Path, table: Path, workers: int, scheduler: str | None, *, overwrite: bool,
-    as_json: bool,
+    todo: "Sequence[Job]", executor: "Callable[[], AbstractContextManager[Executor]]", at_once: int, folder: Path, *,
+    overwrite: bool, as_json: bool,
 ) -> None:  # fmt: skip
     from aolink.cli.tables import recordings as tables
     from aolink.jobs import batch
-    from aolink.jobs.tables import check_table, fill_table, join_tables, table_beside
 
-    of_exposures = table.with_suffix(".exposures.parquet") if table.suffix == ".parquet" else None
-    places = [table]
-    if of_exposures is not None:
-        places += [of_exposures, *(table_beside(job.output) for job in todo)]
-    for each in () if overwrite else places:
-        check_table(each)
-
-    _make_folder(folder)
-    # The table's file is locked from the start, so that the same part, if begun twice, is refused.
-    with writing(table, overwrite=True) as unfinished:
-        with StopRequest().installed() as stop, progress("estimate", len(todo)) as tell:
-            at_once = min(workers, len(todo))
-            executor: Callable[[], AbstractContextManager[Executor]] = partial(batch.here, at_once)
-            if scheduler:
-                from aolink.jobs.cluster import AT_ONCE, workers_of
-
-                executor, at_once = partial(workers_of, scheduler), AT_ONCE
-            done = _printed(batch.run(todo, executor, at_once, stop=stop, progress=tell))
-        rows = batch.table_rows(done)
-        fill_table(unfinished, rows, table.suffix)
-        if of_exposures is not None:
-            parts = [table_beside(each.job.output) for each in done if not each.error]
-            join_tables(sorted(parts), of_exposures)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise AolinkError(f"cannot make the folder {folder}: {(error.strerror or str(error)).lower()}") from None
+    table, done = folder / "results.csv", {}
+    batch.check_table(table, overwrite=overwrite)
+    with StopRequest().installed() as stop, progress("estimate", len(todo)) as tell:
+        for job, row in batch.run(todo, executor, at_once, stop=stop, progress=tell):
+            done[job.output] = row
+            of = f"{job.source} {job.model.name}".strip()
+            if row["error"]:
+                stderr.print(f"aolink: {of}: {row['error']}", markup=False)
+            if row["damage"]:
+                warn(f"{of}: {row['damage']}")
+            if row["nothing_measured"]:
+                warn(f"{of}: {job.estimator} only predicted: {row['nothing_measured']}")
+    rows = [done[job.output] for job in todo if job.output in done]
+    batch.write_table(table, rows)
     if as_json:
         print(json.dumps(rows, allow_nan=False))
     else:
         if len(rows) <= _MOST_ROWS_SHOWN:
             stdout.print(tables.batch(rows))
-        failed, skipped = sum(bool(each.error) for each in done), sum(each.skipped for each in done)
-        text = f"{len(done)} of {len(todo)} done, {skipped} of them before, {failed} failed; table: {table}"
+        before, failed = (sum(bool(row[each]) for row in rows) for each in ("done_before", "error"))
+        text = f"{len(rows)} of {len(todo)} done, {before} of them before, {failed} failed; table: {table}"
         stdout.print(text, markup=False)
     stop.raise_if_asked()
-    if any(each.error for each in done):
+    if any(row["error"] for row in rows):
         raise typer.Exit(1)
-    if any(each.nothing_measured for each in done):
+    if any(row["nothing_measured"] for row in rows):
         raise typer.Exit(EstimatorError.exit_code)
 
 
-def _make_folder(folder: Path) -> None:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise AolinkError(f"cannot make the folder {folder}: {(error.strerror or str(error)).lower()}") from None
-
-
 _MOST_ROWS_SHOWN = 40
-
-
-def _printed(each_done: "Iterable[Done]") -> "list[Done]":
-    """The results of jobs; errors and warnings are printed as they come."""
-    done = []
-    for each in each_done:
-        done.append(each)
-        of = f"{each.job.source} {each.job.settings.model.name}".strip()
-        if each.error:
-            stderr.print(f"aolink: {of}: {each.error}", markup=False)
-        for warning in each.warnings:
-            warn(f"{of}: {warning}")
-    return done
 
 
 def _estimate_one(

@@ -1,28 +1,37 @@
-"""Many recordings and many models: each recording is estimated again with each model, and the results are one table."""
+"""Many recordings and many models: each recording is estimated again with each model, by the processes of this machine
+or the workers of a Dask scheduler."""
 
 from __future__ import annotations
 
+import csv
 import itertools
+import logging
 import re
 import tomllib
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Executor, Future, wait
-from contextlib import AbstractContextManager, suppress
-from dataclasses import dataclass, field
+from contextlib import AbstractContextManager, contextmanager, suppress
+from dataclasses import dataclass
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from aolink.errors import AolinkError, RigError
+from aolink.batch import COLUMNS, Model, aolink_version, estimate_file
+from aolink.errors import AolinkError, RecordingError, RigError
 from aolink.exporting.common import Progress, no_progress
-from aolink.files import remove_unfinished
-from aolink.jobs.tables import COLUMNS
-from aolink.jobs.unit import Model, Settings, aolink_version, estimated
+from aolink.extensions import install_command
+from aolink.files import check_target, remove_unfinished, writing
 from aolink.numerics.workers import processes
 
 _POLL_S = 0.2
 """Time between two checks whether the user wants to stop, s."""
-_LOST = "its process was ended from outside: too little memory, or a signal"
+_CONNECT_S = 5.0
+"""The longest time that a Dask scheduler may take to answer, s."""
+MOST_AT_ONCE = 1000
+"""The most jobs that a scheduler is given at once: to take them back costs a millisecond each."""
+Row = dict[str, Any]
+"""A row of the table of a batch, by `COLUMNS`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,33 +40,14 @@ class Job:
 
     source: str
     output: Path
-    settings: Settings
+    estimator: str
+    model: Model
+    overwrite: bool
 
-
-@dataclass(frozen=True, slots=True)
-class Done:
-    """The result of a job."""
-
-    job: Job
-    row: dict[str, Any] = field(default_factory=dict)
-    """The row, by `COLUMNS`; empty for a job that failed."""
-    error: str = ""
-    skipped: bool = False
-    """Whether the job had been done before."""
-
-    @property
-    def nothing_measured(self) -> bool:
-        """Whether the estimator could not use a single exposure."""
-        return bool(self.row.get("nothing_measured"))
-
-    @property
-    def warnings(self) -> list[str]:
-        """Warnings about the result, in words: the parts of the recording that could not be read or estimated."""
-        damage, why = self.row.get("damage"), self.row.get("nothing_measured")
-        return [
-            *([str(damage)] if damage else []),
-            *([f"{self.row['estimator']} only predicted: {why}"] if why else []),
-        ]
+    def failed(self, error: str) -> Row:
+        """The row of this job where it failed."""
+        known = {"recording": self.source, "model": self.model.name, "estimator": self.estimator, "error": error}
+        return dict.fromkeys(COLUMNS) | known
 
 
 def models(rig_text: str | None, settings: Sequence[str], rig_name: str = "") -> list[Model]:
@@ -90,40 +80,17 @@ def models(rig_text: str | None, settings: Sequence[str], rig_name: str = "") ->
 
 
 def jobs(
-    sources: Sequence[str], each: Sequence[Model], estimators: Sequence[str], folder: Path, *,
-    table: bool = False, overwrite: bool = False,
-) -> list[Job]:  # fmt: skip
-    """Every recording with every model and every estimator; parameters as for `Settings`.
-
-    Raises
-    ------
-    RigError
-        Two would write the same file.
-    """
+    sources: Sequence[str], each: Sequence[Model], estimators: Sequence[str], folder: Path, *, overwrite: bool = False
+) -> list[Job]:
+    """Every recording with every model and every estimator. Raises RigError where two would write the same file."""
     made = {}
     for source, model, name in itertools.product(dict.fromkeys(sources), each, dict.fromkeys(estimators)):
         suffix = re.sub(r"[^\w=.-]", "-", model.name.replace("plant.", ""))
         output = folder / f"{'-'.join(filter(None, [Path(source).stem, suffix]))}.{name}.mcap"
         if output in made:
             raise RigError(f"two recordings would be written as {output.name}: give them different names")
-        settings = Settings(estimator=name, model=model, table=table, overwrite=overwrite)
-        made[output] = Job(source, output, settings)
+        made[output] = Job(source, output, name, model, overwrite)
     return list(made.values())
-
-
-def shard(sources: Sequence[str], part: str) -> list[str]:
-    """The recordings of one part of several, ``i/n`` with i from 1 to n: the same for any order of the recordings.
-
-    The parts' sizes differ by one recording at most, they have none in common, and together they are all recordings.
-
-    Raises
-    ------
-    AolinkError
-        ``part`` is not of that form.
-    """
-    if not (found := re.fullmatch(r"([0-9]{1,9})/([0-9]{1,9})", part)) or not 1 <= int(found[1]) <= int(found[2]):
-        raise AolinkError(f"--shard {part}: I/N is needed, with I from 1 to N, as 1/100 to 100/100")
-    return sorted(set(sources))[int(found[1]) - 1 :: int(found[2])]
 
 
 def here(workers: int) -> AbstractContextManager[Executor]:
@@ -139,11 +106,54 @@ class _Here(Executor):
         return future
 
 
+@contextmanager
+def dask(address: str) -> Iterator[Executor]:
+    """The workers of a Dask scheduler, which may come and go; work that is lost with a worker is done by another. At
+    the end jobs that no worker has begun are taken back; this does not wait for those under way.
+
+    Raises
+    ------
+    AolinkError
+        distributed is not installed, no scheduler answers, it has no workers or goes away, or a worker has another
+        aolink.
+    """
+    try:
+        from distributed import Client
+    except ImportError:
+        raise AolinkError(f"--scheduler needs Dask: {install_command('cluster')}") from None
+    for name in ("distributed", "distributed.client", "distributed.core", "tornado.application"):
+        logging.getLogger(name).setLevel(logging.CRITICAL)  # the error is raised here, once
+    try:
+        client = Client(address, timeout=_CONNECT_S, set_as_default=False)
+    except (OSError, ValueError):
+        raise AolinkError(
+            f"no Dask scheduler answers at {address}: give what `dask scheduler` says, as tcp://host:8786"
+        ) from None
+    with client:
+        found = client.run(version, "aolink", on_error="return")
+        if not found:
+            raise AolinkError(f"the scheduler at {address} has no workers: start some with `dask worker {address}`")
+        for worker, theirs in found.items():
+            if theirs != aolink_version():
+                raise AolinkError(
+                    f"the worker at {worker} has aolink {theirs}, this is aolink {aolink_version()}: install the same"
+                    " everywhere"
+                )
+        try:
+            yield client.get_executor(pure=False)
+        except Exception:
+            if client.status == "running":
+                raise
+            raise AolinkError(
+                f"the scheduler at {address} is gone; what was done stays done: give the same command again"
+            ) from None
+
+
 def run(
     todo: Sequence[Job], executor: Callable[[], AbstractContextManager[Executor]], at_once: int, *,
     stop: Callable[[], bool] = lambda: False, progress: Progress = no_progress,
-) -> Iterator[Done]:  # fmt: skip
-    """Do jobs with an executor, each as a call of its own; gives each when it is done, in no order.
+) -> Iterator[tuple[Job, Row]]:  # fmt: skip
+    """Do jobs with an executor, each as a call of its own; gives each with its row when it is done, in no order.
 
     A failed job stops no other. When ``stop()`` gives True no other job is begun, those that wait in the executor are
     taken back, and those under way are waited for, except on Dask, which does not say which those are.
@@ -164,70 +174,63 @@ def run(
     queue, count = deque(todo), itertools.count(1)
     progress(0)
     while queue and not stop():
-        running: dict[Future[Done], Job] = {}
+        running: dict[Future[Row], Job] = {}
         try:
             with executor() as pool, suppress(BrokenExecutor):
                 while running or (queue and not stop()):
                     while queue and len(running) < at_once and not stop():
-                        running[pool.submit(do, queue[0], aolink_version())] = queue[0]
+                        running[pool.submit(do, queue[0])] = queue[0]
                         queue.popleft()
                     if stop():
                         running = {future: job for future, job in running.items() if not future.cancel()}
                     for future in wait(running, _POLL_S, FIRST_COMPLETED).done:
-                        done = _result(future, running[future])
+                        job = running[future]
+                        row = _row(future, job)
                         del running[future]
-                        yield done
+                        yield job, row
                         progress(next(count))
         finally:
             for job in running.values():
                 remove_unfinished(job.output)
         for future, job in running.items():  # those that the executor had when it broke
-            yield Done(job, error=_LOST) if future.exception() else future.result()
+            yield job, _row(future, job)
             progress(next(count))
 
 
-def _result(future: Future[Done], job: Job) -> Done:
+def _row(future: Future[Row], job: Job) -> Row:
     try:
         return future.result()
-    except (BrokenExecutor, CancelledError):
+    except CancelledError:
         raise
-    except Exception as error:
-        lost = type(error).__name__ == "KilledWorker"  # Dask's: every worker that began the job was lost
-        return Done(job, error=_LOST if lost else f"its worker cannot do it: {error!r}")
+    except Exception as error:  # of the executor: the process was lost, or cannot load what it needs
+        remove_unfinished(job.output)
+        return job.failed(f"its process was lost, for want of memory or by a signal: {error}")
 
 
-def table_rows(done: Sequence[Done]) -> list[dict[str, Any]]:
-    """Rows by `COLUMNS` of these jobs, sorted. A failed job has a row with its error."""
-    rows = []
-    for each in done:
-        failed = {"recording": each.job.source, "model": each.job.settings.model.name, "error": each.error}
-        rows.append(dict.fromkeys(COLUMNS) | (each.row or failed))
-    return sorted(rows, key=lambda row: (_numerically(row["recording"]), _numerically(row["model"])))
-
-
-# A sign belongs to a number only where a value begins: "session-2" comes after "session-1".
-_NUMBERS = re.compile(r"((?:(?<=[=,\[])[-+])?\d+(?:\.\d+)?(?:e[-+]?\d+)?)")
-
-
-def _numerically(text: str) -> list[tuple[str, float]]:
-    """A key that sorts texts with numbers in them by the numbers: 5 before 10, and 1e-05 before both."""
-    parts = _NUMBERS.split(text)
-    return [(words, float(number)) for words, number in zip(parts[::2], [*parts[1::2], "-inf"], strict=True)]
-
-
-def do(job: Job, version: str) -> Done:
-    """Do a job; any error becomes its result.
-
-    ``version`` is that of the aolink which asks: a worker of another machine may have another one.
-    """
-    if aolink_version() != version:
-        return Done(
-            job, error=f"a worker has aolink {aolink_version()}, this is {version}: install the same everywhere"
-        )
+def do(job: Job) -> Row:
+    """Do a job; any error becomes its row."""
     try:
-        row, before = estimated(job.source, job.output, job.settings)
+        return estimate_file(job.source, job.output, job.estimator, model=job.model, overwrite=job.overwrite)
     except (AolinkError, OSError) as error:
-        return Done(job, error=f"{error}")
+        return job.failed(f"{error}")
     except Exception as error:  # an unforeseen error stops no other job
-        return Done(job, error=f"it cannot be estimated with this model: {error!r}")
-    return Done(job, row, skipped=before)
+        return job.failed(f"it cannot be estimated with this model: {error!r}")
+
+
+def check_table(path: Path, *, overwrite: bool = False) -> None:
+    """Raise RecordingError where the table of a batch cannot be written, or another file has its name."""
+    check_target(path, overwrite=True, error=RecordingError)
+    if path.exists() and not overwrite:
+        with path.open("rb") as file:
+            if not file.readline().startswith(",".join(COLUMNS[:3]).encode()):
+                raise RecordingError(
+                    f"{path} exists and is no table of a batch: give another folder; --overwrite replaces it"
+                )
+
+
+def write_table(path: Path, rows: Iterable[Mapping[str, Any]]) -> None:
+    """Write the table of a batch as CSV; unknown values are empty. Raises AolinkError where that is not possible."""
+    with writing(path, overwrite=True) as partial, partial.open("w", newline="", encoding="utf-8") as file:
+        table = csv.DictWriter(file, COLUMNS)
+        table.writeheader()
+        table.writerows(rows)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
 from importlib.metadata import version
+from itertools import tee
 from pathlib import Path
 
 import numpy as np
@@ -151,17 +152,21 @@ def scored_and_compared(
     recording: Recording, names: Sequence[str], progress: Progress = no_progress
 ) -> tuple[dict[str, Score], dict[str, str | None]]:
     """Run estimators over a recording, in one pass: the result of `Outcome`."""
-    outcome, waiting = Outcome(recording, names), deque[Step]()
-
-    def exposures() -> Iterator[Exposure]:
-        for step in recording.steps(outcome.recorded):
-            waiting.append(step)
-            yield step.exposure
-
-    for number, (_, made) in enumerate(Driver(recording.rig, names).steps(exposures()), 1):
-        outcome.add(waiting.popleft(), made)
+    outcome = Outcome(recording, names)
+    for number, (step, made) in enumerate(steps_estimated(recording, names, outcome.recorded), 1):
+        outcome.add(step, made)
         progress(number)
     return outcome.result()
+
+
+def steps_estimated(
+    recording: Recording, names: Sequence[str], recorded: Sequence[str] = ()
+) -> Iterator[tuple[Step, list[Estimate]]]:
+    """The steps of a recording, with the estimates by ``recorded`` that it has, each with new estimates by ``names``; a
+    batch of exposures at a time is in memory."""
+    steps, ahead = tee(recording.steps(recorded))
+    made = Driver(recording.rig, names).steps(step.exposure for step in ahead)
+    yield from zip(steps, (estimates for _, estimates in made), strict=True)
 
 
 def check_has_exposures(recording: Recording) -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from aolink.batch import Settings, estimate_file
+from aolink.batch import estimate_file
 from aolink.errors import ExportError, RecordingError
 from aolink.extensions import install_command
 from aolink.recording.reader import Recording
@@ -82,7 +82,7 @@ def test_a_damaged_recording_gives_what_is_whole_and_says_so(aolink: Run, lively
 @pytest.mark.slow
 def test_a_side_file_alone_is_refused(aolink: Run, tmp_path: Path) -> None:
     source = write_small(tmp_path / "a.mcap", 2)
-    estimate_file(source, tmp_path / "a.o1.mcap", Settings(estimator="o1"))
+    estimate_file(source, tmp_path / "a.o1.mcap", "o1")
     done = aolink("export", "a.mcap", "-o", "out.npz")
     assert done.returncode == 0, done.stderr
     done = aolink("export", "a.o1.mcap", "-o", "side.npz")

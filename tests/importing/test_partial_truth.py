@@ -12,7 +12,6 @@ import pytest
 from rich.console import Console
 
 import aolink
-from aolink.batch import Settings as Batch
 from aolink.batch import estimate_file
 from aolink.cli.tables.scores import scores
 from aolink.estimation import run, score
@@ -22,7 +21,6 @@ from aolink.films.film import array_film
 from aolink.importing.first_rig import first_rig
 from aolink.importing.frames import FilmSettings
 from aolink.importing.recording import import_film
-from aolink.jobs.unit import exposure_row
 from aolink.plotting import save_figure
 from aolink.rig import Rig, parse_rig
 from aolink.viewing import save_rrd
@@ -74,15 +72,13 @@ def test_errors_are_those_of_the_objects_whose_path_is_known(
     whole, first = errors[: GONE // K], [each[:2] for each in errors[GONE // K :]]
     means = [float(np.mean(each**2)) for each in (*whole, *first)]
     assert score(exposures, estimates).path_rmse == pytest.approx(np.sqrt(np.mean(means)), rel=1e-12)
-    rows = [exposure_row(0, x, e)["path_rmse"] for x, e in zip(exposures, estimates, strict=True)]
-    assert rows == pytest.approx(np.sqrt(means), rel=1e-12)
 
 
 @pytest.mark.slow
 def test_it_is_shown_drawn_and_exported(recorded: tuple[Rig, Path], exposures: list[Exposure], tmp_path: Path) -> None:
     """Where it is known: a line of the first object in each exposure, of the second one in the first two."""
     side = tmp_path / "estimates.mcap"
-    estimate_file(recorded[1], side, Batch(estimator="o1"))
+    estimate_file(recorded[1], side, "o1")
     series = aolink.read(recorded[1], side=[side])
     paths = read_rrd(save_rrd(series, tmp_path / "a.rrd"))["/camera/image/path/truth"]
     strips = [len(each) for each in paths["LineStrips2D:strips"] if each is not None]

@@ -2,207 +2,145 @@
 
 from __future__ import annotations
 
-import json
 import os
+import signal
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 
+import dask
 import pytest
-from distributed import Client
+from distributed import Client, LocalCluster
 
+from aolink.batch import Model
 from aolink.errors import AolinkError
 from aolink.jobs import batch
-from aolink.jobs.cluster import workers_of
-from aolink.jobs.unit import Model, aolink_version
 from aolink.recording.reader import Recording
 from tests.recording.small import write_small
 
 Run = Callable[..., subprocess.CompletedProcess[str]]
-_PATIENCE_S = 120
+pytestmark = pytest.mark.slow
 
 
-@dataclass(frozen=True)
-class Cluster:
-    """A scheduler without workers."""
-
-    address: str
-    scheduler: subprocess.Popen[bytes]
-
-    @contextmanager
-    def worker(self, name: str, path: str = "") -> Iterator[subprocess.Popen[bytes]]:
-        """A worker process; ``path`` comes first on its module search path."""
-        root = str(Path(__file__).parents[2])
-        environment = os.environ | {"PYTHONPATH": f"{path}{os.pathsep}{root}" if path else root, "OMP_NUM_THREADS": "1"}
-        options = [
-            "--no-nanny",
-            "--nthreads",
-            "1",
-            "--death-timeout",
-            "30",
-            "--no-dashboard",
-            "--host",
-            "127.0.0.1",
-            "--name",
-            name,
-        ]
-        with _process("worker", self.address, *options, environment=environment) as process:
-            yield process
-
-    def wait_for(self, count: int) -> None:
-        """Wait until it has so many workers."""
-        with Client(self.address, set_as_default=False) as client:
-            client.wait_for_workers(count, timeout=_PATIENCE_S)
-
-
-@contextmanager
-def _process(*arguments: str, environment: dict[str, str] | None = None) -> Iterator[subprocess.Popen[bytes]]:
-    command = [sys.executable, "-m", "dask", *arguments]
-    process = subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    try:
-        yield process
-    finally:
-        process.kill()
-        process.wait()
+def cluster_of(workers: int) -> LocalCluster:
+    return LocalCluster(n_workers=workers, threads_per_worker=1, dashboard_address=None)
 
 
 @pytest.fixture
-def cluster(tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureRequest) -> Iterator[Cluster]:
-    """Its parameter, if it has one, is how many workers a job may cost before it counts as failed."""
-    file = tmp_path_factory.mktemp("cluster") / "scheduler.json"
-    options = ["--host", "127.0.0.1", "--port", "0", "--no-dashboard", "--scheduler-file", str(file)]
-    may_cost = os.environ | {"DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": str(getattr(request, "param", 3))}
-    with _process("scheduler", *options, environment=may_cost) as process:
-        deadline = time.monotonic() + _PATIENCE_S
-        while True:
-            assert process.poll() is None
-            assert time.monotonic() < deadline
-            try:
-                yield Cluster(json.loads(file.read_text())["address"], process)
-                return
-            except (OSError, ValueError):
-                os.sched_yield()
+def cluster(request: pytest.FixtureRequest) -> Iterator[LocalCluster]:
+    """Two workers; a parameter is how many of them a job may cost before it counts as failed."""
+    with (
+        dask.config.set({"distributed.scheduler.allowed-failures": getattr(request, "param", 3)}),
+        cluster_of(2) as made,
+    ):
+        yield made
 
 
-@pytest.mark.slow
-def test_a_worker_is_killed_and_nothing_is_lost_or_doubled(cluster: Cluster, tmp_path: Path) -> None:
-    """Its work is done again by the other; the row and the file of each recording are those of one process."""
-    sources = [str(write_small(tmp_path / f"{k}.mcap", 100 + k)) for k in range(10)]
-    bad = tmp_path / "bad.mcap"
-    bad.write_bytes(b"nonsense, and a good deal of it")
-    (tmp_path / "out").mkdir()
-    todo = batch.jobs([*sources, str(bad)], batch.models(None, []), ["o3"], tmp_path / "out")
-    done: list[batch.Done] = []
-    with ExitStack() as stack:
-        workers = [stack.enter_context(cluster.worker(name)) for name in ("one", "two")]
-        cluster.wait_for(2)
-        for each in batch.run(todo, lambda: workers_of(cluster.address), len(todo)):
-            if not done:
-                workers[0].kill()
-            done.append(each)
-        assert workers[0].wait() == -9
-    assert sorted(each.job.output for each in done) == sorted(job.output for job in todo)
-    assert [each.job.source for each in done if each.error] == [str(bad)]
-    rows = {each.row["recording"]: each.row["exposures"] for each in done if each.row}
-    assert rows == {source: 100 + k for k, source in enumerate(sources)}
-    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [f"{k}.o3.mcap" for k in range(10)]
+def jobs(folder: Path, count: int, exposures: int = 100) -> list[batch.Job]:
+    (folder / "out").mkdir()
+    sources = [str(write_small(folder / f"{k}.mcap", exposures)) for k in range(count)]
+    return batch.jobs(sources, [Model()], ["o3"], folder / "out")
+
+
+def killing_one(cluster: LocalCluster, todo: list[batch.Job]) -> dict[str, batch.Row]:
+    """The rows of jobs, by recording, of which a worker is killed when the first is done."""
+    rows: dict[str, batch.Row] = {}
+    with Client(cluster, set_as_default=False) as client:
+        victim = min(client.run(os.getpid).values())
+    for job, row in batch.run(todo, lambda: batch.dask(cluster.scheduler_address), len(todo)):
+        if not rows:
+            os.kill(victim, signal.SIGKILL)
+        assert job.source not in rows
+        rows[job.source] = row
+    return rows
+
+
+def test_a_worker_is_killed_and_nothing_is_lost_or_doubled(cluster: LocalCluster, tmp_path: Path) -> None:
+    """Its work is done again; the row and the file of each recording are those of one process."""
+    todo = jobs(tmp_path, 10)
+    (bad := tmp_path / "bad.mcap").write_bytes(b"nonsense, and a good deal of it")
+    rows = killing_one(cluster, [*todo, *batch.jobs([str(bad)], [Model()], ["o3"], tmp_path / "out")])
+    assert [source for source, row in rows.items() if row["error"]] == [str(bad)]
+    assert {source for source, row in rows.items() if row["exposures"] == 100} == {job.source for job in todo}
+    assert {*(tmp_path / "out").iterdir()} == {job.output for job in todo}
     (alone := tmp_path / "alone").mkdir()
-    for job in batch.jobs(sources[:2], batch.models(None, []), ["o3"], alone):
-        assert not batch.do(job, aolink_version()).error
+    for job in batch.jobs([each.source for each in todo[:2]], [Model()], ["o3"], alone):
+        assert not batch.do(job)["error"]
         there = Recording(tmp_path / "out" / job.output.name)
         assert [m.data for m in there.raw_messages()] == [m.data for m in Recording(job.output).raw_messages()]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("cluster", [0], indirect=True)
-def test_a_job_that_costs_its_workers_is_one_line(cluster: Cluster, tmp_path: Path) -> None:
-    todo = batch.jobs([str(write_small(tmp_path / f"{k}.mcap", 100)) for k in range(10)], [Model()], ["o3"], tmp_path)
-    done: list[batch.Done] = []
-    with cluster.worker("one") as first, cluster.worker("two"):
-        cluster.wait_for(2)
-        for each in batch.run(todo, lambda: workers_of(cluster.address), len(todo)):
-            if not done:
-                first.kill()
-            done.append(each)
-    errors = [each.error for each in done if each.error]
-    assert len(done) == len(todo)
+def test_a_job_that_costs_its_workers_is_one_row(cluster: LocalCluster, tmp_path: Path) -> None:
+    rows = killing_one(cluster, jobs(tmp_path, 10))
+    errors = [row["error"] for row in rows.values() if row["error"]]
+    assert len(rows) == 10
     assert 1 <= len(errors) <= 3, "those that the worker had"
-    assert {*errors} == {"its process was ended from outside: too little memory, or a signal"}
+    assert all("lost" in each for each in errors)
 
 
-@pytest.mark.slow
 def test_stopped_the_cluster_keeps_nothing_of_the_batch(
-    cluster: Cluster, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+    cluster: LocalCluster, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    todo = batch.jobs([str(write_small(tmp_path / f"{k}.mcap", 100)) for k in range(30)], [Model()], ["o3"], tmp_path)
-    done: list[batch.Done] = []
-    with cluster.worker("one"), Client(cluster.address, set_as_default=False) as client:
-        client.wait_for_workers(1, timeout=_PATIENCE_S)
-        for each in batch.run(todo, lambda: workers_of(cluster.address), len(todo), stop=lambda: bool(done)):
-            done.append(each)
-        while client.run_on_scheduler(lambda dask_scheduler: len(dask_scheduler.tasks)) or [*tmp_path.glob(".*")]:
-            os.sched_yield()
-    assert 1 <= len(done) <= len([*tmp_path.glob("*.o3.mcap")]) <= len(done) + 2 < len(todo)
+    todo, done = jobs(tmp_path, 30), list[batch.Job]()
+    for job, _ in batch.run(
+        todo, lambda: batch.dask(cluster.scheduler_address), len(todo), stop=lambda: bool(done)
+    ):  # fmt: skip
+        done.append(job)
+    while cluster.scheduler.tasks or [*(tmp_path / "out").glob(".*")]:
+        os.sched_yield()
+    assert 1 <= len(done) <= len([*(tmp_path / "out").iterdir()]) <= len(done) + 4 < len(todo)
     assert capfd.readouterr().err == ""
 
 
-@pytest.mark.slow
-def test_without_its_scheduler_a_batch_ends_with_one_line(cluster: Cluster, tmp_path: Path) -> None:
-    todo = batch.jobs([str(write_small(tmp_path / "s.mcap", 3))], batch.models(None, []), ["o3"], tmp_path)
-    with cluster.worker("one"):
-        cluster.wait_for(1)
-        address = cluster.address
-        stopped = iter([False])
+def test_without_its_scheduler_a_batch_ends_with_one_line(cluster: LocalCluster, tmp_path: Path) -> None:
+    stopped = iter([False])
 
-        def stop() -> bool:  # asked once before the job is given away, and then while it is waited for
-            if next(stopped, None) is None:
-                cluster.scheduler.kill()
-            return False
+    def stop() -> bool:  # asked once before the job is given away, and then while it is waited for
+        if next(stopped, None) is None:
+            cluster.close()
+        return False
 
-        with pytest.raises(AolinkError, match=f"the scheduler at {address} is gone; what was done stays"):
-            list(batch.run(todo * 20, lambda: workers_of(address), 20, stop=stop))
+    with pytest.raises(AolinkError, match="is gone"):
+        list(batch.run(jobs(tmp_path, 20, 3), lambda: batch.dask(cluster.scheduler_address), 20, stop=stop))
 
 
-@pytest.mark.slow
-def test_a_worker_with_another_aolink_is_one_clear_line(cluster: Cluster, aolink: Run, tmp_path: Path) -> None:
-    other = tmp_path / "other" / "aolink-0.0.9.dist-info"
-    other.mkdir(parents=True)
-    (other / "METADATA").write_text("Metadata-Version: 2.1\nName: aolink\nVersion: 0.0.9\n")
-    write_small(tmp_path / "s.mcap", 3)
-    arguments = ("estimate", "s.mcap", "-o", "out", "--scheduler", cluster.address)
-    nobody = aolink(*arguments)
-    assert nobody.returncode == 1
-    assert nobody.stderr.startswith(f"aolink: the scheduler at {cluster.address} has no workers: start some")
-    with cluster.worker("old", str(other.parent)):
-        cluster.wait_for(1)
-        refused = aolink(*arguments)
-    assert refused.returncode == 1
-    assert "has aolink 0.0.9, this is aolink 0.1.0: install the same everywhere" in refused.stderr
-    assert (len(nobody.stderr.splitlines()), len(refused.stderr.splitlines())) == (1, 1)
-    assert not [*(tmp_path / "out").iterdir()]
+def test_no_worker_or_one_with_another_aolink_is_one_clear_error(tmp_path: Path) -> None:
+    (tmp_path / "aolink-0.0.9.dist-info").mkdir()
+    (tmp_path / "aolink-0.0.9.dist-info" / "METADATA").write_text(
+        "Metadata-Version: 2.1\nName: aolink\nVersion: 0.0.9\n"
+    )
+    with cluster_of(0) as cluster, Client(cluster, set_as_default=False) as client:
+        address = cluster.scheduler_address
+        with pytest.raises(AolinkError, match="no workers"), batch.dask(address):
+            pass
+        worker = subprocess.Popen(
+            [sys.executable, "-m", "dask", "worker", address, "--no-nanny", "--no-dashboard", "--nthreads", "1"],
+            env=os.environ | {"PYTHONPATH": str(tmp_path)}, stderr=subprocess.DEVNULL,
+        )  # fmt: skip
+        try:
+            client.wait_for_workers(1, timeout=120)
+            with pytest.raises(AolinkError, match=r"0\.0\.9"), batch.dask(address):
+                pass
+        finally:
+            worker.kill()
+            worker.wait()
 
 
-@pytest.mark.slow
-def test_the_command_on_a_cluster(cluster: Cluster, aolink: Run, tmp_path: Path) -> None:
+def test_the_command_on_a_cluster(cluster: LocalCluster, aolink: Run, tmp_path: Path) -> None:
     """Names may be relative: the workers have other folders. A second time, everything was done before."""
     names = [write_small(tmp_path / f"s{k}.mcap", 3 + k).name for k in range(3)]
-    arguments = ("estimate", *names, "-o", "out", "--table", "all.parquet", "--scheduler", cluster.address)
-    with cluster.worker("one"):
-        cluster.wait_for(1)
-        first, second = aolink(*arguments), aolink(*arguments)
-    assert first.returncode == 0, first.stderr
-    assert "3 of 3 done, 0 of them before, 0 failed; table: all.parquet" in first.stdout
-    assert "3 of 3 done, 3 of them before, 0 failed; table: all.parquet" in second.stdout
-    assert (first.stderr, second.stderr) == ("", "")
+    arguments = ("estimate", *names, "-o", "out", "--scheduler", cluster.scheduler_address)
+    for before in (0, 3):
+        done = aolink(*arguments)
+        assert done.returncode == 0, done.stderr
+        assert f"3 of 3 done, {before} of them before, 0 failed" in done.stdout
+        assert done.stderr == ""
     assert {each.name for each in (tmp_path / "out").glob("*.mcap")} == {f"s{k}.moments.mcap" for k in range(3)}
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("address", ["127.0.0.1:1", "nonsense"])
 def test_no_scheduler_is_one_clear_line(address: str) -> None:
-    with pytest.raises(AolinkError, match="no Dask scheduler answers at"):
-        workers_of(address).__enter__()
+    with pytest.raises(AolinkError, match="no Dask scheduler answers"):
+        batch.dask(address).__enter__()

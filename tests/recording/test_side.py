@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 import aolink
-from aolink.batch import Model, Settings, estimate_file
+from aolink.batch import Model, estimate_file
 from aolink.errors import RecordingError
 from aolink.recording.compare import compare
 from aolink.recording.editing import recover
@@ -30,8 +30,7 @@ def test_a_recording_with_a_side_file_is_the_copy_with_these_estimates(
     recorded: Session, tmp_path: Path, model: Model, estimator: str
 ) -> None:
     """In place of the estimates that were there; with another rig, in place of all of them."""
-    settings = Settings(estimator=estimator, model=model)
-    row = estimate_file(recorded.path, tmp_path / "s.mcap", settings)
+    row = estimate_file(recorded.path, tmp_path / "s.mcap", estimator, model=model)
     assert row["exposures"] == EXPOSURES
     beside = Recording(recorded.path, side=[tmp_path / "s.mcap"])
     write_reestimated(model.applied_to(Recording(recorded.path)), [estimator], tmp_path / "copy.mcap")
@@ -55,9 +54,9 @@ def test_two_side_files_of_one_recording_stand_side_by_side(tmp_path: Path) -> N
     source = write_small(tmp_path / "s.mcap", 5)
     sides = [tmp_path / f"{name}.mcap" for name in ("o1", "o3")]
     for side in sides:
-        estimate_file(source, side, Settings(estimator=side.stem))
+        estimate_file(source, side, side.stem)
     assert Recording(source, side=sides).estimators == ["o1", "o3"]
-    estimate_file(source, other := tmp_path / "other.mcap", Settings(model=OTHER))
+    estimate_file(source, other := tmp_path / "other.mcap", model=OTHER)
     with pytest.raises(RecordingError, match="were made with different rig files"):
         Recording(source, side=[sides[0], other])
     with pytest.raises(RecordingError, match="with another than is asked for"):
@@ -109,7 +108,7 @@ def test_what_does_not_belong_together_is_one_clear_error(aolink: Run, tmp_path:
 def test_view_and_compare_take_a_recording_and_its_side_file(aolink: Run, recorded: Session, tmp_path: Path) -> None:
     shutil.copy(recorded.path, source := tmp_path / "s.mcap")
     for name, model in (("same", Model()), ("other", OTHER)):
-        estimate_file(source, tmp_path / f"{name}.mcap", Settings(estimator="o3", model=model))
+        estimate_file(source, tmp_path / f"{name}.mcap", "o3", model=model)
     same = aolink("compare", "s.mcap", "same.mcap", "--json")
     assert same.returncode == 0, same.stdout
     assert list(json.loads(same.stdout)["topics"]) == ["/estimate/o3"]

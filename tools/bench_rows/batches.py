@@ -16,7 +16,7 @@ from contextlib import ExitStack, contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 
-from aolink.batch import Settings, estimate_file
+from aolink.batch import estimate_file
 from aolink.jobs import batch
 from aolink.numerics.workers import processes as pool_of
 from bench_rows.recording import record_long
@@ -45,7 +45,7 @@ def tiny_recordings(effort: Effort) -> list[Row]:
 
         def work(source: Path) -> float:
             out = folder / "out" / f"{source.stem}.o3.mcap"
-            return timed(lambda: estimate_file(source, out, Settings(overwrite=True)))
+            return timed(lambda: estimate_file(source, out, overwrite=True))
 
         few, many = (min(work(folder / f"{each}.mcap") for _ in range(5)) for each in (3, 203))
         of_one = max(0.0, (many - few) / 200)
@@ -73,8 +73,6 @@ def cluster_workers(effort: Effort) -> Row:
     """
     from distributed import Client
 
-    from aolink.jobs.cluster import workers_of
-
     with tempfile.TemporaryDirectory() as name, ExitStack() as stack:
         folder = Path(name)
         for k in range(8):
@@ -99,12 +97,12 @@ def cluster_workers(effort: Effort) -> Row:
 
         def work(address: str, some: Sequence[Any] = todo) -> float:
             """Time that the workers were busy, s."""
-            done = list(batch.run(some, lambda: workers_of(address), len(some)))
-            assert not any(each.error for each in done)
-            return math.fsum(each.row["seconds"] for each in done)
+            rows = [row for _, row in batch.run(some, lambda: batch.dask(address), len(some))]
+            assert not any(row["error"] for row in rows)
+            return math.fsum(row["seconds"] for row in rows)
 
         def plain(pool: ProcessPoolExecutor, some: Sequence[Any] = todo) -> None:
-            assert not any(each.error for each in batch.run(some, lambda: nullcontext(pool), len(some)))
+            assert not any(row["error"] for _, row in batch.run(some, lambda: nullcontext(pool), len(some)))
 
         small, large = cluster(1), cluster(2)
         alone, pair = (stack.enter_context(pool_of(count)) for count in (1, 2))

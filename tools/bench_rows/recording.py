@@ -305,7 +305,7 @@ def batch_workers(effort: Effort) -> Row:
             target.mkdir()
             todo = batch.jobs([*map(str, sources)], batch.models(None, []), ["moments"], target)
             start = time.perf_counter()
-            assert not any(each.error for each in batch.run(todo, lambda: batch.here(jobs), jobs))
+            assert not any(row["error"] for _, row in batch.run(todo, lambda: batch.here(jobs), jobs))
             return time.perf_counter() - start
 
         one, two = work(1), work(2)

@@ -115,7 +115,7 @@ def batch(rows: Sequence[Mapping[str, Any]]) -> Table:
         table.add_column(name, justify="left" if name in columns[:3] else "right", no_wrap=True)
     for row in rows:
         if row["error"]:
-            table.add_row(Path(row["recording"]).name, escape(row["model"]), "failed")
+            table.add_row(Path(row["recording"]).name, escape(row["model"]), row["estimator"], "failed")
             continue
         cells = [Path(row["recording"]).name if name == "recording" else row[name] for name in columns]
         table.add_row(*(escape(f"{cell:.4g}" if isinstance(cell, float) else str(cell or "")) for cell in cells))
