@@ -88,6 +88,7 @@ def test_stopped_the_cluster_keeps_nothing_of_the_batch(
         todo, lambda: batch.dask(cluster.scheduler_address), len(todo), stop=lambda: bool(done)
     ):  # fmt: skip
         done.append(job)
+    assert cluster.scheduler
     while cluster.scheduler.tasks or [*(tmp_path / "out").glob(".*")]:
         os.sched_yield()
     assert 1 <= len(done) <= len([*(tmp_path / "out").iterdir()]) <= len(done) + 4 < len(todo)
