@@ -262,11 +262,6 @@ def is_being_written(target: Path) -> bool:
         return _others_write(target)
 
 
-def is_being_replaced(target: Path) -> bool:
-    """Whether another command is writing a file that is to take the place of ``target``."""
-    return _others_write(target)
-
-
 def remove_unfinished(target: Path) -> None:
     """Remove the unfinished files of ``target`` that killed commands have left."""
     _others_write(target)

@@ -1,26 +1,18 @@
 """The command identify: it makes a rig file with a model of the disturbance from recordings of blurred frames."""
 
-import glob
 import json
-import math
-import time
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from aolink.cli.common import JsonOption, OverwriteOption, app, open_recording, progress, say_damage, stdout
+from aolink.cli.common import JsonOption, OverwriteOption, app, open_recording, progress, stdout
 from aolink.errors import IdentificationError
 from aolink.files import check_target, writing
 
 if TYPE_CHECKING:
-    from aolink.jobs.follow import News, Offer
-    from aolink.jobs.identify import IdentifiedModel, Wanted
-    from aolink.rig import Rig
-
-_LOOK_S = 0.2
-"""Time between two readings of a recording that is being written, s."""
+    from aolink.jobs.identify import IdentifiedModel
 
 
 class Fitted(StrEnum):
@@ -34,7 +26,7 @@ class Fitted(StrEnum):
 
 @app.command(
     epilog="Example: aolink identify session.mcap -o identified.toml --model resonance"
-    "  |  aolink identify *.mcap -o rig.toml  |  aolink identify session.mcap --follow -o identified.toml"
+    "  |  aolink identify *.mcap -o rig.toml"
 )
 def identify(
     files: Annotated[list[Path], typer.Argument(metavar="FILE...", help="Recordings of one rig.")],
@@ -45,8 +37,7 @@ def identify(
             "--model",
             metavar="KIND+KIND...",
             help="Model of the disturbance: random-walk, ornstein-uhlenbeck, second-order, resonance, ar3, ar4, or a"
-            " sum of them. Given several times, cross-validation chooses; without it, from nine; with --follow, the"
-            " rig file's own.",
+            " sum of them. Given several times, cross-validation chooses; without it, from nine.",
         ),
     ] = None,
     fit: Annotated[
@@ -63,14 +54,6 @@ def identify(
     rig: Annotated[
         str | None, typer.Option(metavar="RIG.toml", help="Start from this rig file, not from the recording's own.")
     ] = None,
-    follow: Annotated[
-        bool,
-        typer.Option(
-            "--follow",
-            help="Follow one recording while it is written: say how the rig file's model fits and, where it no longer"
-            " does, offer a new one in a file of its own. The session and its rig file stay as they are.",
-        ),
-    ] = False,
     overwrite: OverwriteOption = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -94,15 +77,6 @@ def identify(
         noise=Fitted.NOISE in fitted, kernel=Fitted.KERNEL in fitted,
         highest_hz=highest or None,
     )  # fmt: skip
-    if follow:
-        if len(files) > 1:
-            raise typer.BadParameter("--follow is for one recording")
-        if fitted or overwrite:
-            raise typer.BadParameter(
-                "--follow fits the disturbance alone and never overwrites: leave out --fit and --overwrite"
-            )
-        _follow(files[0], output, load_rig(rig) if rig else None, wanted, sources, as_json=as_json)
-        return
     recordings = [open_recording(file) for file in files]
     with progress("identify", None) as tell:
 
@@ -123,61 +97,6 @@ def identify(
         for note in each.notes:
             stdout.print(f"note: {note}", markup=False)
     stdout.print(f"wrote {output}", markup=False)
-
-
-def _follow(
-    place: Path, output: Path, rig: "Rig | None", wanted: "Wanted", sources: list[Path], *, as_json: bool
-) -> None:
-    from aolink.control.drift import WINDOW
-    from aolink.jobs.follow import Following, Offer, offer_path
-    from aolink.recording.growing import GrowingRecording
-
-    if taken := sorted(output.parent.glob(f"{glob.escape(output.stem)}-[0-9]*{glob.escape(output.suffix)}")):
-        raise IdentificationError(f"{taken[0]} exists, and further offers would have such names: give another -o")
-    recording = say_damage(GrowingRecording(place, lambda: time.sleep(_LOOK_S), rig=rig))
-    with progress("follow", None) as tell:
-
-        def on_progress(what: str, done: int, of: int) -> None:
-            tell(following.exposures, f"{what}: {done} of {of}")
-
-        following = Following(recording.rig, wanted, output, on_progress)
-        for exposure in recording.exposures():
-            for each in following.see(exposure):
-                if isinstance(each, Offer):
-                    with writing(each.path, sources=sources, error=IdentificationError) as partial:
-                        partial.write_text(each.result.text, newline="")
-                _say(each, as_json=as_json)
-            tell(following.exposures)
-    if not following.judged:
-        raise IdentificationError(
-            f"{recording.path} ended after {following.exposures} exposures: {WINDOW} or more that show a spot are"
-            " needed to say whether a model fits"
-        )
-    if not as_json:
-        offers = ", ".join(offer_path(output, k + 1).name for k in range(following.offers)) or "none"
-        how = recording.end_metadata.get("ended", "complete")
-        ended = f"ended{'' if how == 'complete' else f' ({how})'} after {following.exposures} exposures"
-        stdout.print(f"{recording.path} {ended}; offers: {offers}", markup=False)
-
-
-def _say(each: "News | Offer", *, as_json: bool) -> None:
-    """Print news at once, a line for each."""
-    from aolink.cli.tables.identification import offer_lines
-    from aolink.jobs.follow import News
-
-    if as_json:
-        if isinstance(each, News):
-            print(json.dumps({"frame": each.frame_id, "fits": each.fits, "text": each.text}), flush=True)
-            return
-        row = {
-            "frame": each.frame_id, "out": str(each.path), "fitted": each.fitted, "held_out": each.held_out,
-            "log_likelihood": each.log_likelihood, "before": each.before if math.isfinite(each.before) else None,
-            "outputs": [_as_json(found) for found in each.result.found],
-        }  # fmt: skip
-        print(json.dumps(row), flush=True)
-        return
-    for line in [each.text] if isinstance(each, News) else offer_lines(each):
-        stdout.print(f"frame {each.frame_id}: {line}", markup=False)
 
 
 def _as_json(found: "IdentifiedModel") -> dict[str, Any]:

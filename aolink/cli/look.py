@@ -15,10 +15,6 @@ if TYPE_CHECKING:
     from aolink.recording.reader import Recording
 
 
-_LOOK_S = 0.1
-"""Time between two looks at a file that grows, s."""
-
-
 @app.command(epilog="Example: aolink view session.mcap  |  aolink view session.mcap --frame 7 -o one.rrd")
 def view(
     recorded: Annotated[
@@ -39,9 +35,6 @@ def view(
         int | None, typer.Option(min=0, metavar="N", help="Show one exposure alone, counted from 0.")
     ] = None,
     lenslet: LensletOption = None,
-    follow: Annotated[
-        bool, typer.Option("--follow", help="Show a recording that a session is still writing, as it grows.")
-    ] = False,
     overwrite: OverwriteOption = False,
 ) -> None:
     """Open a recording in Rerun, or a Rerun file that was saved from one.
@@ -51,11 +44,6 @@ def view(
     from aolink import viewing
 
     choices = (frame, lenslet)
-    if follow:
-        if side or output or any(each is not None for each in choices):
-            raise typer.BadParameter("--follow shows the whole session as it comes, alone or with --web")
-        _follow(recorded, web=web)
-        return
     sides = side or []
     if output is not None:
         check_target(output, overwrite=overwrite, sources=[recorded, *sides], suffix=".rrd")
@@ -91,20 +79,6 @@ def _targets(output: list[Path] | None) -> tuple[Path | None, Path | None]:
     if len(usual) > 1 or len(others) > 1:
         raise typer.BadParameter(f"one file of a kind can be written: {', '.join(map(str, output or ()))}")
     return next(iter(usual), None), next(iter(others), None)
-
-
-def _follow(file: Path, *, web: bool) -> None:
-    import time
-
-    from aolink import viewing
-    from aolink.recording.growing import GrowingRecording
-
-    if not web:
-        viewing.check_display()
-    recording = GrowingRecording(file, lambda: time.sleep(_LOOK_S))
-    common.say_damage(recording)
-    with progress("follow", None) as tell:
-        viewing.follow(recording, web=web, on_ready=_address, progress=tell)
 
 
 def _address(address: str) -> None:

@@ -10,14 +10,13 @@ from aolink.identification.choose import CANDIDATES, Tried, chosen, tried
 from aolink.identification.models import PARAMETERS, PLANTS, UNITS, IdentifiedPlant, Process, ProcessSum, kinds_of
 from aolink.identification.pixels import Candidate, Scan, by_pixels, candidates, refined, scanned
 from aolink.identification.readings import FEWEST, Readings, readings
-from aolink.identification.rig_model import RigModel, rig_model
 from aolink.identification.rig_text import identified_text
 from aolink.identification.search import Maximum, Space, maxima, space_of
 from aolink.identification.sets import Identified, Piece, identified
 
 __all__ = [
     "CANDIDATES", "FEWEST", "PARAMETERS", "PLANTS", "UNITS", "Candidate", "Identified", "IdentifiedPlant", "Maximum",
-    "Piece", "Process", "ProcessSum", "Readings", "RigModel", "Scan", "Space", "Tried", "by_pixels", "candidates",
-    "chosen", "identified", "identified_text", "kinds_of", "maxima", "readings", "refined", "rig_model", "scanned",
+    "Piece", "Process", "ProcessSum", "Readings", "Scan", "Space", "Tried", "by_pixels", "candidates",
+    "chosen", "identified", "identified_text", "kinds_of", "maxima", "readings", "refined", "scanned",
     "space_of", "tried",
 ]  # fmt: skip

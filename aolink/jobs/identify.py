@@ -153,16 +153,12 @@ def _by_output(rig: Rig, seen: Sequence[Readings]) -> list[tuple[str, list[Readi
 
 
 def _some(seen: Readings, which: Sequence[int]) -> Readings:
-    return seen.of_outputs(outputs_of(seen, which))
-
-
-def outputs_of(seen: Readings, which: Sequence[int]) -> list[int]:
-    """The outputs among those given that a model is fitted to. Raises IdentificationError where none shows a spot."""
+    """The readings of the outputs that a model is fitted to. Raises IdentificationError where none shows a spot."""
     seeing = [o for o in which if seen.usable[o].any()]
     if not seeing:
         raise IdentificationError("no exposure shows a spot of this output")
     at = np.unique(np.linspace(0, len(seeing) - 1, min(len(seeing), _MOST_OUTPUTS)).round().astype(int))
-    return [seeing[k] for k in at]
+    return seen.of_outputs([seeing[k] for k in at])
 
 
 def _of_output(

@@ -54,11 +54,7 @@ class RawMessage(NamedTuple):
 
 
 class RecordedMessages:
-    """The messages of a file, with its attachments and metadata: surveyed at once, and read when they are wanted.
-
-    A subclass that finds its messages in another way gives `survey` and `own_messages`, and tells of what it finds in
-    ``channels`` and with `note_metadata` and `lose`.
-    """
+    """The messages of a file, with its attachments and metadata: surveyed at once, and read when they are wanted."""
 
     def __init__(self, path: str | Path, *, check: bool) -> None:
         self.path = Path(path)
@@ -87,7 +83,7 @@ class RecordedMessages:
         """Topics that are read from side files instead."""
         self._second_rig_text: str | None = None
         self._attached_bytes = 0
-        self.rig_text = self.survey(check=check)
+        self.rig_text = self._survey(check=check)
         """The text of the rig file; None where the file has none."""
 
     @property
@@ -146,7 +142,7 @@ class RecordedMessages:
                 topic, schema = channels[record.channel_id]
                 yield RawMessage(topic, schema, record.log_time, record.sequence, record.data)
 
-    def survey(self, *, check: bool) -> str | None:
+    def _survey(self, *, check: bool) -> str | None:
         """Find out what is in the file: from its index, or else by a scan. Gives the text of the rig file."""
         with open_recording(self.path) as file:
             summary = None if check else read_summary(file)

@@ -266,34 +266,6 @@ def scan(file: IO[bytes], on_loss: Callable[[Loss], None]) -> Iterator[tuple[Mca
     lose(Loss(size, 0, f"it was cut off: it ends at byte {size}, without an index"))
 
 
-def grown(file: IO[bytes], position: int, on_loss: Callable[[Loss], None]) -> tuple[int, list[McapRecord], bool]:
-    """The record at a position of a file that may still be written, or for a chunk the records in it.
-
-    Returns
-    -------
-    The position of the next record, which is ``position`` while this one is not whole; the records that are of
-    interest; whether this is the end of the data.
-
-    Raises
-    ------
-    RecordingError
-        The bytes there are not a valid record, or are no longer there.
-    """
-    size, name = file.seek(0, os.SEEK_END), _name(file)
-    if size < position:
-        raise RecordingError(f"{name} has become shorter while it was read: it was cut or replaced; begin again")
-    opcode, length = _head_at(file, position)
-    end = position + HEAD.size + length
-    if end > size:
-        return position, [], False
-    if not is_plausible(opcode, length, file, 0):
-        raise RecordingError(f"{name} makes no sense at byte {position}: `aolink copy` copies what is whole")
-    record = _record_at(file, position, on_loss, budget := Budget(name, size))
-    if isinstance(record, Chunk):
-        return end, list(broken_up(record, position, on_loss, budget)), False
-    return end, [] if record is None else [record], opcode == Opcode.DATA_END
-
-
 def _check_data(file: IO[bytes], end: int, on_loss: Callable[[Loss], None]) -> None:
     """Compare all bytes before the end of the data with the checksum that stands there, if there is one."""
     file.seek(end)

@@ -11,7 +11,7 @@ estimator, SciPy or pandas is loaded until the first picture.
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from aolink.viewing.feed import follow, serve, show
+    from aolink.viewing.feed import serve, show
     from aolink.viewing.live import LiveView, live_viewer
     from aolink.viewing.look import Look
     from aolink.viewing.process import check_display, open_viewer, serve_web
@@ -22,7 +22,7 @@ else:  # the type checker would accept any name
     __getattr__ = at_first_use(
         __name__,
         {
-            "feed": "follow serve show",
+            "feed": "serve show",
             "live": "LiveView live_viewer",
             "look": "Look",
             "process": "check_display open_viewer serve_web",
@@ -31,7 +31,7 @@ else:  # the type checker would accept any name
     )
 
 __all__ = [
-    "LiveView", "Look", "check_display", "follow", "live_viewer", "open_viewer", "save_rrd", "serve", "serve_web",
+    "LiveView", "Look", "check_display", "live_viewer", "open_viewer", "save_rrd", "serve", "serve_web",
     "show",
 ]  # fmt: skip
 

@@ -17,7 +17,6 @@ from aolink.viewing.process import Server, serving, window
 if TYPE_CHECKING:
     import rerun as rr
 
-    from aolink.recording.growing import GrowingRecording
     from aolink.recording.reader import Recording
 
 _FLUSH_S = 60.0
@@ -78,29 +77,6 @@ def serve(
     """
     with serving() as server:
         _feed(server, recording, look or Look(), progress, on_ready)
-
-
-def follow(
-    recording: GrowingRecording, *, web: bool = False, on_ready: Callable[[str], None] | None = None,
-    progress: Callable[[int], None] | None = None,
-) -> None:  # fmt: skip
-    """Show a recording while a session writes it, and wait until the window is closed, or the web page interrupted.
-
-    Parameters are those of `serve`. Raises `ViewerError`.
-    """
-    with serving() if web else window() as server:
-        from aolink.viewing.live import LiveView  # while the viewer starts
-
-        with fed(server) as stream:
-            if web and on_ready is not None:
-                on_ready(server.address)
-            view = LiveView(stream, recording.rig, recording.estimators)
-            for done, (exposure, estimates) in enumerate(recording.walk(), 1):
-                if server.process.poll() is not None:
-                    return  # its window was closed
-                view.show(exposure, list(estimates.values()))
-                if progress:
-                    progress(done)
 
 
 def _feed(

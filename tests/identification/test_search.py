@@ -11,20 +11,25 @@ from aolink.identification import maxima, readings, space_of
 from aolink.identification.likelihood import Likelihood
 from aolink.identification.search import climb
 from aolink.jobs.closed_loop import closed_loop
-from aolink.rig import load_rig
+from aolink.rig import load_rig, parse_rig
 from tests.needs import needed
 
 needed("pyrtc")
 sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
-from bench_rows.identification import DisturbanceChange, changed  # noqa: E402 # where that is installed
+from bench_rows.disturbances import by_model, played  # noqa: E402 # where that is installed
 from bench_rows.loop_worth import Cell  # noqa: E402
 
 
 @pytest.mark.rare
-def test_a_sharp_vibration_beside_a_drift_is_found_although_only_an_alias_is_found_at_first():
+def test_a_sharp_vibration_beside_a_drift_is_found_although_only_an_alias_is_found_at_first(tmp_path):
     """The vibration is at 14.4 Hz; the best that the grid and its aliases lead to is at 34.4 Hz, 20 nats below."""
-    rig = load_rig("loop")
-    seen = [readings(rig, changed(DisturbanceChange("", frequency=1.2), 180, 30_001)[84:])]
+    rig, random = load_rig("loop"), np.random.default_rng(30_001)
+    period = rig.timing.frame_period_steps
+    before, state = by_model(rig, 80 * period, random, None)
+    moved = parse_rig(rig.toml.replace("frequency_hz = 12.0", "frequency_hz = 14.4"))
+    after, _ = by_model(moved, 102 * period, random, state)
+    disturbed = played(rig, np.concatenate([before, after]), tmp_path / "rig.toml")
+    seen = [readings(rig, list(aolink.simulate(disturbed, 180, seed=30_001))[84:])]
     kinds = ("ornstein-uhlenbeck", "resonance")
     space = space_of(kinds, seen, rig.sensor.kernel.variance, with_noise=False, with_kernel=False)
     found = maxima(space, seen)

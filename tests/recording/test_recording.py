@@ -32,9 +32,10 @@ from aolink.assembly import Frame
 from aolink.errors import RecordingError
 from aolink.estimation import exposure_model
 from aolink.recording import convert, topics
+from aolink.recording.mcap_file import McapFile, WriteOptions, schema_of
 from aolink.recording.reader import Recording
 from aolink.recording.reestimate import write_reestimated
-from aolink.recording.writer import RecordingWriter
+from aolink.recording.writer import RecordingWriter, begin_recording
 from aolink.rig import load_rig
 from tests.conftest import ESTIMATORS, EXPOSURES, Session
 
@@ -112,6 +113,28 @@ def test_a_recording_cut_anywhere_gives_what_is_whole(recorded: Session, tmp_pat
         counts.append(len(exposures))
     assert counts == sorted(counts)
     assert counts[0] < counts[-1] == EXPOSURES
+
+
+def test_a_recording_that_is_being_written_reads_as_far_as_it_is_whole(recorded: Session, tmp_path: Path) -> None:
+    whole, counts = Recording(recorded.path), []
+    estimated = list(whole.walk())
+    file = McapFile(tmp_path / "a.mcap", WriteOptions())
+    begin_recording(file, whole.rig, {"session": "again"}, whole.start_ns, {})
+    for number, each in enumerate(whole.raw_messages(), 1):
+        file.add(each.topic, schema_of(topics.SCHEMAS[each.schema]), each.data, each.log_time_ns, number)
+        if number % 25 == 0:
+            file.flush()
+            reading = Recording(tmp_path / "a.mcap")
+            assert "cut off" in reading.damage
+            counts.append(len(came := list(reading.walk())))
+            for (ours, made), (theirs, known) in zip(came[:-1], estimated, strict=False):
+                assert np.array_equal(ours.pixels, theirs.pixels)
+                assert np.array_equal(ours.inputs, theirs.inputs)
+                assert made.keys() == known.keys()
+    file.finish()
+    assert counts == sorted(counts)
+    assert 0 < counts[len(counts) // 2] < counts[-1] <= EXPOSURES
+    assert len(Recording(tmp_path / "a.mcap")) == EXPOSURES
 
 
 def test_the_file_is_flushed_by_the_messages_own_time(recorded: Session, tmp_path: Path) -> None:

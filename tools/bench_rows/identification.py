@@ -1,5 +1,5 @@
-"""Rows about `aolink identify`: on recordings (logs) drawn at random, whether its sets hold the truth, and its offers
-when it follows; and the diffusion of the film of spheres."""
+"""Rows about `aolink identify`: on recordings (logs) drawn at random, whether its sets hold the truth; and the
+diffusion of the film of spheres."""
 
 from __future__ import annotations
 
@@ -8,8 +8,6 @@ import math
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
-from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import NamedTuple
 
 import numpy as np
@@ -21,10 +19,8 @@ from scipy import stats
 import aolink
 from aolink.exposure import Exposure
 from aolink.identification import Identified, Process, ProcessSum, Readings, identified, maxima, readings, space_of
-from aolink.jobs.follow import Following, Offer
 from aolink.jobs.identify import Wanted, from_readings
-from aolink.rig import Rig, load_rig, parse_rig
-from bench_rows.disturbances import by_model, played
+from aolink.rig import Rig, parse_rig
 from bench_rows.row import FULL, Effort, Row
 
 _KINDS = (
@@ -161,93 +157,6 @@ def _coverage(what: str, judge: Callable[[int], dict[str, bool]], seeds: Sequenc
             sum(hits) / max(least, 1.0), 1.0,
         ))  # fmt: skip
     return rows
-
-
-_FIRST_FOLLOWED = 40_000
-_CHANGED_AFTER = 80
-"""Exposures before the change."""
-
-
-@dataclass(frozen=True)
-class DisturbanceChange:
-    """A change of the disturbance of the rig `loop`, whose rig file keeps the old model."""
-
-    name: str
-    frequency: float = 1.0
-    """Factor of the vibration's frequency."""
-    sd: float = 1.0
-    """Factor of the gain of all its noise: of the sd of drift and vibration."""
-
-    def rig(self) -> Rig:
-        text = load_rig("loop").toml.replace("frequency_hz = 12.0", f"frequency_hz = {12.0 * self.frequency}")
-        return parse_rig(text.replace("\nsd = 0.1", f"\nsd = {0.1 * self.sd}"))
-
-
-_CHANGES = (
-    DisturbanceChange("vibration 10 % higher", frequency=1.1),
-    DisturbanceChange("vibration 10 % lower", frequency=0.9),
-    DisturbanceChange("vibration 20 % higher", frequency=1.2),
-    DisturbanceChange("vibration 20 % lower", frequency=0.8),
-    DisturbanceChange("gain of the noise times 3", sd=3.0),
-    DisturbanceChange("gain of the noise by 3", sd=1 / 3),
-)
-
-
-def following(effort: Effort) -> list[Row]:
-    """The offers of `aolink identify --follow` on the rig `loop` when its disturbance changes after 80 of 320
-    exposures.
-
-    There are 8 logs of each change, 16 without a change, and 8 of the rig `jitter`, with 320 exposures each.
-    """
-    exposures, seeds = effort.of(320, 4), range(_FIRST_FOLLOWED, _FIRST_FOLLOWED + effort.of(8))
-    rows = []
-    for rig, count in (("loop", 2 * len(seeds)), ("jitter", len(seeds))):
-        quiet = [_offers(list(aolink.simulate(rig, exposures, seed=_FIRST_FOLLOWED + k)), rig)[0] for k in range(count)]
-        right = sum(not each for each in quiet)
-        rows.append(Row(
-            f"{rig}, unchanged: logs without an offer", f"{right} of {count}", "all of them", right / count, 0.95,
-        ))  # fmt: skip
-    for change in _CHANGES:
-        logs = [_offers(changed(change, exposures, seed), "loop") for seed in seeds]
-        offered = [offers[0] for offers, _ in logs if offers]
-        truth = 12.0 * change.frequency
-        held = sum(_frequency(offer).holds(truth) for offer in offered)
-        off = [100 * abs(_frequency(offer).best / truth - 1) for offer in offered] or [math.nan]
-        later = [offer.frame_id - _CHANGED_AFTER for offer in offered]
-        when = f", {min(later)} to {max(later)} exposures later" if later else ""
-        missed = sum(each for _, each in logs)
-        rows.append(Row(
-            f"loop, {change.name}: logs with an offer", f"{len(offered)} of {len(logs)}{when}",
-            f"said not to fit in {missed}; frequency off by {np.median(off):.1f} %, at most {max(off):.1f} %; {held} of"
-            f" {len(offered)} sets hold the truth",
-            len(offered) / len(logs), 0.5,
-        ))  # fmt: skip
-    return rows
-
-
-def _offers(exposures: Sequence[Exposure], rig: str) -> tuple[list[Offer], bool]:
-    """The offers, and whether the rig file's model was found not to fit."""
-    job = Following(load_rig(rig), Wanted(), Path("identified.toml"))
-    news = [each for exposure in exposures for each in job.see(exposure)]
-    return [each for each in news if isinstance(each, Offer)], any(
-        each.fits is False for each in news if not isinstance(each, Offer)
-    )
-
-
-def _frequency(offer: Offer) -> Identified:
-    (found,) = offer.result.found
-    return next(each for each in found.parameters if each.name.endswith("frequency_hz"))
-
-
-def changed(change: DisturbanceChange, exposures: int, seed: int) -> list[Exposure]:
-    """A log of the rig `loop` whose disturbance goes on from the state that it is in when its model changes."""
-    rig, random = load_rig("loop"), np.random.default_rng(seed)
-    period = rig.timing.frame_period_steps
-    before, state = by_model(rig, _CHANGED_AFTER * period, random, None)
-    after, _ = by_model(change.rig(), (max(exposures - _CHANGED_AFTER, 0) + 2) * period, random, state)
-    with TemporaryDirectory() as folder:
-        disturbed = played(rig, np.concatenate([before, after]), Path(folder) / "rig.toml")
-        return list(aolink.simulate(disturbed, exposures, seed=seed))
 
 
 _PICTURES = 12

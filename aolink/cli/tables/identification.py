@@ -11,7 +11,6 @@ from rich.table import Table
 from aolink.identification import UNITS, Identified
 
 if TYPE_CHECKING:
-    from aolink.jobs.follow import Offer
     from aolink.jobs.identify import IdentifiedModel
 
 
@@ -32,25 +31,6 @@ def found(one: IdentifiedModel) -> Iterator[Table]:
         unit = UNITS.get(parameter.name.split(".")[-1], "")
         table.add_row(parameter.name, f"{parameter.best:.4g}", unit, set_text(parameter))
     yield table
-
-
-def offer_lines(offer: Offer) -> Iterator[str]:
-    """The offered model and the one that it replaces, with the gain in log-likelihood on exposures that neither was
-    fitted to."""
-    (first, last), (held_first, held_last) = offer.fitted, offer.held_out
-    yield (
-        f"{offer.path.name} is offered: it explains frames {held_first} to {held_last}, to which it was not fitted,"
-        f" better than {offer.before_name} ({offer.before_model}) does (log-likelihood {offer.log_likelihood:.1f}"
-        f" against {offer.before:.1f} nats); it was fitted to frames {first} to {last}"
-    )
-    for one in offer.result.found:
-        values = ", ".join(
-            f"{each.name} {each.best:.4g}{' ' * bool(unit)}{unit} ({set_text(each)})"
-            for each in one.parameters
-            for unit in [UNITS.get(each.name.split(".")[-1], "")]
-        )
-        yield f"{offer.path.name}, {one.output}: {one.model.name}: {values}"
-        yield from (f"note: {note}" for note in one.notes)
 
 
 def set_text(parameter: Identified) -> str:
