@@ -359,8 +359,6 @@ def test_a_folder_that_cannot_be_made_is_one_clear_line(
     ("words", "message"),
     [
         ("view {session} -o a.mcap", "cannot write a.mcap: what is written is a .rrd file"),
-        ("view {session} -o a.rrd -o b.rrd", "one file of a kind can be written: a.rrd, b.rrd"),
-        ("view {session} -o a.png -o b.png", "one file of a kind can be written: a.png, b.png"),
         ("slopes {frame} --reference {reference} -o a.txt", "cannot write a.txt: what is written is a .npz file"),
     ],
 )

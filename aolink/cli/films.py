@@ -1,6 +1,5 @@
 """Commands that bring other people's data in: import, and the film options that `aolink rig --from` shares."""
 
-import json
 import math
 from datetime import UTC, datetime
 from pathlib import Path
@@ -8,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
-from aolink.cli.common import JsonOption, OutputOption, OverwriteOption, app, progress, stdout
+from aolink.cli.common import OutputOption, OverwriteOption, app, progress, stdout
 from aolink.errors import ImportingError
 
 if TYPE_CHECKING:
@@ -170,7 +169,6 @@ def import_(
     at: AtOption = None,
     film: FilmOfImport = None,
     overwrite: OverwriteOption = False,
-    as_json: JsonOption = False,
 ) -> None:
     """Make a recording of a film: then estimate, replay, compare, deblur and view it like any other."""
     from aolink.importing.recording import import_film
@@ -183,9 +181,6 @@ def import_(
             shown, loaded, settings, output, overwrite=overwrite, sources=[source, Path(rig)],
             progress=tell,
         )  # fmt: skip
-    if as_json:
-        print(json.dumps({"out": str(output), **vars(account)}))
-        return
     for note in account.notes:
         stdout.print(f"note: {note}", markup=False)
     for count, what in (

@@ -21,7 +21,6 @@ from aolink.cli.common import (
 from aolink.errors import RecordingError
 
 if TYPE_CHECKING:
-    from aolink.recording.editing import Edited
     from aolink.recording.reader import Recording
 
 
@@ -32,11 +31,10 @@ CutTime = Annotated[float | None, typer.Option(metavar="S", help="Seconds from t
 def info(
     file: FileArgument,
     check: Annotated[bool, typer.Option("--check", help="Read every byte, not the index alone.")] = False,
-    every: Annotated[bool, typer.Option("--all", help="Print all facts.")] = False,
     log: Annotated[bool, typer.Option("--log", help="Print what the session said while it ran, line by line.")] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Summarise a recording. Exit code 1 if a part of it cannot be read."""
+    """Summarise a recording; --json has all facts. Exit code 1 if a part of it cannot be read."""
     from aolink.cli.tables import recordings as tables
     from aolink.recording.facts import log_lines, recording_facts
 
@@ -49,7 +47,7 @@ def info(
     if as_json:
         print(json.dumps(facts, allow_nan=False))
     else:
-        stdout.print(tables.facts(facts) if every else tables.summary(facts))
+        stdout.print(tables.summary(facts))
     if recording.damage:
         raise typer.Exit(1)
 
@@ -146,7 +144,6 @@ def copy(
     start: CutTime = None,
     end: CutTime = None,
     overwrite: OverwriteOption = False,
-    as_json: JsonOption = False,
 ) -> None:
     """Copy what is whole of a recording, a part of it between two times, or the parts of a session joined to one.
 
@@ -166,15 +163,6 @@ def copy(
             edited = editing.cut(files[0], output, start or 0.0, until, overwrite=overwrite, progress=tell)
         else:
             edited = editing.recover(files[0], output, overwrite=overwrite, progress=tell)
-    _print_edited(edited, as_json)
-    if edited.losses and not timed and len(files) == 1:
-        raise typer.Exit(1)
-
-
-def _print_edited(edited: "Edited", as_json: bool) -> None:
-    if as_json:
-        print(json.dumps({**asdict(edited), "path": str(edited.path)}))
-        return
     for loss in edited.losses:
         stdout.print(f"lost: {loss.text()}", markup=False)
     stdout.print(
@@ -182,3 +170,5 @@ def _print_edited(edited: "Edited", as_json: bool) -> None:
         + (f"; {sum(loss.count for loss in edited.losses)} part(s) of the source lost" if edited.losses else ""),
         markup=False,
     )
+    if edited.losses and not timed and len(files) == 1:
+        raise typer.Exit(1)

@@ -1,6 +1,5 @@
 """Commands that take blur out of pictures: deblur."""
 
-import json
 import math
 import os
 from collections.abc import Sequence
@@ -8,10 +7,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from typer.core import TyperCommand, TyperOption
 
 from aolink.cli import common
-from aolink.cli.common import JsonOption, OverwriteOption, app, check_measured, open_recording, stdout
+from aolink.cli.common import OverwriteOption, app, check_measured, open_recording, stdout
 from aolink.errors import RestorationError
 from aolink.files import check_target
 
@@ -19,27 +17,7 @@ if TYPE_CHECKING:
     from aolink.restoration.films import PathClock
 
 
-class _NamingMethods(TyperCommand):
-    """An option whose help names all methods: installed packages are searched for them when the help is shown."""
-
-    def format_help(self, *arguments: Any, **named: Any) -> None:
-        from aolink.restoration import METHODS, find_method
-        from aolink.restoration.registry import DEFAULT_METHOD
-
-        def described(name: str) -> str:
-            try:
-                return f"{name} ({find_method(name).summary})"
-            except RestorationError as error:
-                return f"{name} ({error})"
-
-        for each in self.params:
-            if isinstance(each, TyperOption) and each.name == "method":
-                each.help, each.default = f"{'; '.join(map(described, METHODS))}.", DEFAULT_METHOD
-        super().format_help(*arguments, **named)
-
-
 @app.command(
-    cls=_NamingMethods,
     epilog="Example: aolink deblur session.mcap -e moments -o sharp.mcap"
     "  |  aolink deblur moved.png --psf psf.csv -o sharp.png",
 )
@@ -90,7 +68,14 @@ def deblur(
         float | None,
         typer.Option(metavar="S", help="With --path: exposure time of the pictures, where their file lacks it."),
     ] = None,
-    method: Annotated[str | None, typer.Option(metavar="NAME", help="The restoration method.")] = None,
+    method: Annotated[
+        str,
+        typer.Option(
+            metavar="NAME",
+            help="tv keeps edges; pnp is the best, and slow; gauss_markov is for smooth scenes; smoother, lag, inverse,"
+            " filter and predictor are for motion along lines; or another package's.",
+        ),
+    ] = "tv",
     noise_sd: Annotated[
         float | None,
         typer.Option(
@@ -98,27 +83,22 @@ def deblur(
         ),
     ] = None,
     overwrite: OverwriteOption = False,
-    as_json: JsonOption = False,
 ) -> None:
     """Remove the motion blur from every picture of a recording, or from a single picture with a known PSF."""
     from aolink.estimation.registry import DEFAULT_ESTIMATOR
     from aolink.restoration.films import PathClock
-    from aolink.restoration.registry import DEFAULT_METHOD
 
-    method = method or DEFAULT_METHOD
     blur = psf or path
     if file is None or (psf and path) or (noise_sd and not blur):
         raise typer.BadParameter("give a recording alone, or a picture with --psf or --path (--noise-sd is for these)")
     if blur is None:
-        _deblur_recording(file, out, estimator or DEFAULT_ESTIMATOR, method, overwrite=overwrite, as_json=as_json)
+        _deblur_recording(file, out, estimator or DEFAULT_ESTIMATOR, method, overwrite=overwrite)
     else:
         clock = PathClock(offset, exposure) if psf is None else None
-        _deblur_pictures(file, blur, clock, out, method, noise_sd, overwrite=overwrite, as_json=as_json)
+        _deblur_pictures(file, blur, clock, out, method, noise_sd, overwrite=overwrite)
 
 
-def _deblur_recording(
-    file: Path, out: Path, estimator: str, method: str, *, overwrite: bool, as_json: bool,
-) -> None:  # fmt: skip
+def _deblur_recording(file: Path, out: Path, estimator: str, method: str, *, overwrite: bool) -> None:
     from aolink.cli.tables import sessions as tables
     from aolink.recording.deblur import write_deblurred
 
@@ -128,18 +108,15 @@ def _deblur_recording(
             recording, out, estimator=estimator, method=method, overwrite=overwrite,
             workers=os.cpu_count() or 1, progress=tell,
         )  # fmt: skip
-    if as_json:
-        print(json.dumps({"out": str(out), "estimator": estimator, "method": method, **tables.deblurred(summary)}))
-    else:
-        for line in tables.deblurred_lines(summary, estimator, method):
-            stdout.print(line, markup=False)
-        stdout.print(f"written: {out}", markup=False)
+    for line in tables.deblurred_lines(summary, estimator, method):
+        stdout.print(line, markup=False)
+    stdout.print(f"written: {out}", markup=False)
     check_measured(file, {estimator: summary.motion.result()})
 
 
 def _deblur_pictures(
     image: Path, blur: Path, clock: "PathClock | None", out: Path, method: str, noise_sd: float | None, *,
-    overwrite: bool, as_json: bool,
+    overwrite: bool,
 ) -> None:  # fmt: skip
     from aolink.cli.tables.sessions import adds_error
     from aolink.films.pictures import read_film, read_psf, write_pictures
@@ -157,25 +134,13 @@ def _deblur_pictures(
     done = restored_film(film, psfs, method, noise_sd)
     write_pictures(out, done.pictures, film, overwrite=overwrite, sources=[image, blur])
     last = done.last
-    if as_json:
-        found = None if math.isnan(last.noise_sd) else last.noise_sd
-        gain = None if math.isnan(last.expected_gain_db) else last.expected_gain_db
-        facts: dict[str, Any] = {
-            "method": method,
-            "noise_sd": found,
-            "direction": last.direction,
-            "pixels_filled": done.missing,
-        }
-        facts |= {"pixels_saturated": done.saturated, "pictures": len(done.pictures), "warnings": notes}
-        print(json.dumps({"out": str(out), **facts, "expected_gain_db": gain}))
-    else:
-        noise = "" if math.isnan(last.noise_sd) else f", noise sd {last.noise_sd:.3g}"
-        scanned = f", scanned {last.direction}s" if "direction" in find_method(method).parameters else ""
-        filled = f", {done.missing} pixels that are not numbers filled in" if done.missing else ""
-        filled += f", {done.saturated} saturated pixels left out" if done.saturated else ""
-        several = f", {len(done.pictures)} pictures" if len(done.pictures) > 1 else ""
-        stdout.print(f"{out}: {method}{several}{noise}{scanned}{filled}", markup=False)
-        for note in notes:
-            stdout.print(f"warning: {note}", markup=False)
-        for line in adds_error(method, last.expected_gain_db):
-            stdout.print(line, markup=False)
+    noise = "" if math.isnan(last.noise_sd) else f", noise sd {last.noise_sd:.3g}"
+    scanned = f", scanned {last.direction}s" if "direction" in find_method(method).parameters else ""
+    filled = f", {done.missing} pixels that are not numbers filled in" if done.missing else ""
+    filled += f", {done.saturated} saturated pixels left out" if done.saturated else ""
+    several = f", {len(done.pictures)} pictures" if len(done.pictures) > 1 else ""
+    stdout.print(f"{out}: {method}{several}{noise}{scanned}{filled}", markup=False)
+    for note in notes:
+        stdout.print(f"warning: {note}", markup=False)
+    for line in adds_error(method, last.expected_gain_db):
+        stdout.print(line, markup=False)

@@ -89,8 +89,6 @@ class Method:
     """One row of the registry: a restoration method."""
 
     name: str
-    summary: str
-    """The method in a few words."""
     restore: Callable[..., Restored]
     """The function: it takes a `Blurred`, and by name those of `parameters` that the caller gives."""
     why_not: Callable[[Blurred], str | None] = lambda blurred: None

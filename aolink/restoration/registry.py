@@ -18,9 +18,9 @@ GROUP = "aolink.restorations"
 DEFAULT_METHOD = "tv"
 
 
-def _on_lines(name: str, summary: str) -> Method:
+def _on_lines(name: str) -> Method:
     return Method(
-        name=name, summary=f"on lines: {summary}", restore=partial(kalman_estimate, which=name), why_not=why_not_lines,
+        name=name, restore=partial(kalman_estimate, which=name), why_not=why_not_lines,
         parameters=("boundary", "scanner", "direction"),
     )  # fmt: skip
 
@@ -28,22 +28,18 @@ def _on_lines(name: str, summary: str) -> Method:
 _OURS = {
     row.name: row
     for row in (
-        Method(name="tv", summary="total variation, keeps edges", restore=tv),
+        Method(name="tv", restore=tv),
+        Method(name="pnp", restore=pnp, why_not=why_not_pnp, parameters=("denoise",)),
+        Method(name="gauss_markov", restore=gauss_markov),
+        _on_lines("smoother"),
+        _on_lines("lag"),
         Method(
-            name="pnp", summary="plug and play with a denoiser: the best, and slow", restore=pnp, why_not=why_not_pnp,
-            parameters=("denoise",),
+            name="inverse", restore=inverse, why_not=why_not_inverse, parameters=("boundary", "scanner", "direction")
         ),
-        Method(name="gauss_markov", summary="linear, for smooth scenes", restore=gauss_markov),
-        _on_lines("smoother", "Kalman smoother, from all pixels of the line"),
-        _on_lines("lag", "Kalman filter, a PSF's length behind"),
-        Method(
-            name="inverse", summary="on lines: exact, for pictures without noise", restore=inverse,
-            why_not=why_not_inverse, parameters=("boundary", "scanner", "direction"),
-        ),
-        _on_lines("filter", "Kalman filter, from the pixels up to each; rarely better than the blurred picture"),
-        _on_lines("predictor", "Kalman predictor, from the pixels before each; hardly ever better"),
+        _on_lines("filter"),
+        _on_lines("predictor"),
     )
-}  # fmt: skip
+}
 
 
 def method_names() -> tuple[str, ...]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from pathlib import Path
 
@@ -62,11 +61,9 @@ def test_notes_and_warnings_are_printed(aolink, rig, tmp_path):
         " are masked",
         "a.mcap: 7 exposures of 7 frames",
     ]
-    made = aolink("import", source, "-o", "b.mcap", "--rig", rig, "--film", "scale=300", "--json")
-    said = json.loads(made.stdout)
-    assert said["out"] == "b.mcap"
-    assert (said["frames"], said["exposures"], said["pixels"], said["saturated"]) == (7, 7, 448, 4)
-    assert said["clipped"] == np.count_nonzero((frames > 65_535 / 300) & (frames < 255))
+    made = aolink("import", source, "-o", "b.mcap", "--rig", rig, "--film", "scale=300")
+    clipped = np.count_nonzero((frames > 65_535 / 300) & (frames < 255))
+    assert f"warning: {clipped} pixel" in made.stdout
 
 
 def test_a_film_without_its_dark_level_is_told_of_the_option(aolink, rig, tmp_path):

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from aolink.errors import RestorationError
-from aolink.restoration import METHODS, find_method, restore
+from aolink.restoration import restore
 from aolink.restoration.deblur import psnr
 from tests.restoration.scenes import UNIFORM, blocks, blurred
 
@@ -44,19 +44,6 @@ def test_a_method_of_another_package_restores_a_picture(
     inside = np.s_[:, 8:-8]
     restored = np.load(tmp_path / "out.npy")
     assert psnr(restored[inside], scene[inside]) > psnr(image[inside], scene[inside]) + 3
-
-
-@pytest.mark.slow
-def test_the_help_names_the_methods_of_other_packages_and_what_is_wrong_with_one(
-    aolink: Run, with_packages: dict[str, str],
-) -> None:  # fmt: skip
-    help_page = aolink("deblur", "--help", env=with_packages)
-    assert help_page.returncode == 0
-    text = " ".join(help_page.stdout.replace("│", " ").split())
-    for name in METHODS:
-        assert f"{name} ({find_method(name).summary})" in text
-    assert "richardson_lucy (for counted light)" in text
-    assert "the restoration method gone of broken (no_such_module:method) cannot be loaded: ModuleNotFoundError" in text
 
 
 @pytest.mark.slow

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import json
 import shutil
 import subprocess
 from collections.abc import Callable
@@ -401,11 +400,10 @@ def test_what_cannot_be_restored_says_why(session: Path, tmp_path: Path) -> None
 @pytest.mark.slow
 def test_the_command_deblurs_a_recording(aolink: Run, session: Path, tmp_path: Path) -> None:
     shutil.copy(session, tmp_path / "a.mcap")
-    done = aolink("deblur", "a.mcap", "-e", "o1", "--method", "gauss_markov", "-o", "b.mcap", "--json")
+    done = aolink("deblur", "a.mcap", "-e", "o1", "--method", "gauss_markov", "-o", "b.mcap")
     assert done.returncode == 0, done.stderr
-    printed = json.loads(done.stdout)
-    assert (printed["exposures"], printed["scenes_restored"], printed["missing"]) == (EXPOSURES, EXPOSURES, {})
-    assert printed["psnr_restored_db"] >= printed["psnr_restored_least_db"]
+    assert f"{EXPOSURES} scenes of {EXPOSURES} exposures restored" in done.stdout
+    assert "not restored" not in done.stdout
     worse = aolink("deblur", "a.mcap", "-e", "o1", "--method", "predictor", "-o", "worse.mcap")
     assert "predictor leaves more error than the blurred picture has, by its own model" in worse.stdout
     again = aolink("deblur", "a.mcap", "-e", "o1", "-o", "b.mcap")

@@ -27,7 +27,7 @@ _ODD = (
 
 
 def summary(values: Mapping[str, Any]) -> Table:
-    """What a session was, what was lost and what is odd, in some ten lines; `facts` has all."""
+    """What a session was, what was lost and what is odd, in some ten lines; `recording_facts` has all."""
     table = Table(box=None, show_header=False, pad_edge=False)
     table.add_column(no_wrap=True)
     table.add_column(overflow="fold")
@@ -62,43 +62,6 @@ def summary(values: Mapping[str, Any]) -> Table:
         if text:
             table.add_row(name, escape(text))
     return table
-
-
-def facts(values: Mapping[str, Any]) -> Table:
-    """Name and value, line by line, in the units that people read; `recording_facts` has the numbers."""
-    table = Table(box=None, show_header=False, pad_edge=False)
-    table.add_column(no_wrap=True)
-    table.add_column(overflow="fold")
-    virtual = " (the rig's own time)" if values["session"].get("virtual_time") is True else ""
-    begun = (values["start_utc"] or f"{values['start_ns']} ns since 1970").replace("T", " ").replace("+00:00", " UTC")
-    readable = {
-        "file": values["file"], "size": with_unit(values["bytes"], "B"), "recorded": f"{begun}{virtual}",
-        "duration": duration(values["duration_s"]),
-    }  # fmt: skip
-    left_out = {"bytes", "start_ns", "start_utc", "duration_s", "session", "estimators", "estimates", "answers"}
-    flat = readable | {name: value for name, value in values.items() if name not in left_out}
-    flat["estimates"] = ", ".join(f"{name} {each['count']}" for name, each in values["estimates"].items()) or "none"
-    for name, value in (flat | {k: v for k, v in values["session"].items() if k != "estimators"}).items():
-        if name in ("damage", "warnings", "commands", "camera_lacks", "mirror_lacks") and not value:
-            continue
-        if isinstance(value, Mapping):
-            value = ", ".join(f"{key} {count}" for key, count in value.items()) or "none"
-        elif isinstance(value, list):
-            value = " ".join(value) or "none"
-        table.add_row(*map(escape, _readable(name, value)))
-        for line in _unused(values["estimates"]) if name == "estimates" else ():
-            table.add_row("", escape(line))
-    for line in Answers.of(values["answers"]).lines():
-        table.add_row("answers", escape(line))
-    return table
-
-
-def _readable(name: str, value: Any) -> tuple[str, str]:
-    """A number whose name ends in its unit, with a unit that makes it short."""
-    for ending, unit, factor in (("_ns", "s", 1e-9), ("_s", "s", 1.0), ("_ppm", "ppm", 1.0)):
-        if name.endswith(ending) and isinstance(value, int | float):
-            return name.removesuffix(ending), f"{value:.4g} ppm" if unit == "ppm" else with_unit(factor * value, unit)
-    return name, str(value)
 
 
 def _unused(estimates: Mapping[str, Any]) -> list[str]:

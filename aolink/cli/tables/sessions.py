@@ -142,39 +142,24 @@ def _latency_ms(latencies: Sequence[pb.Latency], since: str, until: str) -> list
     return [len(values), *map(float, np.percentile(values, [50, 99]))] if values else [0.0]
 
 
-def deblurred(summary: RestoredCounts) -> dict[str, Any]:
-    """The results for restored pictures; PSNRs are means over the scenes, None where the true scene is not known."""
-    blurred, restored = summary.psnr_blurred, summary.psnr_restored
-    return {
-        "exposures": summary.exposures,
-        "exposures_measured": summary.motion.result().measured,
-        "scenes_restored": summary.scenes,
-        "missing": dict(summary.reasons),
-        "psnr_blurred_db": float(np.mean(blurred)) if blurred else None,
-        "psnr_restored_db": float(np.mean(restored)) if restored else None,
-        "psnr_restored_least_db": min(restored) if restored else None,
-        "expected_gain_db": float(np.mean(summary.expected_gains)) if summary.expected_gains else None,
-    }
-
-
 def deblurred_lines(summary: RestoredCounts, estimator: str, method: str) -> list[str]:
-    """The results for restored pictures, in words."""
-    facts = deblurred(summary)
-    scenes = f"{facts['scenes_restored']} scenes" if facts["scenes_restored"] else f"spots in {summary.spots}"
-    lines = [f"{scenes} of {facts['exposures']} exposures restored with the path of {estimator}, {method}"]
-    if facts["psnr_blurred_db"] is not None:
+    """The results for restored pictures, in words; PSNRs are means over the scenes."""
+    scenes = f"{summary.scenes} scenes" if summary.scenes else f"spots in {summary.spots}"
+    lines = [f"{scenes} of {summary.exposures} exposures restored with the path of {estimator}, {method}"]
+    if summary.psnr_restored:
         lines.append(
-            f"PSNR of the scene: {facts['psnr_blurred_db']:.1f} dB as recorded (shift removed),"
-            f" {facts['psnr_restored_db']:.1f} dB restored (at least {facts['psnr_restored_least_db']:.1f})"
+            f"PSNR of the scene: {np.mean(summary.psnr_blurred):.1f} dB as recorded (shift removed),"
+            f" {np.mean(summary.psnr_restored):.1f} dB restored (at least {min(summary.psnr_restored):.1f})"
         )
-    lines += adds_error(method, facts["expected_gain_db"])
+    if summary.expected_gains:
+        lines += adds_error(method, float(np.mean(summary.expected_gains)))
     lines += unused_lines({estimator: summary.motion.result()})
     return lines + [f"{count} not restored: {reason}" for reason, count in summary.reasons.items()]
 
 
-def adds_error(method: str, expected_gain_db: float | None) -> list[str]:
+def adds_error(method: str, expected_gain_db: float) -> list[str]:
     """A line where a method expects to make a picture worse."""
-    if expected_gain_db is None or not expected_gain_db < 0:
+    if not expected_gain_db < 0:
         return []
     return [
         f"{method} leaves more error than the blurred picture has, by its own model ({expected_gain_db:.1f} dB): take"
@@ -206,8 +191,8 @@ def demo_sentence(result: DemoResult) -> str:
         left = ", ".join(f"{name} {value:.4g}" for name, value in result.residuals.items())
         parts.append(f"the slopes left are, rms, {left}")
     if result.deblurred is not None and result.deblurred.psnr_restored:
-        facts = deblurred(result.deblurred)
-        parts.append(f"the scene goes from {facts['psnr_blurred_db']:.1f} to {facts['psnr_restored_db']:.1f} dB (PSNR)")
+        before, after = np.mean(result.deblurred.psnr_blurred), np.mean(result.deblurred.psnr_restored)
+        parts.append(f"the scene goes from {before:.1f} to {after:.1f} dB (PSNR)")
     text = "; ".join(parts or ["the truth is not known here, and so no error either"])
     return f"{text[0].upper()}{text[1:]}."
 

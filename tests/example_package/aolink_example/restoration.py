@@ -24,6 +24,4 @@ def _why_not(picture: Blurred) -> str | None:
     return "richardson_lucy needs one PSF for the whole picture: use tv" if picture.psf.varies else None
 
 
-richardson_lucy = Method(
-    name="richardson_lucy", summary="for counted light", restore=_restore, why_not=_why_not, parameters=("iterations",)
-)
+richardson_lucy = Method(name="richardson_lucy", restore=_restore, why_not=_why_not, parameters=("iterations",))
