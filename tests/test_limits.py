@@ -14,10 +14,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from aolink import limits
 from aolink.errors import FrameError, ImportingError, RestorationError
 from aolink.films.formats import open_film
 from aolink.films.pictures import read_frame, read_picture
-from aolink.limits import VARIABLE, limits, load_array
+from aolink.limits import load_array
 
 Run = Callable[..., subprocess.CompletedProcess[str]]
 CARDS = ("SIMPLE  =                    T", "BITPIX  =                    8", "NAXIS   =                    2")
@@ -50,7 +51,7 @@ def test_a_small_fits_file_that_holds_gigabytes_is_refused(tmp_path: Path, monke
             file.write(bytes(1 << 20))
     assert path.stat().st_size < 1 << 20
     assert read_frame(path, FrameError).shape == (8192, 8192)
-    monkeypatch.setenv(VARIABLE, "unpacked_bytes=3e7")
+    monkeypatch.setattr(limits, "_UNPACKED_BYTES", 30_000_000)
     for error in (FrameError, ImportingError):
         with pytest.raises(error, match="very much more than its size without compression, which is above the limit"):
             read_frame(path, error)
@@ -68,7 +69,7 @@ def test_a_picture_with_too_many_pixels_is_refused_before_they_are_read(tmp_path
 def test_an_archive_that_holds_more_than_it_should_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     np.savez_compressed(tmp_path / "a.npz", frames=np.zeros((100, 100, 100)))
     assert open_film(tmp_path / "a.npz").count == 100
-    monkeypatch.setenv(VARIABLE, "unpacked_bytes=1e6")
+    monkeypatch.setattr(limits, "_UNPACKED_BYTES", 1_000_000)
     with pytest.raises(ImportingError, match=r"it holds 8000\d* bytes without compression, which is above the limit"):
         open_film(tmp_path / "a.npz")
 
@@ -96,13 +97,6 @@ def test_an_array_holds_what_its_header_says(tmp_path: Path) -> None:
         archive.writestr("frames.npy", data)
     with pytest.raises(ImportingError, match="it is cut off"):
         open_film(tmp_path / "a.npz")
-
-
-def test_the_limits_are_those_of_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
-    usual = limits()
-    monkeypatch.setenv(VARIABLE, "picture_pixels=1e9, chunk_bytes=2000")
-    assert (limits().picture_pixels, limits().chunk_bytes) == (10**9, 2000)
-    assert limits().record_bytes == usual.record_bytes
 
 
 @pytest.mark.slow

@@ -20,7 +20,7 @@ from aolink.estimation import ExposureModel
 from aolink.estimation.estimate import LARGE, AlignmentError, Estimate, Status
 from aolink.estimation.verdict import Fit, Verdict
 from aolink.exposure import Exposure, Truth
-from aolink.limits import limits
+from aolink.limits import CHUNK_BYTES
 from aolink.numerics.covariance import CORRELATION_STEP, correlation_steps, from_correlation_steps
 from aolink.recording import schemas_pb2 as pb
 from aolink.wire import messages_pb2 as wire
@@ -176,7 +176,7 @@ def is_compressed(data: bytes, axes: int, n: int) -> bool:
         size = zstandard.get_frame_parameters(data).content_size
     except zstandard.ZstdError:
         return False
-    return 8 * axes * n * n <= limits().chunk_bytes and size == axes * (4 * n + 3 * (n * (n - 1) // 2))
+    return 8 * axes * n * n <= CHUNK_BYTES and size == axes * (4 * n + 3 * (n * (n - 1) // 2))
 
 
 def decoded(data: bytes, axes: int, n: int) -> NDArray[np.float64]:

@@ -15,7 +15,7 @@ from mcap.records import Attachment, Channel, ChunkIndex, McapRecord, Metadata, 
 from mcap.records import Message as McapMessage
 
 from aolink.errors import RecordingError
-from aolink.limits import Budget, exceeded, limits
+from aolink.limits import ATTACHMENT_BYTES, Budget, exceeded
 from aolink.recording import topics
 from aolink.recording.mcap_file import unsealed
 from aolink.recording.scan import Loss, Summary, chunk_at, open_recording, read_summary, record_at, scan
@@ -196,8 +196,8 @@ class RecordedMessages:
     def _attach(self, record: Attachment) -> None:
         self.attachments[record.name] = record.data
         self._attached_bytes += len(record.data)
-        if self._attached_bytes > limits().attachment_bytes:
-            raise exceeded(f"{self.path} holds attachments of {self._attached_bytes} bytes", "attachment_bytes")
+        if self._attached_bytes > ATTACHMENT_BYTES:
+            raise exceeded(f"{self.path} holds attachments of {self._attached_bytes} bytes", ATTACHMENT_BYTES)
 
     def note_metadata(self, records: Sequence[Metadata]) -> None:
         """Keep the facts in the file's metadata."""

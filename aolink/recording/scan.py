@@ -29,7 +29,7 @@ from mcap.records import AttachmentIndex, Channel, Chunk, ChunkIndex, McapRecord
 from mcap.records import Message as McapMessage
 
 from aolink.errors import RecordingError
-from aolink.limits import Budget, exceeded, limits
+from aolink.limits import ATTACHMENT_BYTES, CHUNK_BYTES, RECORD_BYTES, Budget, exceeded
 from aolink.recording.search import HEAD, MESSAGE_HEAD, Search, begins_a_record, is_plausible
 
 _MOST_READINGS = 4
@@ -154,7 +154,7 @@ def read_summary(file: IO[bytes]) -> Summary | None:
     if not tail.endswith(MAGIC) or (opcode, length) != (Opcode.FOOTER, 20) or start > end:
         return None
     start = start or end
-    if end - start > limits().record_bytes:
+    if end - start > RECORD_BYTES:
         return None
     file.seek(start)
     data = file.read(end - start)
@@ -283,7 +283,7 @@ def chunk_at(
 ) -> Iterator[McapRecord]:
     """The records in a chunk that the summary names; none if it is damaged."""
     opcode, length = _head_at(file, index.chunk_start_offset)
-    if opcode != Opcode.CHUNK or length > limits().record_bytes:
+    if opcode != Opcode.CHUNK or length > RECORD_BYTES:
         on_loss(_chunk_loss(index.chunk_start_offset, index.chunk_length, index))
         return
     record = _record_at(file, index.chunk_start_offset, on_loss, budget)
@@ -297,7 +297,7 @@ def record_at(
     """An attachment or metadata that the summary names; None, and a loss, if it is damaged."""
     kind = Opcode.ATTACHMENT if isinstance(index, AttachmentIndex) else Opcode.METADATA
     opcode, length = _head_at(file, index.offset)
-    if opcode == kind and length <= limits().record_bytes:
+    if opcode == kind and length <= RECORD_BYTES:
         return _record_at(file, index.offset, on_loss, budget)
     on_loss(Loss(index.offset, index.length, f"the {kind.name.lower()} {index.name!r} is damaged"))
     return None
@@ -381,8 +381,8 @@ def _record_at(file: IO[bytes], position: int, on_loss: Callable[[Loss], None], 
     _charge(budget, opcode, length)
     if opcode not in _PARSERS and opcode != Opcode.MESSAGE:
         return None
-    if opcode == Opcode.ATTACHMENT and length > limits().attachment_bytes:
-        raise exceeded(f"it holds an attachment of {length} bytes", "attachment_bytes")
+    if opcode == Opcode.ATTACHMENT and length > ATTACHMENT_BYTES:
+        raise exceeded(f"it holds an attachment of {length} bytes", ATTACHMENT_BYTES)
     content = file.read(length)
     try:
         record = _parsed(opcode, content)
@@ -399,7 +399,7 @@ def _record_at(file: IO[bytes], position: int, on_loss: Callable[[Loss], None], 
 
 def _decompressed(chunk: Chunk, budget: Budget) -> bytes:
     """The content of a chunk. Its stated and its real size may differ: neither may fill the memory."""
-    if chunk.uncompressed_size > limits().chunk_bytes:
+    if chunk.uncompressed_size > CHUNK_BYTES:
         raise ValueError(f"a chunk of {chunk.uncompressed_size} bytes")
     budget.take_bytes(chunk.uncompressed_size)
     data = chunk.data

@@ -9,7 +9,7 @@ from typing import IO
 
 from mcap.opcode import Opcode
 
-from aolink.limits import limits
+from aolink.limits import RECORD_BYTES
 
 HEAD = struct.Struct("<BQ")
 """Kind and length of a record."""
@@ -39,8 +39,8 @@ def is_plausible(opcode: int, length: int, file: IO[bytes], before: int) -> bool
         is_index = len(rest) == 6 and length == 6 + struct.unpack_from("<I", rest, 2)[0]
         return is_index is (opcode == Opcode.MESSAGE_INDEX)
     if opcode == Opcode.MESSAGE:
-        return MESSAGE_HEAD.size <= length <= limits().record_bytes
-    return opcode in _KINDS and length <= limits().record_bytes and _LENGTHS.get(opcode, length) == length
+        return MESSAGE_HEAD.size <= length <= RECORD_BYTES
+    return opcode in _KINDS and length <= RECORD_BYTES and _LENGTHS.get(opcode, length) == length
 
 
 def begins_a_record(file: IO[bytes], position: int, size: int) -> bool:
@@ -87,7 +87,7 @@ class Search:
         """Whether the bytes there can be a valid record."""
         data = self._data[position - self._start :][:_LOOK_BYTES]
         opcode, length = HEAD.unpack_from(data)
-        if position + HEAD.size + length > self._size or length > limits().record_bytes:
+        if position + HEAD.size + length > self._size or length > RECORD_BYTES:
             return False
         if opcode == Opcode.METADATA:
             (name_length,) = struct.unpack_from("<I", data, HEAD.size)

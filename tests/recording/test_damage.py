@@ -25,7 +25,7 @@ from mcap.stream_reader import StreamReader
 from mcap.writer import IndexType, Writer
 
 from aolink.errors import AolinkError, RecordingError
-from aolink.limits import Budget, limits
+from aolink.limits import CHUNK_BYTES, Budget
 from aolink.recording import schemas_pb2 as pb
 from aolink.recording import topics
 from aolink.recording.editing import recover
@@ -300,7 +300,7 @@ def test_small_messages_in_a_large_chunk_cost_no_memory() -> None:
     tracemalloc.stop()
     assert (count, losses) == (len(data) // len(message), [])
     assert peak < 4 * len(data)
-    huge = Chunk("zstd", b"", 1, 1, 0, limits().chunk_bytes + 1)
+    huge = Chunk("zstd", b"", 1, 1, 0, CHUNK_BYTES + 1)
     assert list(broken_up(huge, 0, losses.append, Budget("a", 8 << 20))) == []
     assert len(losses) == 1
 

@@ -6,7 +6,6 @@ import contextlib
 import os
 import struct
 import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -20,7 +19,6 @@ from mcap.opcode import Opcode
 from mcap.writer import Writer
 
 from aolink.errors import RecordingError, RigError
-from aolink.limits import VARIABLE
 from aolink.recording import schemas_pb2 as pb
 from aolink.recording import topics
 from aolink.recording.mcap_file import McapFile, WriteOptions, schema_of
@@ -111,9 +109,7 @@ def in_place_of_the_end(path: Path) -> tuple[bytes, int]:
 
 
 @pytest.mark.slow
-def test_a_small_file_with_millions_of_messages_is_refused_at_once(
-    aolink: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_small_file_with_millions_of_messages_is_refused_at_once(aolink: Run, tmp_path: Path) -> None:
     message = struct.pack("<BQHIQQ", Opcode.MESSAGE, 22, 1, 1, 1, 1)
     data = message * ((16 << 20) // len(message))
     packed = zstandard.compress(data)
@@ -124,10 +120,7 @@ def test_a_small_file_with_millions_of_messages_is_refused_at_once(
         done = aolink(*command)
         assert done.returncode == 5
         assert "very many tiny records" in done.stderr
-        assert "AOLINK_LIMITS=records_per_kilobyte=NUMBER" in done.stderr
     assert not (tmp_path / "b.mcap").exists()
-    monkeypatch.setenv(VARIABLE, "records_per_kilobyte=1e6")
-    assert sum(Recording(path).counts.values()) == 0  # of a channel that the file does not name
 
 
 @pytest.mark.slow
@@ -168,7 +161,7 @@ def test_metadata_that_are_holes_are_refused(tmp_path: Path) -> None:
             file.seek(0, os.SEEK_END)
             file.write(struct.pack("<BQ", Opcode.METADATA, len(head) + (20 << 20)) + head)
             file.truncate(file.tell() + (20 << 20))
-    with pytest.raises(RecordingError, match=r"very long metadata, channels or schemas, .* of 33554432 for"):
+    with pytest.raises(RecordingError, match="very long metadata, channels or schemas"):
         Recording(path)
 
 
@@ -228,18 +221,6 @@ def test_no_text_of_a_file_steers_the_terminal(aolink: Run, tmp_path: Path) -> N
     assert done.returncode == 0
     assert "owned" in done.stdout
     assert not {"\x1b", "\x07", "\x9b"} & set(done.stdout + done.stderr)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("value", "said"), [("records=5", "is no limit"), ("chunk_bytes=much", "is no limit")])
-def test_limits_that_are_none_are_one_error(tmp_path: Path, value: str, said: str) -> None:
-    done = subprocess.run(
-        [sys.executable, "-m", "aolink", "info", rig_only(tmp_path / "a.mcap")],
-        env={**os.environ, VARIABLE: value}, capture_output=True, text=True,
-    )  # fmt: skip
-    assert done.returncode == 5
-    assert said in done.stderr
-    assert "Traceback" not in done.stderr
 
 
 @pytest.mark.parametrize("what", ["attachment", "metadata"])

@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
+from aolink import limits
 from aolink.errors import RigError
 from aolink.optics.turbulence import Layer
 from aolink.rig import load_rig, parse_rig
@@ -110,7 +111,7 @@ def test_a_table_that_is_above_the_limit_is_refused(tmp_path, monkeypatch):
     np.savetxt(tmp_path / "wind.csv", np.zeros((100, 2)), delimiter=",")
     rig = parse_rig(TILT.toml.split("[disturbance]")[0] + '[disturbance]\nrecorded = "wind.csv"\n', tmp_path)
     RigPhysics(rig)
-    monkeypatch.setenv("AOLINK_LIMITS", "unpacked_bytes=1000")
+    monkeypatch.setattr(limits, "_UNPACKED_BYTES", 1000)
     with pytest.raises(RigError, match=r"wind\.csv has \d+ bytes, which is above the limit of 1000"):
         RigPhysics(rig)
 
