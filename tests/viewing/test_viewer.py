@@ -14,16 +14,18 @@ import psutil
 import pytest
 
 from aolink.errors import ViewerError
+from aolink.recording.reader import Recording
 from aolink.viewing import open_viewer, serve_web
 from aolink.viewing.process import WEB_PORT, free_port, is_free
 from aolink.viewing.save import save_rrd
 from tests.commands import command_server
-from tests.viewing.stand_in import StandIn, as_recording
+
+LIVELY = Path(__file__).parents[2] / "recordings" / "section-vi-lively.mcap"
 
 
 @pytest.fixture(scope="module")
 def rrd(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return save_rrd(as_recording(StandIn(n=4)), tmp_path_factory.mktemp("rrd") / "session.rrd")
+    return save_rrd(Recording(LIVELY), tmp_path_factory.mktemp("rrd") / "session.rrd")
 
 
 @pytest.fixture(autouse=True)
