@@ -38,7 +38,6 @@ from tests.kinds import must_be
 from tests.needs import needed
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tools"))
-from paper_report.spot_films import random_walk, spot_film
 
 ROOT = Path(__file__).parents[1]
 PAGES = sorted(
@@ -161,10 +160,9 @@ def laboratory(tmp_path_factory: pytest.TempPathFactory) -> Path:
     scene = np.asarray(Image.open(rigs / "moving-scene.png").convert("L").resize((96, 96)))
     Image.fromarray(scene).save(folder / "moved.png")
     frames = np.stack([each.pixels for each in simulate(rig, 6)])
-    np.savez(folder / "film.npz", frames=frames, rate_hz=1 / (rig.timing.frame_period_steps * rig.timing.fast_step_s))
-    rng = np.random.default_rng(1)
-    beads = spot_film(rng, random_walk(rng, 80, 2, 0.5), np.array([[24.0, 32.0], [70.0, 30.0]]))
-    tifffile.imwrite(folder / "beads.tif", beads.frames)
+    rate = 1 / (rig.timing.frame_period_steps * rig.timing.fast_step_s)
+    np.savez(folder / "film.npz", frames=frames, rate_hz=rate)
+    np.savez(folder / "wide.npz", frames=np.pad(frames, ((0, 0), (7, 7), (200, 200)), mode="edge"), rate_hz=rate)
     tifffile.imwrite(folder / "film.tif", np.stack(list(shaken().frames())))
     np.savetxt(folder / "psf.csv", np.full((1, 9), 1 / 9), delimiter=",")
     (folder / "log.csv").write_text("time,x,y\n0.0,0.0,0.0\n0.1,5.0,1.0\n")

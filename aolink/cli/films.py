@@ -1,4 +1,4 @@
-"""Commands that bring other people's data in: import, and the film options that `aolink rig --from` shares."""
+"""Commands that bring other people's data in: import, and the film options that `aolink look` shares."""
 
 import math
 from datetime import UTC, datetime
@@ -17,16 +17,6 @@ if TYPE_CHECKING:
 RateOption = Annotated[
     float | None, typer.Option("--rate", metavar="HZ", help="Frames a second, where the film does not state them.")
 ]
-TrackOption = Annotated[
-    int,
-    typer.Option(
-        "--track", metavar="N", min=0, help="Follow N objects, each in a window of its own: the brightest, or --at."
-    ),
-]
-AtOption = Annotated[
-    list[str] | None,
-    typer.Option("--at", metavar="X,Y", help="Where an object to follow is in the first frame, pixels; repeatable."),
-]
 _FILM = {
     "gamma=2.2": ("gamma", "undo a gamma curve, which most JPEG and video have"),
     "invert": ("invert", "dark objects on a bright ground"),
@@ -42,7 +32,7 @@ _FILM = {
     "row_time=S": ("row_time_s", "from the start of a row's exposure to the next row's, 0 for all at once"),
 }  # fmt: skip
 """The options of --film: the field of `FilmSettings` or `FilmFile` where each goes, and its help."""
-_TAKEN = {"look": 4, "rig": 5, "import": len(_FILM)}
+_TAKEN = {"look": 4, "import": len(_FILM)}
 """How many of them, from the first on, a command takes."""
 _COLOURS = ("red", "green", "blue", "all")
 
@@ -53,7 +43,6 @@ def _film_option(command: str) -> Any:
 
 
 FilmOfLook = Annotated[list[str] | None, _film_option("look")]
-FilmOfRig = Annotated[list[str] | None, _film_option("rig")]
 FilmOfImport = Annotated[list[str] | None, _film_option("import")]
 
 _DARK = 0.01
@@ -122,7 +111,7 @@ def _start_ns(text: str) -> int:
 
 
 def film_settings(
-    rate: float | None, track: int, at: list[str] | None, film: FilmFile, exposure: float | None = None
+    rate: float | None, exposure: float | None, film: FilmFile, at: list[str] | None = None
 ) -> "FilmSettings":
     """The options of a command as settings. Raises ImportingError for an invalid place, rate or time."""
     from aolink.importing.frames import FilmSettings
@@ -141,14 +130,14 @@ def film_settings(
             raise ImportingError(f"--at {text} is no place: give X,Y in pixels, such as --at 12.5,40")
         places.append((x, y))
     return FilmSettings(
-        rate_hz=rate, track=track or len(places), places=tuple(places), exposure_s=exposure, **film.settings,
+        rate_hz=rate, places=tuple(places), exposure_s=exposure, **film.settings,
     )  # fmt: skip
 
 
 @app.command(
     "import",
     epilog="Example: aolink import film.tif -o film.mcap --rig my.toml --rate 500"
-    "  |  aolink import film.npz -o film.mcap --rig spheres.toml --rate 24 --film invert,sum=8 --track 6",
+    "  |  aolink import film.npz -o film.mcap --rig spheres.toml --rate 24 --film invert,sum=8 --at 24,31",
 )
 def import_(
     source: Annotated[
@@ -165,8 +154,12 @@ def import_(
     exposure: Annotated[
         float | None, typer.Option(metavar="S", help="Exposure time of a frame, s, where the film lacks it.")
     ] = None,
-    track: TrackOption = 0,
-    at: AtOption = None,
+    at: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="X,Y", help="Cut a window of the rig's out of the frames, about this pixel; one for each spot."
+        ),
+    ] = None,
     film: FilmOfImport = None,
     overwrite: OverwriteOption = False,
 ) -> None:
@@ -175,7 +168,7 @@ def import_(
     from aolink.rig import load_rig
 
     how = film_file(film, "import")
-    settings, loaded, shown = film_settings(rate, track, at, how, exposure), load_rig(rig), how.open(source)
+    settings, loaded, shown = film_settings(rate, exposure, how, at), load_rig(rig), how.open(source)
     with progress("import", shown.count // settings.frames_per_exposure) as tell:
         account = import_film(
             shown, loaded, settings, output, overwrite=overwrite, sources=[source, Path(rig)],
@@ -184,7 +177,7 @@ def import_(
     for note in account.notes:
         stdout.print(f"note: {note}", markup=False)
     for count, what in (
-        (account.saturated, "saturated in the film, hot or dead, no numbers, or shared by two objects"),
+        (account.saturated, "saturated in the film, hot or dead, or no numbers"),
         (account.clipped, "beyond the range of the rig's camera"),
     ):
         if count:

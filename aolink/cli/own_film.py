@@ -62,7 +62,7 @@ def look(
     if kernel is not None and not 0 < kernel < math.inf:
         raise ImportingError(f"--kernel {kernel:g} must be above 0{' and finite' if kernel > 0 else ''}")
     how = film_file(film, "look")
-    settings, shown = film_settings(rate, 0, None, how, exposure), how.open(source)
+    settings, shown = film_settings(rate, exposure, how), how.open(source)
     folder = output or Path(f"{source.stem}-look")
     rig_file, recording, page = folder / "rig.toml", folder / "film.mcap", folder / "page.html"
     if not overwrite and (there := [each for each in (rig_file, recording, page) if each.exists()]):

@@ -11,57 +11,32 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.markup import escape
 
-from aolink.cli import common, films
-from aolink.cli.common import JsonOption, OverwriteOption, RigArgument, app, load_checked, program, stdout
-from aolink.cli.films import AtOption, FilmOfRig, RateOption, TrackOption
+from aolink.cli import common
+from aolink.cli.common import JsonOption, RigArgument, app, load_checked, program, stdout
 from aolink.cli.terminal import input_ended
 from aolink.errors import AolinkError, RigError
-from aolink.files import check_target, writing
 from aolink.signals import StopRequest
 
 if TYPE_CHECKING:
-    from aolink.importing.frames import FilmSettings
     from aolink.rig import Rig
 
 
-@app.command(
-    epilog="Example: aolink rig section-vi --check"
-    "  |  aolink rig my.toml --from film.tif --rate 500 --track 3 --film sum=8 (writes my.toml)"
-)
+@app.command(epilog="Example: aolink rig section-vi --check")
 def rig(
-    context: typer.Context,
     rig: RigArgument = "",
     check: Annotated[bool, typer.Option("--check", help="Check the rig file, print the findings, and end.")] = False,
     listed: Annotated[bool, typer.Option("--list", help="List the rigs that come with aolink, and end.")] = False,
     exposure_scan: Annotated[
         bool, typer.Option("--exposure-scan", help="Print the error of o1 to expect at other exposure times, and end.")
     ] = False,
-    source: Annotated[
-        Path | None,
-        typer.Option(
-            "--from",
-            metavar="FILM",
-            help="Write a first rig file for the objects of a film, RIG or FILM's name with .toml, and end.",
-        ),
-    ] = None,
-    rate: RateOption = None,
-    track: TrackOption = 0,
-    at: AtOption = None,
-    film: FilmOfRig = None,
-    overwrite: OverwriteOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Check a rig file, list the rigs that come along, or write a first rig file for a film."""
+    """Check a rig file, or list the rigs that come along."""
     from aolink.rig import builtin_rigs, load_rig
 
     if listed:
         for name in builtin_rigs():
             stdout.print(f"{name:<18}{load_rig(name).summary.split('. ')[0].rstrip('.')}.", markup=False)
-        return
-    _check_goes_with(context, source)
-    if source is not None:
-        path, how = Path(rig or f"{source.stem}.toml"), films.film_file(film, "rig")
-        _write_first_rig(path, source, how, films.film_settings(rate, track, at, how), overwrite)
         return
     if not rig:
         raise typer.BadParameter("name a rig file, or a rig that comes with aolink")
@@ -72,35 +47,6 @@ def rig(
         _print_scan(load_rig(rig), as_json)
         return
     raise typer.BadParameter(f"say what of {rig}: --check it, or serve it with `aolink sim {rig}`")
-
-
-_OF_FILMS = frozenset(("rate", "frames", "track", "at", "film", "overwrite"))
-"""Parameters of `rig` that go with --from only, where no others but the rig's name go with it."""
-
-
-def _check_goes_with(context: typer.Context, film: Path | None) -> None:
-    for each in context.command.params:
-        name = each.name or ""
-        source = context.get_parameter_source(name)
-        if source is None or source.name != "COMMANDLINE" or name in ("rig", "source"):
-            continue
-        if (name in _OF_FILMS) != (film is not None):
-            without = "needs --from FILM" if film is None else "makes no sense with --from, which writes a rig file"
-            raise typer.BadParameter(f"{each.opts[0]} {without}")
-
-
-def _write_first_rig(path: Path, source: Path, how: films.FilmFile, settings: "FilmSettings", overwrite: bool) -> None:
-    from aolink.importing.first_rig import first_rig
-
-    check_target(path, overwrite=overwrite, suffix=".toml", error=RigError)
-    film = how.open(source)
-    with common.progress("follow", film.count) as tell:
-        made = first_rig(film, settings, path.stem, tell)
-    with writing(path, overwrite=overwrite, error=RigError) as partial:
-        partial.write_text(made.text, encoding="utf-8")
-    for note in made.notes:
-        stdout.print(f"note: {note}", markup=False)
-    stdout.print(f"{path}: written from {film.name}; read it, then: {program()} rig {path} --check", markup=False)
 
 
 def _print_scan(loaded: "Rig", as_json: bool) -> None:

@@ -101,8 +101,7 @@ def find_spots(
     side = max(_SMALLEST, *(2 * math.ceil(half) for _, half in boxes))
     if side > _LARGEST:
         raise ImportingError(
-            f"{film.name}: a spot goes over {side} pixels, {_LARGEST} at most can be looked at: follow it with `aolink"
-            " import --track 1`, or take a part of the film"
+            f"{film.name}: a spot goes over {side} pixels, {_LARGEST} at most can be looked at: take a part of the film"
         )
     middles = np.array([middle for middle, _ in boxes])
     corners = np.rint(middles - (side - 1) / 2).astype(np.int64)

@@ -1,13 +1,12 @@
 """A film becomes the frames of a rig: light to counts, times to fast steps, several frames to one exposure.
 
-The result is the data that a session records for each exposure: a frame, the inputs of its fast steps, and, where
-objects were followed in the single frames, the true path.
+The result is the data that a session records for each exposure: a frame and the inputs of its fast steps.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -70,31 +69,21 @@ def imported(film: Film, rig: Rig, settings: FilmSettings, account: FilmAccount)
     if film.slopes:
         yield from _of_slopes(film, rig, settings, times, account)
         return
-    if settings.track:
-        from aolink.importing.tracking import tracked
-
-        yield from tracked(film, rig, settings, times, account)
-        return
     if settings.scale is not None and settings.scale < 0:
         raise ImportingError(
             f"--film scale={settings.scale:g} must be above 0 for pictures: dark objects need --film invert"
         )
-    if film.shape != rig.sensor.shape:
-        rows, columns = rig.sensor.shape
-        raise ImportingError(
-            f"{film.name} has frames of {film.shape[0]} x {film.shape[1]} pixels, the rig file {rig.name} describes"
-            f" {rows} x {columns}: change its [sensor], or follow objects with --track N"
-        )
     light = FilmLight(film, settings)
+    cut = _windows(film, rig, settings.places)
     defects = find_defects(film, light, math.sqrt(rig.sensor.kernel.variance) / rig.sensor.pixel_width)
     if defects.any():
-        account.notes += (defects_note(defects, of_rig=True),)
+        account.notes += (defects_note(defects, of_rig=not settings.places),)
         light = FilmLight(film, settings, defects)
     offset = rig.sensor.black_level if settings.invert or settings.subtract_median else 0.0
     scale = settings.scale or default_scale(film, rig)
     inputs = _Inputs(film, rig, settings, times)
     account.notes += inputs.notes
-    groups = grouped(film, settings.frames_per_exposure, times.periods, light.of)
+    groups = grouped(film, settings.frames_per_exposure, times.periods, lambda frame: cut(*light.of(frame)))
     shine = _brightness([_spot_light(offset + scale * group.mean, ~group.bad, rig) for group in groups])
     if len(shine) and (change := change_of(shine)):
         account.notes += (
@@ -102,7 +91,7 @@ def imported(film: Film, rig: Rig, settings: FilmSettings, account: FilmAccount)
             " exposures are scaled to the rig file's light",
         )
     black = rig.sensor.black_level
-    groups = grouped(film, settings.frames_per_exposure, times.periods, light.of)
+    groups = grouped(film, settings.frames_per_exposure, times.periods, lambda frame: cut(*light.of(frame)))
     for group, bright in zip(groups, shine.tolist(), strict=True):
         mean = group.mean
         if settings.scale is None and film.dtype.kind == "f" and mean.max() > 1.0:
@@ -119,6 +108,45 @@ def imported(film: Film, rig: Rig, settings: FilmSettings, account: FilmAccount)
         unknown = rig.sensor.row_time_s is None and film.inputs is not None  # only inputs have times of their own
         frame = rig_frame(group, times, rig, settings.frames_per_exposure, pixels, mask, unknown)
         yield ImportedExposure(frame=frame, inputs=inputs.until(frame.last_step + 1))
+
+
+def _windows(
+    film: Film, rig: Rig, places: tuple[tuple[float, float], ...]
+) -> Callable[[FloatArray, BoolArray], tuple[FloatArray, BoolArray]]:
+    """What makes a frame of the rig's sensor of the light and the bad pixels of a film's frame: the windows about
+    ``places``, one for each spot; without places the frame itself."""
+    sensor, (height, width) = rig.sensor, film.shape
+    if not places:
+        if film.shape != sensor.shape:
+            raise ImportingError(
+                f"{film.name} has frames of {height} x {width} pixels, the rig file {rig.name} describes"
+                f" {sensor.shape[0]} x {sensor.shape[1]}: change its [sensor], or say where its spots are with --at X,Y"
+            )
+        return lambda *frame: frame
+    if len(places) != sensor.spots:
+        raise ImportingError(
+            f"--at gives {len(places)} places, the rig file {rig.name} has {sensor.spots} spots: give one for each"
+        )
+    if sensor.row_starts_s.any():
+        raise ImportingError("with --at the rows of the sensor are not the film's: leave out row_time")
+    rows, columns = (pixels // windows for pixels, windows in zip(sensor.shape, sensor.grid, strict=True))
+    cuts = []
+    for x, y in places:
+        left, top = round(x - (columns - 1) / 2), round(y - (rows - 1) / 2)
+        if not (0 <= left <= width - columns and 0 <= top <= height - rows):
+            raise ImportingError(
+                f"{film.name}: the window of {columns} x {rows} pixels about --at {x:g},{y:g} is not inside its"
+                f" pictures of {width} x {height} pixels"
+            )
+        cuts.append(np.s_[top : top + rows, left : left + columns])
+
+    def cut(light: FloatArray, bad: BoolArray) -> tuple[FloatArray, BoolArray]:
+        frame, wrong = np.full(sensor.shape, np.median(light)), np.zeros(sensor.shape, dtype=np.bool_)
+        for spot, window in enumerate(cuts):
+            frame[sensor.window_of(spot)], wrong[sensor.window_of(spot)] = light[window], bad[window]
+        return frame, wrong
+
+    return cut
 
 
 def _spot_light(counts: FloatArray, usable: NDArray[np.bool_], rig: Rig) -> FloatArray:
@@ -162,9 +190,9 @@ def _of_slopes(
     film: Film, rig: Rig, settings: FilmSettings, times: FrameTimes, account: FilmAccount
 ) -> Iterator[ImportedExposure]:
     """The exposures of a film without pictures: all of their pixels are missing."""
-    if settings.track or settings.invert or settings.subtract_median or settings.gamma != 1.0:
+    if settings.places or settings.invert or settings.subtract_median or settings.gamma != 1.0:
         raise ImportingError(
-            f"{film.name} has slopes and no pictures: --track, and --film invert, background and gamma, need pixels"
+            f"{film.name} has slopes and no pictures: --at, and --film invert, background and gamma, need pixels"
         )
     if film.shape[1] != rig.n_outputs:
         raise ImportingError(

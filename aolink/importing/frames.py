@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from aolink.assembly import Frame
 from aolink.errors import ImportingError
-from aolink.exposure import Truth
 from aolink.films.film import Film, FilmFrame
 from aolink.numerics.arrays import BoolArray, FloatArray
 from aolink.optics.maxima import mended
@@ -52,13 +51,11 @@ class FilmSettings:
     """Whether each frame's median is background, which is subtracted."""
     frames_per_exposure: int = 1
     """Number of frames of a fast film whose mean becomes one exposure."""
-    track: int = 0
-    """Number of objects that are followed, each in a window of its own; 0: the frames are those of the rig's sensor."""
     row_time_s: float | None = None
     """As `BaseSensor.row_time_s`, where the rig file does not have it or is wrong."""
     places: tuple[tuple[float, float], ...] = ()
-    """Places of these objects in the first frame, (x, y) in pixels; empty: the brightest ones that are not at an
-    edge."""
+    """Places about which the windows of the rig's spots are cut out, (x, y) in pixels; empty: the frames are those of
+    the rig's sensor."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -69,8 +66,6 @@ class ImportedExposure:
     inputs: FloatArray
     """Inputs that the mirror held from the end of the exposure before this one to the end of this one, (steps,
     n_inputs)."""
-    truth: Truth | None = None
-    """The motion as measured in the single frames."""
 
 
 @dataclass(kw_only=True, eq=False)
@@ -82,8 +77,7 @@ class FilmAccount:
     missing: int = 0
     """Frames that are missing between others, by their times."""
     saturated: int = 0
-    """Pixels that are masked: at the end of their range in the film, hot or dead, no numbers, or with the light of two
-    objects."""
+    """Pixels that are masked: at the end of their range in the film, hot or dead, or no numbers."""
     clipped: int = 0
     """Pixels whose counts do not fit into the rig's range, which are masked as well."""
     below: int = 0

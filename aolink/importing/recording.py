@@ -22,7 +22,6 @@ from aolink.recording.writer import begin_recording
 from aolink.rig import Rig, parse_rig
 from aolink.rig.edit import with_value
 from aolink.wire.messages_pb2 import Applied
-from aolink.wire.truth import truth_message
 
 _AT_ONCE = 65_536
 """Numbers in one report of inputs."""
@@ -89,5 +88,3 @@ def _messages(each: ImportedExposure) -> Iterator[tuple[str, Message]]:
     for k in range(0, len(inputs), rows):
         some = inputs[k : k + rows]
         yield topics.APPLIED, Applied(first_step=first + k, n_steps=len(some), u=some.ravel())
-    if each.truth is not None:
-        yield topics.TRUTH, truth_message(frame.frame_id, each.truth)

@@ -207,6 +207,26 @@ def test_frames_of_another_size_are_refused(tmp_path):
     assert "frames of 8 x 9 pixels, the rig file single-lenslet describes 8 x 8" in text
 
 
+def test_each_spot_has_the_window_about_its_place(tmp_path):
+    """In the order of the places, whose pixels count from the middle of the first one; the median is the picture's."""
+    rig = load_rig("sh-4x4")
+    (rows, columns), (height, width) = rig.sensor.grid, rig.sensor.window
+    corners = np.random.default_rng(1).permutation(200)[: 2 * rig.sensor.spots].reshape(-1, 2)
+    frames = np.random.default_rng(2).integers(0, 4000, (12, 220 + height, 220 + width)).astype(np.uint16)
+    frames[:, corners[5, 1] + 3, corners[5, 0] + 2] = 60_000  # a hot pixel
+    places = tuple((x + (width - 1) / 2, y + (height - 1) / 2) for x, y in corners.tolist())
+    settings = FilmSettings(places=places, subtract_median=True, row_time_s=0.0)
+    recording, _ = made(tmp_path, frames, rig, settings)
+    ground = np.median(frames, axis=(1, 2))
+    for each, frame, dark in zip(recording, frames, ground, strict=True):
+        windows = each.pixels.reshape(rows, height, columns, width).swapaxes(1, 2).reshape(-1, height, width)
+        mask = each.mask.reshape(rows, height, columns, width).swapaxes(1, 2).reshape(-1, height, width)
+        for (x, y), window, usable in zip(corners, windows, mask, strict=True):
+            counts = frame[y : y + height, x : x + width] - dark + rig.sensor.black_level
+            np.testing.assert_array_equal(window[usable], np.rint(counts)[usable])
+        assert not mask[5, 3, 2]
+
+
 @pytest.mark.parametrize("K", [2, 3])
 def test_the_mean_of_several_frames_is_one_exposure(K, tmp_path):
     frames = film(np.uint16, 7)

@@ -19,7 +19,7 @@ from paper_report.ensemble import Cell, map_cells
 from paper_report.judge import RECORDED, judge_plan, read_rows
 from paper_report.limit import against_o1, limit_table
 from paper_report.loop import loop_cells
-from paper_report.made_films import fitted_films, made_films
+from paper_report.made_films import made_films
 from paper_report.page import Results, build
 from paper_report.shake import shake_table
 from paper_report.spheres import film
@@ -67,7 +67,7 @@ def compute(effort: n.Effort, out: Path) -> Results:
     with _timed("spheres"):
         spheres = film(effort)
     with _timed("made films"):
-        made, fitted = made_films(effort), fitted_films(effort)
+        made = made_films(effort)
     with _timed("closed loops"):
         loops = loop_cells(effort is n.QUICK)
     with _timed("family"):
@@ -82,7 +82,7 @@ def compute(effort: n.Effort, out: Path) -> Results:
     return Results(
         printed=printed, lively=lively, effort=effort, rows=rows, norms=norms, errors=errors, forms=forms,
         remark_1=first, remark_2=second, mechanism=mechanism, shake=shake, limit=limit, over_o1=over_o1, film=spheres,
-        made=made, fitted=fitted, family=family, loops=loops, cells=cells,
+        made=made, family=family, loops=loops, cells=cells,
     )  # fmt: skip
 
 

@@ -51,10 +51,6 @@ class Effort:
     """Range of the kinds of made films, from the first number to before the second."""
     made_seeds: int = 5
     made_exposures: int = 14
-    fitted_kinds: int = 15
-    """Number of kinds of made films with the rig file that is fitted to them."""
-    fitted_seeds: int = 2
-    fitted_exposures: int = 24
     family: Plan | None = None
     """What is judged over the family; the rows that the repository keeps if None."""
     particles: int | None = None
@@ -70,8 +66,7 @@ FULL = Effort()
 QUICK = Effort(
     noise_frames=20_000, runs=16, exposures=14, cycle_exposures=20, skip=4, map_runs=16, shake_runs=6,
     limit_runs=2, limit_exposures=4, limit_skip=1, o1_runs=4, o1_exposures=4, particles=150,
-    film_exposures=3, made_kinds=(3, 4), made_seeds=1, made_exposures=5, fitted_kinds=1,
-    fitted_seeds=1, fitted_exposures=5,
+    film_exposures=3, made_kinds=(3, 4), made_seeds=1, made_exposures=5,
     family=Plan(
         scenes=4, pixel_scenes=2, limit_scenes=1,
         size=Size(runs=4, exposures=5, skip=2, pixel_runs=1, limit_runs=1, particles=150),

@@ -18,7 +18,7 @@ from paper_report.ensemble import Cell, IntervalEstimate
 from paper_report.judge import Row as JudgedRow
 from paper_report.limit import Scene, against_o1_section, limit_section
 from paper_report.loop import loop_section
-from paper_report.made_films import MadeFilm, fitted_section, made_section
+from paper_report.made_films import MadeFilm, made_section
 from paper_report.numbers import Effort, ErrorRow, FormRow, Mechanism, Norms, Remark1, Row, late_input_error, number
 from paper_report.shake import ShakeRow, shake_section
 from paper_report.spheres import Film, film_section
@@ -46,8 +46,6 @@ class Results:
     over_o1: list[tuple[str, dict[str, IntervalEstimate]]]
     film: list[Film]
     made: list[MadeFilm]
-    fitted: list[MadeFilm]
-    """With the rig file that is fitted to them."""
     family: list[JudgedRow]
     loops: list[ClosedLoops]
     cells: list[Cell]
@@ -82,7 +80,7 @@ def build(results: Results) -> list[Block]:
         *limit_section(results.limit, results.effort, _picture("limit.png")),
         *against_o1_section(results.over_o1, results.effort), *family_section(results.family, _picture("family.png")),
         *film_section(results.film), *made_section(results.made, results.effort),
-        *fitted_section(results.fitted, results.effort), *loop_section(results.loops),
+        *loop_section(results.loops),
     ]  # fmt: skip
 
 

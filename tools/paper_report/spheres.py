@@ -1,34 +1,27 @@
-"""Real motion blur: a film of spheres that diffuse in water, imported as by `aolink import`.
+"""Real motion blur: a film of spheres that diffuse in water.
 
-The mean of K frames is an exposure of K fast steps whose path is measured in the single frames. The rig file is the one
-that `aolink rig --from` writes: kernel, noise and random walk of the single frames. Beside the estimators stands what a
-user would do instead: the centroid of each blurred picture, held for the exposure, or interpolated from one to the
-next. Exposures of a sphere that has other light beside it, as `aolink import` reports, count in one table only.
+The mean of K frames is an exposure of K fast steps, whose path a tracker saw in the single frames. Beside the
+estimators stands what a user would do instead: the centroid of each blurred picture, held for the exposure, or
+interpolated from one to the next. Exposures of a sphere that has another one beside it count in one table only.
 """
 
-import tempfile
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from judging.sampled import NAME as LIMIT
 from judging.sampled import estimator as estimator_named
 
+import aolink
 from aolink.estimation import ESTIMATOR_NAMES, smooth
-from aolink.exposure import Exposure
-from aolink.films.formats import open_film
-from aolink.importing.first_rig import first_rig
-from aolink.importing.frames import FilmSettings
-from aolink.importing.recording import import_film
-from aolink.importing.survey import survey
-from aolink.importing.tracker import find_objects
+from aolink.exposure import Exposure, Truth
 from aolink.numerics.arrays import BoolArray, FloatArray
 from aolink.optics.camera import to_density
 from aolink.optics.centroid import weighted_centroid
 from aolink.optics.frame import spot_windows
+from aolink.optics.maxima import cut_windows
 from aolink.optics.sensor import SpotSensor
-from aolink.recording.reader import Recording
 from aolink.rig import Rig, parse_rig
 from paper_report.blocks import Block, Heading, Table, Text
 from paper_report.ensemble import IntervalEstimate, ratio, rms
@@ -37,36 +30,106 @@ from paper_report.numbers import Effort
 
 FILE = Path(__file__).parents[2] / "tests" / "data" / "diffusing_spheres.npz"
 NAMES = (*ESTIMATOR_NAMES, LIMIT)
-_RATE_HZ = 24.0
 _SKIP = 1
 """Exposures that are not scored, because the spheres' motion before is not known."""
+_STEP, _SD, _NOISE = 0.47, 1.7, 0.009
+"""Rms of a sphere's step in a frame and its standard deviation, pixels; noise of a mean's pixel over its light."""
+PATH_SD = 0.1
+"""Error of the tracker, pixels."""
+_BESIDE = {0: (180, 300), 1: (0, 30), 5: (240, 270)}
+"""Frames in which a sphere has another one beside it that is a third as bright or more."""
+HALF = 12
+"""Pixels of a window on either side of its middle one."""
+_BLACK, _COUNTS = 20_000, 340_000
+WALK = """
+A = [[1.0, 0.0], [0.0, 0.0]]
+B = [[1.0], [0.0]]
+B_w = [[1.0], [1.0]]
+C = [[1.0, -0.21132487]]
+process_noise = [[{0}]]
+initial_covariance = [[4.0, 0.0], [0.0, {0}]]
+"""
+"""Plant of a random walk that gains so much variance in a frame, in pixels. The mean over a frame has not the whole
+last step yet, which is the last state; the input is the shift of the window."""
 
 
-def places() -> tuple[tuple[float, float], ...]:
-    """Positions of the six spheres in the first frame, their films side by side, pixels."""
-    data = np.load(FILE)
-    width = data["frames"].shape[3]
-    return tuple((float(x) + k * width, float(y)) for k, (x, y) in enumerate(data["tracked_xy"][:, 0]))
+def spot_rig(plant: str, spots: int, frames: int, sd: float, noise: float) -> Rig:
+    """A rig of spots, each in a window that its inputs shift, for exposures of so many frames. The slope unit is a
+    pixel; ``noise`` is the standard deviation of a pixel over a spot's light."""
+    edge = HALF + 0.5
+    return parse_rig(f"""
+name = "spots"
+[plant]
+axes = {2 * spots}
+{plant}
+[timing]
+fast_step_s = 0.04
+exposure_steps = {frames}
+frame_period_steps = {frames}
+[sensor]
+kind = "spots"
+grid = [1, {spots}]
+window = [{2 * HALF + 1}, {2 * HALF + 1}]
+field = [{-edge}, {edge}]
+noise_density = {noise**2}
+black_level = {_BLACK}
+counts_per_density = {_COUNTS}
+[sensor.kernel]
+shape = "gaussian"
+sd = {sd}
+[mirror]
+input_min = -{2 * HALF}.0
+input_max = {2 * HALF}.0
+dac_bits = 0
+block_steps = 1
+queue_steps = 16
+""")
+
+
+def followed(rig: Rig, light: FloatArray, places: FloatArray, reach: float) -> list[Exposure]:
+    """Exposures of spots of a film, (frames, rows, columns), with their true paths; ``places`` are those in the single
+    frames, (frames, spots, 2) as (x, y), pixels.
+
+    From exposure to exposure a window moves by whole pixels to the middle of the blur before; light farther than
+    ``reach`` from that belongs to others.
+    """
+    K, spots = rig.timing.exposure_steps, places.shape[1]
+    count, middles = len(light) // K, places[0]
+    rows, columns = np.indices((2 * HALF + 1, 2 * HALF + 1))
+    own, corners = [], []
+    for k in range(count):
+        windows, corner = cut_windows(light[k * K : (k + 1) * K].mean(axis=0), middles, HALF)
+        windows -= np.median(windows, axis=(1, 2), keepdims=True)  # the ground
+        found = weighted_centroid(windows, reach / 2, start=middles - corner)
+        far = np.hypot(columns - found[:, :1, None], rows - found[:, 1:, None]) > reach
+        own.append(np.where(far, 0.0, windows))
+        corners.append(corner)
+        middles = corner + found
+    density = np.array(own) / np.median(np.sum(own, axis=(2, 3)), axis=0)[:, None, None]
+    counts = np.rint(_BLACK + _COUNTS * density).clip(0, rig.sensor.full_scale)
+    inputs = np.zeros((count * K, rig.n_inputs))
+    inputs[K - 1 : -1 : K] = -np.diff(corners, axis=0).reshape(-1, 2 * spots)
+    frames = counts.transpose(0, 2, 1, 3).reshape(count, *rig.sensor.shape)
+    unknown = np.full((rig.plant.axes, rig.plant.n_states), np.nan)
+    exposures = list[Exposure]()
+    for k, each in enumerate(aolink.exposures(frames, rig, inputs)):
+        path = (places[k * K : (k + 1) * K] - corners[k] - HALF).reshape(K, 2 * spots).T
+        exposures.append(replace(each, truth=Truth(start_state=unknown, end_state=unknown, path=path)))
+    return exposures
 
 
 def spheres(K: int) -> tuple[Rig, list[Exposure], BoolArray]:
-    """A rig of 12 axes, its exposures of K frames, read back from a recording, and where a sphere is seen and alone.
-
-    The last is (exposures, 12).
-    """
-    settings = FilmSettings(rate_hz=_RATE_HZ, invert=True, track=6, places=places(), frames_per_exposure=K)
-    film = open_film(FILE)
-    rig = parse_rig(first_rig(film, settings, "spheres").text)
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "spheres.mcap"
-        import_film(film, rig, settings, path)
-        exposures = list(Recording(path).exposures())
-    known = survey(film, settings, find_objects(film, settings))
-    alone = [
-        known.alone(each.first_step, each.first_step + K)
-        & np.isfinite(known.places[each.first_step : each.first_step + K]).all(axis=(0, 2))
-        for each in exposures
-    ]
+    """A rig of 12 axes, its exposures of K frames, and where a sphere is alone, (exposures, 12)."""
+    data = np.load(FILE)
+    films, tracks = data["frames"], data["tracked_xy"]
+    beside = np.array([[k * films.shape[3], 0.0] for k in range(len(films))])
+    picture = np.concatenate(list(films), axis=2)  # side by side
+    light = np.median(picture, axis=(1, 2), keepdims=True) - picture
+    rig = spot_rig(WALK.format(_STEP**2), len(films), K, _SD, _NOISE)
+    exposures = followed(rig, light, tracks.swapaxes(0, 1) + beside, 2.5 * np.hypot(_SD, _STEP * np.sqrt(K)))
+    alone = np.ones((len(exposures), len(films)), dtype=np.bool_)
+    for sphere, (first, end) in _BESIDE.items():
+        alone[first // K : -(-end // K), sphere] = False
     return rig, exposures, np.repeat(alone, 2, axis=1)
 
 
@@ -128,7 +191,7 @@ def _film_of(frames: int, effort: Effort) -> Film:
     exposures = exposures[: effort.film_exposures]
     scored = [k for k, each in enumerate(exposures) if k >= _SKIP and each.truth is not None]
     truths = [each.truth for k, each in enumerate(exposures) if k >= _SKIP and each.truth is not None]
-    true, truth_sd = np.array([each.path for each in truths]), max(each.path_sd for each in truths)
+    true = np.array([each.path for each in truths])
     counts = alone[scored].T
 
     def squares(paths: FloatArray) -> FloatArray:
@@ -145,7 +208,7 @@ def _film_of(frames: int, effort: Effort) -> Film:
         path[name] = squares(np.array([each.path for each in some]))
         smoothed[name] = squares(np.array([after[k].path for k in scored]))
         error = np.abs(np.array([each.path for each in some]) - true)
-        spread = np.hypot(np.array([each.path_sd for each in some]), truth_sd)
+        spread = np.hypot(np.array([each.path_sd for each in some]), PATH_SD)
         coverage[name] = float((error <= BEYOND_95 * spread).mean(axis=2).T[counts].mean())
 
     def of(errors: FloatArray, which: BoolArray) -> FloatArray:
@@ -177,10 +240,9 @@ def film_section(found: Sequence[Film]) -> list[Block]:
         Heading("Blur that nobody here made"),
         Text(
             "Not the paper's: a film of six spheres that diffuse in water, along x and y"
-            " (tests/data/diffusing_spheres.md), imported as `aolink rig --from` and `aolink import --track 6 --sum K`"
-            " do it. The mean of K frames is an exposure, the places in the single frames its path; kernel, noise and"
-            " random walk are those of single frames. Exposures of a sphere that has other light beside it, as"
-            " `aolink import` says of the single frames, do not count: "
+            " (tests/data/diffusing_spheres.md). The mean of K frames is an exposure, the places in the single frames"
+            " its path; kernel, noise and random walk are those of single frames. Exposures of a sphere that has"
+            " another one beside it do not count: "
             + ", ".join(f"{each.crowded} of {each.scored} at {each.frames} frames" for each in found)
             + ". RMSE of the path, pixels, with the standard error over the twelve axes:"
         ),

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import lfilter
 
 from aolink.numerics.arrays import FloatArray
 from aolink.optics.kernel import pixel_masses
@@ -26,18 +25,6 @@ def random_walk(rng: np.random.Generator, frames: int, spots: int, step: float, 
     """Places about zero at ``fine`` times in each frame, (frames, fine, spots, 2); ``step`` is the rms of one frame."""
     steps = rng.normal(size=(frames * fine, spots, 2)) * step / np.sqrt(fine)
     return np.asarray(np.cumsum(steps, axis=0).reshape(frames, fine, spots, 2))
-
-
-def ornstein_uhlenbeck(
-    rng: np.random.Generator, frames: int, spots: int, step: float, forgets: float, fine: int = 8,
-) -> FloatArray:  # fmt: skip
-    """Places that return to zero: their covariance decays to 1/e in ``forgets`` frames; as `random_walk` otherwise."""
-    a = np.exp(-1 / (forgets * fine))
-    kick = step / np.sqrt(fine)
-    start = kick / np.sqrt(1 - a**2) * rng.normal(size=(1, spots, 2))
-    kicks = kick * rng.normal(size=(frames * fine, spots, 2))
-    x, _ = lfilter([1.0], [1.0, -a], kicks, axis=0, zi=a * start)
-    return np.asarray(x.reshape(frames, fine, spots, 2))
 
 
 def resonance(

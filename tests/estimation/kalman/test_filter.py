@@ -433,7 +433,7 @@ def test_the_gain_of_many_outputs_is_that_of_all_of_them(mimo):
 @pytest.mark.parametrize("noise", [1e-6, 1e-5, 1e-4, 1e-3])
 @pytest.mark.parametrize("a", [0.5, 0.74, 0.9, 0.99, 1.0])
 def test_no_steady_gain_lets_the_error_grow(a, noise):
-    """As of a first rig file for an imported film: the window's shifts are a state that no noise drives."""
+    """Where a state is driven by inputs alone, as one that adds up the shifts of a window."""
     plant = dataclasses.replace(
         PLANT, A=np.diag([a, 1.0]), B=np.array([[0.0], [1.0]]), B_w=np.array([[1.0], [0.0]]), C=np.ones((1, 2)),
         process_noise=np.array([[0.0022]]), initial_covariance=np.diag([0.01, 0.1]),
