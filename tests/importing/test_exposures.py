@@ -210,7 +210,8 @@ def test_frames_of_another_size_are_refused(tmp_path):
 def test_each_spot_has_the_window_about_its_place(tmp_path):
     """In the order of the places, whose pixels count from the middle of the first one; the median is the picture's."""
     rig = load_rig("sh-4x4")
-    (rows, columns), (height, width) = rig.sensor.grid, rig.sensor.window
+    rows, columns = rig.sensor.grid
+    height, width = np.array(rig.sensor.shape) // rig.sensor.grid
     corners = np.random.default_rng(1).permutation(200)[: 2 * rig.sensor.spots].reshape(-1, 2)
     frames = np.random.default_rng(2).integers(0, 4000, (12, 220 + height, 220 + width)).astype(np.uint16)
     frames[:, corners[5, 1] + 3, corners[5, 0] + 2] = 60_000  # a hot pixel

@@ -111,15 +111,11 @@ def test_scale_makes_slopes_of_another_unit(tmp_path: Path) -> None:
     ("rig", "settings", "says"),
     [
         ("sh-4x4", {}, "has 2 slopes in each frame, the rig file sh-4x4 32"),
-        (
-            "single-lenslet",
-            {"track": 1},
-            "no pictures: --track, and --film invert, background and gamma",
-        ),
+        ("single-lenslet", {"places": ((3.0, 3.0),)}, "no pictures: --at"),
     ],
 )
 def test_slopes_that_are_not_the_rigs_are_refused(
-    rig: str, settings: dict[str, int], says: str, tmp_path: Path
+    rig: str, settings: dict[str, object], says: str, tmp_path: Path
 ) -> None:
     path = others.write_aot(tmp_path / "a.fits", None)
     with pytest.raises(ImportingError, match=says):

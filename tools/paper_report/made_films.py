@@ -71,7 +71,7 @@ def made(kind: Kind, seed: int, exposures: int) -> tuple[Rig, list[Exposure], Fl
     film = spot_film(rng, motion, middles, (_PITCH, _PITCH * _SPOTS), light=light)
     # The motion in a single frame widens the spot.
     rig = spot_rig(plant, _SPOTS, K, np.hypot(_SD, step / np.sqrt(12)), 20.0 / light)
-    found = followed(rig, film.frames - 1000.0, film.places, 3.5 * np.hypot(_SD, far))
+    found = followed(rig, film.frames.astype(np.float64) - 1000, film.places, 3.5 * np.hypot(_SD, far))
     return rig, found, np.array([each.truth.path for each in found if each.truth is not None])
 
 
