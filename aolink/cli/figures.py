@@ -19,13 +19,13 @@ Figure = StrEnum("Figure", ["EXPOSURE", "PUPIL", "SCENE"])
 )
 def report(
     context: typer.Context,
-    recorded: Annotated[str, typer.Argument(metavar="FILE", help="A recording.")],
+    recorded: Annotated[Path, typer.Argument(metavar="FILE", help="A recording.")],
     output: Annotated[
         Path,
         typer.Option("--output", "-o", metavar="FILE", help="The page to write, X.html; of a figure X.png|svg|pdf."),
     ],
     side: Annotated[
-        list[str] | None,
+        list[Path] | None,
         typer.Argument(metavar="[SIDE...]", help="Its side files: their estimates instead of its own."),
     ] = None,
     figure: Annotated[Figure | None, typer.Option(help="Draw this figure alone, in a paper's size.")] = None,
@@ -53,7 +53,7 @@ def report(
         source = context.get_parameter_source(name)
         if source is not None and source.name == "COMMANDLINE":
             raise typer.BadParameter(f"--{name.replace('_', '-')} goes with --figure NAME")
-    recording = open_recording(recorded, side=[Path(each) for each in side or ()])
+    recording = open_recording(recorded, side=side or [])
     spot = common.spot_of(recording.rig.sensor, lenslet) if lenslet else 0
     with progress("read", recording.n_frames) as tell:
         if figure is None:
