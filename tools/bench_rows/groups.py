@@ -7,7 +7,7 @@ ROWS = {
         "membrane_in_real_time",
     ),
     "optics": (
-        "frame_synthesis", "diffraction_synthesis", "picture_synthesis", "coupled_exposure", "cost_against_lenslets",
+        "frame_synthesis", "coupled_exposure", "cost_against_lenslets",
         "turbulence", "zonal_wavefront",
     ),
     "wire": ("link_throughput", "frame_to_command", "commands_at_1_khz", "slow_estimator", "live_membrane"),

@@ -9,7 +9,6 @@ from aolink.optics.frame import spots_density
 from aolink.optics.kernel import pixel_mass
 from aolink.optics.lenslets import Lenslets
 from aolink.optics.sensor import Kernel
-from aolink.optics.synthesis import Psi, light_in_windows
 from aolink.optics.turbulence import FrozenFlow, Layer
 from aolink.optics.wavefront import SpotReconstructor
 from aolink.rig import load_rig, parse_rig
@@ -28,23 +27,6 @@ def frame_synthesis(effort: Effort) -> Row:
 
     ours, theirs = (1 / each for each in median_s(lambda: spots_density(kernel, edges, path), effort.of(15), plain))
     return Row("frames of 900 spots, 200 fast steps", f"{ours:.0f}/s", f"20/s; erf {theirs:.0f}/s", ours / 20, 1)
-
-
-def diffraction_synthesis(effort: Effort) -> Row:
-    """Frames of 900 spots whose kernel is a lenslet's diffraction."""
-    path = 7.5 + np.cumsum(np.random.default_rng(0).normal(0, 0.05, (900, 2, 200)), axis=2)
-    psi = Psi(shape="sinc2", zero_px=2.0)
-    light_in_windows(psi, 16, path)
-    ours = 1 / median_s(lambda: light_in_windows(psi, 16, path), effort.of(5))[0]
-    return Row("frames of 900 diffraction spots", f"{ours:.0f}/s", "20/s", ours / 20, 1)
-
-
-def picture_synthesis(effort: Effort) -> Row:
-    """Frames of 900 spots whose kernel is a picture of 33 x 33 points, four of them a pixel."""
-    path = 7.5 + np.cumsum(np.random.default_rng(0).normal(0, 0.05, (900, 2, 200)), axis=2)
-    psi = Psi(shape="image", image=np.random.default_rng(1).random((33, 33)), finer=4)
-    ours = 1 / median_s(lambda: light_in_windows(psi, 16, path), effort.of(5))[0]
-    return Row("frames of 900 spots that are a picture", f"{ours:.0f}/s", "20/s", ours / 20, 1)
 
 
 def coupled_exposure(effort: Effort) -> Row:
