@@ -19,7 +19,7 @@ from aolink.plain import plain_data
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Truth:
-    """The true states and path of one exposure, from a simulated rig or the single frames of a film.
+    """The true states and path of one exposure, from a simulated rig.
 
     No estimator reads it. What is not known is NaN: states, and the whole path of an output.
     """
@@ -31,9 +31,6 @@ class Truth:
     path: NDArray[np.float64]
     """Output at each fast step of the exposure, slope units, (n_outputs, n_steps); of its own interval, see
     `Exposure`."""
-    path_sd: float = 0.0
-    """Standard deviation of an error in ``path``, slope units: zero for a simulated rig, larger where the path was
-    measured."""
 
     @property
     def known(self) -> NDArray[np.bool_]:

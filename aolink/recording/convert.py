@@ -257,7 +257,6 @@ def truth_from_message(message: wire.Truth) -> Truth:
         start_state=_array(message.start_state, axes, -1),
         end_state=_array(message.end_state, axes, -1),
         path=_array(message.path or message.path_single, outputs, -1),
-        path_sd=message.path_sd,
     )
 
 

@@ -307,7 +307,7 @@ class TruthChunk(_message.Message):
     def __init__(self, frame_id: _Optional[int] = ..., offset: _Optional[int] = ..., total: _Optional[int] = ..., data: _Optional[bytes] = ...) -> None: ...
 
 class Truth(_message.Message):
-    __slots__ = ("frame_id", "axes", "n_outputs", "start_state", "end_state", "path", "path_single", "path_sd")
+    __slots__ = ("frame_id", "axes", "n_outputs", "start_state", "end_state", "path", "path_single")
     FRAME_ID_FIELD_NUMBER: _ClassVar[int]
     AXES_FIELD_NUMBER: _ClassVar[int]
     N_OUTPUTS_FIELD_NUMBER: _ClassVar[int]
@@ -315,7 +315,6 @@ class Truth(_message.Message):
     END_STATE_FIELD_NUMBER: _ClassVar[int]
     PATH_FIELD_NUMBER: _ClassVar[int]
     PATH_SINGLE_FIELD_NUMBER: _ClassVar[int]
-    PATH_SD_FIELD_NUMBER: _ClassVar[int]
     frame_id: int
     axes: int
     n_outputs: int
@@ -323,8 +322,7 @@ class Truth(_message.Message):
     end_state: _containers.RepeatedScalarFieldContainer[float]
     path: _containers.RepeatedScalarFieldContainer[float]
     path_single: _containers.RepeatedScalarFieldContainer[float]
-    path_sd: float
-    def __init__(self, frame_id: _Optional[int] = ..., axes: _Optional[int] = ..., n_outputs: _Optional[int] = ..., start_state: _Optional[_Iterable[float]] = ..., end_state: _Optional[_Iterable[float]] = ..., path: _Optional[_Iterable[float]] = ..., path_single: _Optional[_Iterable[float]] = ..., path_sd: _Optional[float] = ...) -> None: ...
+    def __init__(self, frame_id: _Optional[int] = ..., axes: _Optional[int] = ..., n_outputs: _Optional[int] = ..., start_state: _Optional[_Iterable[float]] = ..., end_state: _Optional[_Iterable[float]] = ..., path: _Optional[_Iterable[float]] = ..., path_single: _Optional[_Iterable[float]] = ...) -> None: ...
 
 class VirtualTime(_message.Message):
     __slots__ = ("host_ns", "camera_bytes", "mirror_bytes")

@@ -13,7 +13,7 @@ def truth_message(frame_id: int, truth: Truth) -> pb.Truth:
     """The wire's form of a `Truth`."""
     message = pb.Truth(
         frame_id=frame_id, axes=truth.start_state.shape[0], n_outputs=truth.path.shape[0],
-        start_state=truth.start_state.ravel(), end_state=truth.end_state.ravel(), path_sd=truth.path_sd,
+        start_state=truth.start_state.ravel(), end_state=truth.end_state.ravel(),
     )  # fmt: skip
     small = truth.path.size <= _LARGEST_PATH
     (message.path if small else message.path_single).extend(truth.path.ravel().tolist())

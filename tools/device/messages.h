@@ -35,7 +35,7 @@ enum source { SOURCE_COMMAND, SOURCE_PARKED, SOURCE_CLIPPED, SOURCE_WATCHDOG, SO
 enum level { LEVEL_INFO, LEVEL_WARNING, LEVEL_ERROR };
 
 /* The first 8 bytes of the SHA-256 of messages.proto without comments and white space; `make test` compares. */
-#define SCHEMA_HASH "\xff\x0c\x33\xc9\xf1\x2e\x60\x02"
+#define SCHEMA_HASH "\x65\xa5\x4d\x90\xa2\xee\x99\xd7"
 
 /* A payload being written. When it does not fit, `overflow` is set and nothing more is written. */
 struct writer {
