@@ -6,7 +6,6 @@ e + d - 1 are fixed, and the controller is given them. The page is `aolink/pages
 """
 
 from aolink.control.controller import Controller, ControllerRow, Seen
-from aolink.control.drift import Fit, FitMonitor
 from aolink.control.fall_back import FallBack
 from aolink.control.loop import Act, ControlLoop, State, delay_steps
 from aolink.control.modes import MirrorModes, response_at_rest
@@ -14,7 +13,7 @@ from aolink.control.registry import controller_names, find_controller
 from aolink.control.stability import Stability, check_stable, stability
 
 __all__ = [
-    "Act", "ControlLoop", "Controller", "ControllerRow", "FallBack", "Fit", "FitMonitor", "MirrorModes", "Seen",
+    "Act", "ControlLoop", "Controller", "ControllerRow", "FallBack", "MirrorModes", "Seen",
     "Stability", "State", "check_stable", "controller_names", "delay_steps", "find_controller", "response_at_rest",
     "stability",
 ]  # fmt: skip

@@ -18,7 +18,6 @@ import numpy as np
 
 from aolink.control.checked import CheckedController
 from aolink.control.controller import ControllerRow
-from aolink.control.drift import TOLERATED_RATIO, Fit
 from aolink.control.integrator import INTEGRATOR, STILL
 from aolink.control.rival import Rival
 from aolink.estimation import Needs
@@ -49,7 +48,8 @@ class FallBack:
     """Chooses the controller that acts: the one that was asked for, or another while that one is worse.
 
     The others are the integrator and a mirror that holds still. Another one acts once it would have left significantly
-    less over the last exposures; the one that was asked for is tried again after a while, if its model fits.
+    less over the last exposures; the one that was asked for is tried again after a while, unless its model is known not
+    to fit.
     """
 
     def __init__(self, rig: Rig, row: ControllerRow, delay_steps: int) -> None:
@@ -71,11 +71,11 @@ class FallBack:
         self._rivals: dict[str, Rival] = {}
         self._settling = _SETTLING
 
-    def see(self, exposure: Exposure, slopes: FloatArray, fit: Fit | None) -> float | None:
+    def see(self, exposure: Exposure, slopes: FloatArray, misfits: bool) -> float | None:
         """Take the next exposure with its centroids, (n_outputs,). Where another controller is to act, it gives the
         slopes that this one would have left less, as a share of their root mean square, or NaN for a trial.
 
-        ``fit`` says how well the asked-for controller's model fits, as far as that is known.
+        ``misfits`` says whether the model is known not to fit.
         """
         held, before = np.concatenate([exposure.lead_inputs, exposure.inputs]), self._end
         self._end, self._since = exposure.first_step + exposure.n_steps, self._since + 1
@@ -90,7 +90,7 @@ class FallBack:
             return None
         squares = [float(np.nansum(each**2)) for each in (slopes, *(slopes + each.mean(axis=1) for each in moved))]
         self._judged.append([_blur(self._rig, exposure), *squares, *(float(each.var(axis=1).sum()) for each in moved)])
-        return self._verdict(fit)
+        return self._verdict(misfits)
 
     def _begin(self) -> None:
         """Forget earlier exposures, and judge from now on."""
@@ -99,14 +99,13 @@ class FallBack:
         """The blur's variance, the squared means, the real ones first, then those that each rival would have left, and
         the variance inside the exposure of the difference that each would have made."""
 
-    def _verdict(self, fit: Fit | None) -> float | None:
+    def _verdict(self, misfits: bool) -> float | None:
         if len(self._judged) < _FEWEST:
             return None
         count, (blur, real, *rest) = len(self._rivals), np.array(self._judged).T
         asked = self.acting == self._preferred
         # With a model that is known to be wrong there is no reason to expect more of the one that acts.
-        wrong = fit is not None and not fit.fits
-        required, sigmas = 0.0 if wrong and asked else _SIGMAS, _SIGMAS if wrong else _SIGMAS_OF_MOTION
+        required, sigmas = 0.0 if misfits and asked else _SIGMAS, _SIGMAS if misfits else _SIGMAS_OF_MOTION
         gains = [
             _mean_and_error(real - square - (1 - 2 * _needless(blur, inside, sigmas)) * inside)
             for square, inside in zip(rest[:count], rest[count:], strict=True)
@@ -116,7 +115,7 @@ class FallBack:
         if least[best] > _LEAST_GAIN * real.mean():
             before = real.mean() + max(float(np.nan_to_num(blur).mean()), 0.0)
             name, gained = list(self._rivals)[best], 1 - math.sqrt(max(1 - gains[best][0] / before, 0.0))
-        elif not asked and fit is not None and fit.nis_ratio <= TOLERATED_RATIO and self._since >= self._wait:
+        elif not asked and not misfits and self._since >= self._wait:
             name, gained = self._preferred, math.nan
         else:
             return None

@@ -11,12 +11,12 @@ import numpy as np
 
 from aolink.control.checked import CheckedController
 from aolink.control.controller import ControllerRow, Seen
-from aolink.control.drift import Fit, FitMonitor
 from aolink.control.fall_back import FallBack
 from aolink.control.registry import find_controller
 from aolink.errors import ControlError
 from aolink.estimation import Estimate, Needs, Status
 from aolink.estimation.frames.measure import measure
+from aolink.estimation.verdict import Fit
 from aolink.exposure import Exposure
 from aolink.numerics.arrays import FloatArray
 from aolink.numerics.rms import rms
@@ -59,8 +59,6 @@ class Act:
     """Root mean square of the estimated path inside the exposure, slope units; NaN without an estimate."""
     clipped_steps: int
     """Fast steps from the exposure before to this one whose wanted input the limits or the slew limit have changed."""
-    fit: Fit | None
-    """The model's fit; None while it is not known."""
     acting: str
     """The controller that acts: another one while the loop's own is worse (`FallBack`)."""
     gained: float
@@ -99,7 +97,6 @@ class ControlLoop:
         self.name, self.needs_state = row.name, row.needs_state
         self.delay_steps = delay_steps(rig)
         self.state, self.reason = State.CLOSED, ""
-        self.fit: Fit | None = None
         self._rig, self._controller = rig, CheckedController(row, rig)
         self._fall_back: FallBack | None = None
         if row.believes_a_model and rig.control.fall_back:
@@ -122,7 +119,6 @@ class ControlLoop:
         self._seen_any = False
         self._blind = self._trusted = 0
         self._clipped = 0
-        self._monitor = FitMonitor()
         timing = rig.timing
         self._patience = (BLIND_EXPOSURES + 1) * timing.frame_period_steps + self.delay_steps
         self._most_rows = 4 * self._patience + 2 * mirror.queue_steps
@@ -182,9 +178,8 @@ class ControlLoop:
             self.lose(f"frame {exposure.frame_id} came {first - end} fast steps late")
         self._forget_from(first)
         pending = np.array(self._held[max(end - self._oldest, 0) : first - self._oldest]).reshape(-1, len(self._park))
-        if estimate is not None:
-            self.fit = self._monitor.add(estimate)
-        gained = self._compare(exposure, slopes)
+        verdict = None if estimate is None else estimate.verdict
+        gained = self._compare(exposure, slopes, verdict is not None and verdict.fit is Fit.DOES_NOT_FIT)
         if self.state is State.CLOSED and len(pending):
             state = None if estimate is None else estimate.end_state
             self._controller.see(Seen(slopes=slopes, state=state, pending=pending))
@@ -196,7 +191,7 @@ class ControlLoop:
             late=first > end + self.delay_steps, state=self.state, reason=self.reason,
             slope_rms=rms(slopes[np.isfinite(slopes)]),
             path_rms=math.nan if estimate is None else rms(estimate.path[np.isfinite(estimate.path)]),
-            clipped_steps=clipped, fit=self.fit, acting=self.acting, gained=gained,
+            clipped_steps=clipped, acting=self.acting, gained=gained,
         )  # fmt: skip
 
     @property
@@ -211,14 +206,14 @@ class ControlLoop:
             self._trusted = 0
         self.reason = reason
 
-    def _compare(self, exposure: Exposure, slopes: FloatArray) -> float:
+    def _compare(self, exposure: Exposure, slopes: FloatArray, misfits: bool) -> float:
         """Let another controller act where this one is worse, or this one again; what is gained, NaN where unknown."""
         if self._fall_back is None:
             return math.nan
         if self.state is not State.CLOSED or not self._seen_any:
             self._fall_back.interrupt()
             return math.nan
-        gained = self._fall_back.see(exposure, slopes, self.fit)
+        gained = self._fall_back.see(exposure, slopes, misfits)
         if gained is None:
             return math.nan
         self._controller = self._fall_back.controller()

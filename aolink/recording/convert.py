@@ -3,7 +3,6 @@ which was written, bit for bit."""
 
 from __future__ import annotations
 
-import math
 from dataclasses import asdict
 from functools import lru_cache
 from typing import TYPE_CHECKING
@@ -60,11 +59,9 @@ def frame_messages(frame: Frame) -> tuple[pb.ExposureInfo, RawImage]:
 
 def control_message(act: Act, controller: str, estimator: str) -> pb.Control:
     """The message of a controller's result for an exposure."""
-    fit = act.fit
     return pb.Control(
         controller=controller, estimator=estimator, state=pb.Control.State.Name(act.state),
-        nis_ratio=math.nan if fit is None else fit.nis_ratio, whiteness=math.nan if fit is None else fit.whiteness,
-        model_fits=fit is None or fit.fits, **{name: getattr(act, name) for name in _OF_ACT},
+        **{name: getattr(act, name) for name in _OF_ACT},
     )  # fmt: skip
 
 

@@ -26,7 +26,7 @@ _LOSSES = (
     "frames_lost", "frames_incomplete", "scenes_lost", "scenes_incomplete", "connection_sequence_gaps",
     "connection_bad_crc", "connection_bad_framing", "connection_bad_payload", "chunks_refused", "steps_late",
     "steps_refused", "steps_not_reported", "steps_clipped", "steps_parked", "ports_vanished",
-    "control_open_exposures", "control_late_exposures", "control_misfit_exposures", "control_fall_back_exposures",
+    "control_open_exposures", "control_late_exposures", "control_fall_back_exposures",
 )  # fmt: skip
 """A session's counts of losses and faults."""
 _ENDS = ("commanded", "applied", "superseded", "late", "refused", "not_reported")

@@ -46,8 +46,7 @@ class Controlling:
         self._step_s, self._period = rig.timing.fast_step_s, rig.timing.frame_period_steps
         self._steps, self._n_inputs = rig.timing.exposure_steps, rig.n_inputs
         self._first_step = 0
-        self._state, self._fits = State.CLOSED, True
-        self._acting = self.loop.acting
+        self._state, self._acting = State.CLOSED, self.loop.acting
 
     def begin(self, first_step: int) -> None:
         """Begin the session with this fast step."""
@@ -90,13 +89,9 @@ class Controlling:
             held = "the mirror holds its input" if act.state is State.HELD else "the mirror goes to its safe input"
             lost = f"the loop is open from frame {frame} on, {held}: {act.reason}"
             news.append(f"the loop is closed again from frame {frame} on" if act.state is State.CLOSED else lost)
-        if act.fit is not None and act.fit.fits != self._fits:
-            self._fits = act.fit.fits
-            fits = "fits again" if act.fit.fits else "no longer fits the measurements"
-            news.append(f"the rig file's model {fits} (frame {frame}): {act.fit.text()}")
         if act.acting != self._acting:
             pays = f"{act.acting} would have left {100 * act.gained:.0f} % less of the slopes (rms) than {self._acting}"
-            tried = f"the model of {act.acting} fits: it is tried again"
+            tried = f"{act.acting} is tried again"
             news.append(f"{tried if math.isnan(act.gained) else pays}, and acts from frame {frame} on")
         self._state, self._acting = act.state, act.acting
         return news

@@ -55,8 +55,6 @@ class ControlReport:
     """Exposures with which the loop was open: the mirror held its input, or went to the safe one."""
     late_exposures: int = 0
     """Exposures that changed the inputs later than the rig file's ``control.delay_s``."""
-    misfit_exposures: int = 0
-    """Exposures at which the model no longer fitted."""
     fall_back_exposures: int = 0
     """Exposures after which another controller acted, because this one left larger slopes."""
     clipped_steps: int = 0
@@ -74,7 +72,6 @@ class ControlReport:
         self.exposures += 1
         self.open_exposures += act.state is not State.CLOSED
         self.late_exposures += act.late
-        self.misfit_exposures += act.fit is not None and not act.fit.fits
         self.fall_back_exposures += act.acting != self.controller
         self.clipped_steps += act.clipped_steps
         if not math.isnan(act.slope_rms):
@@ -85,15 +82,13 @@ class ControlReport:
         del self.delay_ms[:-_KEPT_LATENCIES]
         state = "" if act.state is State.CLOSED else f", loop {act.state.name.lower()}"
         self.note = f"slopes {act.slope_rms:.3g} rms, delay {self.delay_ms[-1]:.3g} ms{state}"
-        if act.fit is not None and not act.fit.fits:
-            self.note += ", the model does not fit"
         if act.acting != self.controller:
             self.note += f", fallen back to {act.acting}"
 
     def counts(self) -> dict[str, Any]:
         """All counts, with the median and the longest of the delays."""
         names = (
-            "exposures", "open_exposures", "late_exposures", "misfit_exposures", "fall_back_exposures", "clipped_steps",
+            "exposures", "open_exposures", "late_exposures", "fall_back_exposures", "clipped_steps",
             "slope_rms",
         )  # fmt: skip
         delays = sorted(self.delay_ms)

@@ -2,25 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import pytest
-
 from aolink.devices.host import Host
 from aolink.devices.no_mirror import NoMirror
-from aolink.estimation import make_estimator
 from aolink.recording import topics
 from aolink.recording.reader import Recording
 from aolink.recording.schemas_pb2 import ConnectionStatistics
 from aolink.recording.writer import RecordingWriter
 from aolink.rig import load_rig
-from aolink.session.controlling import Controlling
 from aolink.session.journal import Journal
 from aolink.session.report import Report
-from aolink.simulation.model import simulate
-from tests.control.rigs import DRIFT, small_rig
 from tests.kinds import messages_of
 
 
@@ -60,25 +53,3 @@ def test_warnings_that_differ_in_their_numbers_are_said_once_with_their_count(tm
     recording = Recording(tmp_path / "a.mcap")
     assert recording.counts[topics.LOG] == 6
     assert len(recording.metadata["warnings"]) < 400
-
-
-@pytest.mark.slow
-def test_a_controller_whose_model_fits_and_does_not_in_turn_says_so_once(tmp_path: Path) -> None:
-    """Its estimates are those of a rig that is shaken more than its file says, and those of one that is not."""
-    rig = small_rig(DRIFT)
-    right, wrong = (list(simulate(each, 120, seed=4)) for each in (rig, small_rig(DRIFT.replace("0.15", "0.26"))))
-    exposures = [
-        replace(each, frame_id=k, first_step=40 * k)
-        for k, each in enumerate([*right[:70], *wrong[:40], *right[70:], *wrong[40:]] * 2)
-    ]
-    controlling, estimator = Controlling(rig, "lqg", ["o1"]), make_estimator(rig, "o1")
-    controlling.begin(0)
-    with RecordingWriter(tmp_path / "a.mcap", rig, {}, 0, deterministic=True) as writer:
-        journal = Journal(writer, report := Report(), Host())
-        for each in exposures:
-            for text in controlling.see(each, estimator.step(each), each.first_step + 41)[2]:
-                journal.warn(text)
-    assert controlling.report.misfit_exposures > 0
-    said = [each for each in report.warnings if "the rig file's model" in each]
-    assert len(said) == 2
-    assert all(each.endswith(" times)") for each in said)

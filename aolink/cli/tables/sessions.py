@@ -109,7 +109,7 @@ def _control(report: ControlReport) -> str:
         text += f"; delay p50 {delay:.3g} ms, longest {report.counts()['longest_delay_ms']:.3g} ms"
     counts = (
         (report.late_exposures, "later than control.delay_s"), (report.open_exposures, "with the loop open"),
-        (report.misfit_exposures, "while the model did not fit"), (report.fall_back_exposures, "fallen back"),
+        (report.fall_back_exposures, "fallen back"),
         (report.clipped_steps, "steps changed by the limits"),
     )  # fmt: skip
     return ", ".join([text, *_counted(counts)])
