@@ -56,8 +56,6 @@ class ObservabilityReport:
     centroid_rank: int
     """The same for (A^N, C-bar), the means over exposures; remark 1 holds where it equals ``rank``, and it need not."""
     modes: tuple[Eigenmode, ...]
-    o2_needs: str
-    """The condition under which an estimator of the second moment alone (`o2`) works."""
 
     @property
     def unseen(self) -> tuple[Eigenmode, ...]:
@@ -102,7 +100,6 @@ def observability(plant: Plant, n_steps: int, fast_step_s: float) -> Observabili
             )
         )
     n = plant.n_states
-    stable = bool(np.abs(lifted).max() < 1 - 1e-9)
     # Eigenvectors of different eigenvalues are independent.
     rank, centroid_rank = (n - sum(space.shape[1] for space in spaces) for spaces in (blind, lost))
     return ObservabilityReport(
@@ -110,7 +107,6 @@ def observability(plant: Plant, n_steps: int, fast_step_s: float) -> Observabili
         rank=rank,
         centroid_rank=centroid_rank,
         modes=tuple(modes),
-        o2_needs=_o2_needs(stable, centroid_rank == n),
     )
 
 
@@ -153,15 +149,3 @@ def _has_part_in(A: FloatArray, value: complex, space: NDArray[Any], parts: list
     # The eigenvalue's left invariant space: a vector that it does not annihilate has a component in the eigenmode.
     left = null_space(A, value, parts, _SAME, left=True, power=len(A))
     return bool(np.linalg.norm(left.conj().T @ space) > 1e-6)
-
-
-def _o2_needs(stable: bool, observable: bool) -> str:
-    needs = [
-        "a spot off centre (drive.offset or drive.amplitude, or plant.initial_mean): where it"
-        " rests in the middle, a blur's width does not tell x from -x"
-    ]
-    if not stable:
-        needs.append("a plant that forgets (every eigenvalue of A inside the unit circle): this one does not")
-    if not observable:
-        needs.append("centroids that show every state: here they do not")
-    return "; ".join(needs)

@@ -101,7 +101,7 @@ class Timing:
     """The timing of fast steps and exposures. Exposure j covers ``exposure_steps`` steps from j *
     ``frame_period_steps`` on."""
 
-    fast_step_s: Annotated[float, Within(above=0.0, high=1e4)]
+    fast_step_s: Annotated[float, Within(1e-6, 1e4)]
     """T_f, s."""
     exposure_steps: Annotated[int, Within(1, 1_000_000)]
     """N, fast steps in one exposure."""
@@ -143,7 +143,7 @@ class MirrorDriver:
     """Fast steps in one command block; if left out 50, or as many as fit into a packet."""
     queue_steps: Annotated[int, Within(1)]
     """Fast steps that the device can hold; if left out eight blocks."""
-    watchdog_s: Positive = 1.0
+    watchdog_s: Annotated[float, Within(above=0.0, high=60.0)] = 1.0
     """The mirror parks itself when no valid packet has come for this time, s."""
     slew_max_per_s: NotNegative = 0.0
     """Most that an input may change in a second; the host refuses commands that change faster. 0 for no limit."""
@@ -311,8 +311,8 @@ class Simulation:
     """The lights: each start of the camera takes the next one; the last one stays."""
     clock_offset_s: Annotated[float, Within(-1e9, 1e9)] = 0.0
     """Device clock minus host clock at the start, s."""
-    clock_drift_ppm: Annotated[float, Within(-1e5, 1e5)] = 0.0
+    clock_drift_ppm: Annotated[float, Within(-1000.0, 1000.0)] = 0.0
     """How much faster the device clock runs than the host's, parts per million."""
-    latency_s: Seconds = 100e-6
+    latency_s: Annotated[float, Within(0.0, 0.1)] = 100e-6
     """Median one-way latency of the link on virtual time, s."""
     faults: Faults = Faults()

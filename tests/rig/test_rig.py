@@ -70,7 +70,7 @@ def changed(old: str, new: str) -> str:
             "sensor.kind = 'line' sees one slope, but the plant",
         ),
         ("process_noise = 0.1", "process_noise = -0.1", "plant.process_noise has the negative eigenvalue -0.1"),
-        ("fast_step_s = 0.001", "fast_step_s = 0", "timing.fast_step_s = 0 must be above 0"),
+        ("fast_step_s = 0.001", "fast_step_s = 0", "timing.fast_step_s = 0 must be at least"),
         ("fast_step_s = 0.001", 'fast_step_s = "fast"', "timing.fast_step_s: expected a finite number, found 'fast'"),
         ("exposure_steps = 200", "exposure_steps = 2.5", "timing.exposure_steps: expected a whole number"),
         (
