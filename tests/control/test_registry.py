@@ -50,10 +50,7 @@ def test_it_may_refuse_a_rig(with_example: dict[str, str]) -> None:
 
 @pytest.mark.parametrize(
     ("value", "why"),
-    [
-        ("nowhere.at_all:ROW", "cannot be loaded: ModuleNotFoundError"),
-        ("math:pi", "(math:pi) is 3.14159"),
-    ],
+    [("nowhere.at_all:ROW", "cannot be loaded: ModuleNotFoundError"), ("math:pi", "(math:pi) is 3.14159")],
 )
 def test_a_broken_package_is_one_line_for_who_asks_for_it(
     with_example: dict[str, str], tmp_path: Path, value: str, why: str

@@ -18,8 +18,7 @@ from tests.kinds import line_of, truth_of
 
 RIG = load_rig("section-vi")
 STILL = dataclasses.replace(
-    RIG,
-    plant=dataclasses.replace(RIG.plant, process_noise=np.zeros((1, 1)), initial_covariance=np.zeros((2, 2))),
+    RIG, plant=dataclasses.replace(RIG.plant, process_noise=np.zeros((1, 1)), initial_covariance=np.zeros((2, 2)))
 )
 
 

@@ -33,10 +33,7 @@ def test_every_pixel_arrives_and_ids_go_on_where_16_bits_end(tmp_path: Path) -> 
     It is asked for 1000 frames a second, its most; a busy machine gives 200.
     """
     pictures = noise(16, 16)
-    with (
-        gige_camera(tmp_path, packed(pictures, PIXEL_FORMATS["Mono16"]), {}),
-        opened(fast_rig(), FAKE) as camera,
-    ):
+    with gige_camera(tmp_path, packed(pictures, PIXEL_FORMATS["Mono16"]), {}), opened(fast_rig(), FAKE) as camera:
         assert camera.description.startswith("Aravis Fake, serial number GV01, firmware 0.8.")
         assert camera.description.endswith(", Mono16 from 127.0.0.1 by Aravis")
         assert camera.lacks == (Lacks.TIME, Lacks.TRIGGER)

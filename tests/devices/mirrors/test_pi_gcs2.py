@@ -127,10 +127,7 @@ def test_what_a_controller_cannot_tell_is_not_needed(unknown: str) -> None:
         ({"CSV?": "3.0"}, "speaks version 3.0 of its command set, this driver version 2"),
         ({"CSV?": "new"}, "answers CSV[?] with 'new', which is no answer of GCS 2"),
         ({"SAI?": "A \nB"}, "has the axes A, B, not 1, 2: correct devices.mirror.axes"),
-        (
-            {"TMN? 1 2": "1=9 \n2=0"},
-            "are 7.5 to 27.5 by .* scale and offset, the PI axis 1 goes from 9 to 36.5",
-        ),
+        ({"TMN? 1 2": "1=9 \n2=0"}, "are 7.5 to 27.5 by .* scale and offset, the PI axis 1 goes from 9 to 36.5"),
         ({"TMX? 1 2": "1=36 \n2=much"}, r"answers TMX\? 1 2 with '1=36  2=much', which is no answer"),
         ({"TMX? 1 2": "1=36 \n2=nan"}, r"answers TMX\? 1 2 with '1=36  2=nan', which is no answer"),
         ({"TMX? 1 2": "1=36"}, r"answers TMX\? 1 2 with '1=36', which is no answer"),

@@ -145,18 +145,12 @@ def test_a_unit_that_is_not_as_it_should_be_is_one_line(behaviour: dict[str, Any
 @pytest.mark.parametrize(
     ("behaviour", "what"),
     [
-        (
-            {"faults": Faults(silent_from=0)},
-            "the Thorlabs aligner at .* does not answer .*nothing came: is it",
-        ),
+        ({"faults": Faults(silent_from=0)}, "the Thorlabs aligner at .* does not answer .*nothing came: is it"),
         ({"faults": Faults(silent_from=5)}, "the Thorlabs aligner at .* does not answer .*nothing came"),
         ({"faults": Faults(late_s=1.2)}, "the Thorlabs aligner at .* does not answer .*nothing came"),
         ({"faults": Faults(garbled=frozenset([0]))}, "which is no message of Thorlabs' APT protocol that this driver"),
         ({"faults": Faults(garbled=frozenset([1]))}, "which is no message of Thorlabs' APT protocol that this driver"),
-        (
-            {"complains_at": 4},
-            "reports an error as it is asked quad_req_positionoutputs: code 7 Actuator not",
-        ),
+        ({"complains_at": 4}, "reports an error as it is asked quad_req_positionoutputs: code 7 Actuator not"),
         ({"faults": Faults(unplugged_at=3)}, r"lost /dev/pts/\d+"),
     ],
 )
