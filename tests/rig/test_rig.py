@@ -40,11 +40,7 @@ def changed(old: str, new: str) -> str:
         (A, '[["1", 0], [0, 1]]', r"plant.A: expected numbers in rows of equal length, found \[\['1', 0"),
         ("process_noise = 0.1", 'process_noise = "0.1"', "plant.process_noise: expected numbers .* found '0.1'"),
         ("process_noise = 0.1", "process_noise = true", "plant.process_noise: expected numbers .* found True"),
-        (
-            "field = [-1.0, 1.0]",
-            'field = "wide"',
-            "sensor.field: expected numbers in rows of equal length, found 'wide'",
-        ),
+        ("field = [-1.0, 1.0]", 'field = "wide"', "sensor.field: expected numbers in rows of equal length, found"),
         ("bit_depth = 16", 'bit_depth = "16"', "sensor.bit_depth: expected a whole number, found '16'"),
         ("photoelectrons = 0 ", "read_noise_counts = 1 ", "sensor has more than one of noise_density, read_noise_c"),
         (A, "[[1.0, 0.1], [0.1, 0.9]]", "plant.A is unstable: .* modulus 1.06"),
@@ -57,11 +53,7 @@ def changed(old: str, new: str) -> str:
         ("fast_step_s = 0.001", "fast_step_s = 0", "timing.fast_step_s = 0 must be at least"),
         ("fast_step_s = 0.001", 'fast_step_s = "fast"', "timing.fast_step_s: expected a finite number, found 'fast'"),
         ("exposure_steps = 200", "exposure_steps = 2.5", "timing.exposure_steps: expected a whole number"),
-        (
-            "exposure_steps = 200",
-            "exposure_steps = 200\nframe_period_steps = 100",
-            "timing.frame_period_steps = 100 is",
-        ),
+        ("exposure_steps = 200", "exposure_steps = 200\nframe_period_steps = 100", "timing.frame_period_steps = 100"),
         ('kind = "line"', 'kind = "square"', "sensor.kind = 'square' is not known: use one of line"),
         ("field = [-1.0, 1.0]", "field = [1.0, -1.0]", "the lower edge must be below the upper one"),
         ("field = [-1.0, 1.0]", "field = [1.0]", "sensor.field has shape 1, expected 2"),
@@ -75,23 +67,11 @@ def changed(old: str, new: str) -> str:
         ("amplitude = 0.0109", "", "drive.amplitude is missing"),
         ("[simulation]", "[simulation.faults]\nbit_flip_rate = 2\n[simulation]", "simulation.faults.bit_flip_rate = 2"),
         ("photoelectrons = 0 ", "photoelectrons = -1 ", "sensor.photoelectrons = -1 must be at least 0"),
-        (
-            "[simulation]",
-            '[simulation]\nlight = "dim"',
-            "simulation.light: 'dim' is not known: use dark, flat, flat:DEN",
-        ),
+        ("[simulation]", '[simulation]\nlight = "dim"', "simulation.light: 'dim' is not known: use dark, flat"),
         ("[simulation]", '[simulation]\nlight = "dark:3"', "simulation.light: 'dark:3' is not known"),
-        (
-            "[simulation]",
-            '[simulation]\nlight = "flat:x"',
-            "simulation.light: the density of 'flat:x' must be a number",
-        ),
+        ("[simulation]", '[simulation]\nlight = "flat:x"', "simulation.light: the density of 'flat:x' must be a"),
         ("[simulation]", "[calibration]\nsd = 1\n[simulation]", "calibration.sd is not a key that aolink knows"),
-        (
-            "[simulation]",
-            "[calibration]\nkernel_sigma_sd = -1\n[simulation]",
-            "calibration.kernel_sigma_sd = -1 must be",
-        ),
+        ("[simulation]", "[calibration]\nkernel_sigma_sd = -1\n[simulation]", "calibration.kernel_sigma_sd = -1 must"),
         ("[simulation]", "[calibration]\ndark_frames = 0.5\n[simulation]", "calibration.dark_frames: expected a whole"),
         ("[simulation]", "[calibration]\nsources = [1]\n[simulation]", r"sources\[0\]: expected text, found 1"),
         ("[simulation]", "[simulation", "not valid TOML"),
@@ -223,11 +203,7 @@ def test_check_says_what_is_wrong_and_what_is_lost(
 @pytest.mark.parametrize(
     ("name", "sigma", "message"),
     [
-        (
-            "single-lenslet",
-            "[[0.1, 0.02], [0.02, 0.1]]",
-            "each copy of the plant moves a spot along one direction only",
-        ),
+        ("single-lenslet", "[[0.1, 0.02], [0.02, 0.1]]", "each copy of the plant moves a spot along one direction"),
         ("section-vi", "[[0.1, 0.02], [0.02, 0.1]]", "a line sensor sees one direction: give a number"),
         ("single-lenslet", "[[0.1, 0.02], [0.03, 0.1]]", "must be symmetric and positive definite"),
         ("single-lenslet", "[[0.1, 0.2], [0.2, 0.1]]", "must be symmetric and positive definite"),
@@ -266,12 +242,7 @@ def test_a_row_of_inputs_and_their_limits_must_fit_into_a_message() -> None:
 @pytest.mark.parametrize(
     ("name", "old", "new", "message"),
     [
-        (
-            "section-vi",
-            "[sensor.kernel]",
-            "[sensor.kernal]",
-            r"sensor.kernel is missing: you wrote kernal; .* kernel\?",
-        ),
+        ("section-vi", "[sensor.kernel]", "[sensor.kernal]", r"sensor.kernel is missing: you wrote kernal"),
         ("section-vi", "sigma =", "sigam =", r"sensor.kernel.sigam is not a key .* did you mean sigma\?"),
         ("section-vi", "field =", "feild =", r"sensor.field is missing: you wrote feild; did you mean field\?"),
         ("section-vi", "fast_step_s", "fast-step-s", "timing.fast_step_s is missing: you wrote fast-step-s; did you"),

@@ -120,10 +120,7 @@ def test_what_a_controller_cannot_tell_is_not_needed(unknown: str) -> None:
 @pytest.mark.parametrize(
     ("answers", "what"),
     [
-        (
-            {"*IDN?": "HEWLETT-PACKARD,34401A,0,1"},
-            "identifies itself as 'HEWLETT-PACKARD,34401A,0,1', not as a controller of",
-        ),
+        ({"*IDN?": "HEWLETT-PACKARD,34401A,0,1"}, "identifies itself as 'HEWLETT-PACKARD,34401A,0,1', not as a"),
         ({"CSV?": "3.0"}, "speaks version 3.0 of its command set, this driver version 2"),
         ({"CSV?": "new"}, "answers CSV[?] with 'new', which is no answer of GCS 2"),
         ({"SAI?": "A \nB"}, "has the axes A, B, not 1, 2: correct devices.mirror.axes"),

@@ -101,10 +101,7 @@ def test_a_slow_line_or_other_messages_do_an_aligner_no_harm(behaviour: dict[str
         ({"bays": None, "port": ["a", "b"], "closed_loop": True}, "travel_um: in closed loop cubes need the travel of"),
         ({"unit": 40.0}, "are -5 to 75 V by devices.mirror.s unit and zero, the Thorlabs unit goes from 0 to 75 V"),
         ({"closed_loop": True}, "are 5 to 65 um by devices.mirror.s unit and zero, .* from 0 to 20 um"),
-        (
-            {"unit": 1e-3},
-            "mirror.dac_bits = 12 is finer than the Thorlabs unit, which goes in steps of 2.29 of an input",
-        ),
+        ({"unit": 1e-3}, "mirror.dac_bits = 12 is finer than the Thorlabs unit, which goes in steps of 2.29 of an"),
         ({"unit": 0}, "devices.mirror.unit: expected a number that is not zero, found 0"),
         ({"zero": [1, 2, 3]}, "devices.mirror.zero: expected a finite number, or a list of 2"),
         ({"bays": [1]}, r"has 2 input\(s\), and port = '/dev/pts/\d+', bays = \[1\] name 1 unit"),
