@@ -41,6 +41,8 @@ class SerialMirror:
     """Keys of ``[devices.mirror]``, without the port."""
     inputs: Callable[[NDArray[np.float64]], NDArray[np.float64]]
     """The rig's inputs, (2,), from what its simulator holds."""
+    called: str
+    """How its description begins."""
 
     def rig(self, device: SerialDevice, camera: str = "", watchdog_s: float = 30.0) -> Rig:
         """A rig with it, and with a camera that sees it, unless it has another one."""
@@ -75,17 +77,20 @@ MIRRORS = {
         OptotuneSimulator,
         f'driver = "optotune"\nunit_rad = {_UNIT_RAD}',
         lambda xy: np.asarray(np.arctan(xy * _TAN_50) / _UNIT_RAD),
+        "Optotune MR-E-3",
     ),
     "pi_gcs2": SerialMirror(
         PiSimulator,
         'driver = "pi_gcs2"\naxes = ["1", "2"]\nscale = 10\noffset = 17.5',
         lambda positions: (positions[:2] - 17.5) / 10,
+        "PI E-727.3SDA",
     ),
     "thorlabs_aligner": SerialMirror(
-        Aligner, 'driver = "thorlabs_aligner"\nunit = 5.0\nzero = 1.0', lambda volts: (volts - 1) / 5
+        Aligner, 'driver = "thorlabs_aligner"\nunit = 5.0\nzero = 1.0', lambda volts: (volts - 1) / 5, "Thorlabs KPA101"
     ),
     "thorlabs_piezo": SerialMirror(
-        _bays, 'driver = "thorlabs_piezo"\nunit = 30.0\nzero = 35.0\nbays = [1, 2]', lambda volts: (volts - 35) / 30
+        _bays, 'driver = "thorlabs_piezo"\nunit = 30.0\nzero = 35.0\nbays = [1, 2]', lambda volts: (volts - 35) / 30,
+        "Thorlabs BPC303",
     ),
 }  # fmt: skip
 

@@ -1,4 +1,4 @@
-"""What goes wrong on the line of any serial mirror when it is opened; `test_sessions_on_bad_lines` has the rest."""
+"""What goes wrong on the line of any serial mirror when it is opened; `test_sessions` has the rest."""
 
 from __future__ import annotations
 

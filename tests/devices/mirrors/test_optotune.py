@@ -17,8 +17,7 @@ from hypothesis import strategies as st
 
 from aolink.devices.mirrors.optotune import OptotuneMirror
 from aolink.devices.paced import PacedMirror
-from aolink.devices.simple import Lacks
-from aolink.errors import DeviceError, PortError, RigError
+from aolink.errors import DeviceError, RigError
 from aolink.estimation import make_estimator
 from aolink.extensions import installed
 from aolink.jobs.calibrate import Poked, interaction, record_pokes
@@ -85,16 +84,6 @@ def test_a_driver_that_was_left_in_its_pro_mode_is_brought_back() -> None:
         assert simulator.now() == (0, 0)
 
 
-@pytest.mark.parametrize("faults", [Faults(split=True), Faults(late_s=0.02)])
-def test_answers_in_pieces_and_late_ones_are_whole(faults: Faults) -> None:
-    with OptotuneSimulator(faults) as simulator:
-        mirror = opened(simulator)
-        for x in (0.1, 0.2, 0.3):
-            np.testing.assert_allclose(mirror.put(np.array([x, 0.0])), [x, 0], atol=1e-5)
-        mirror.close()
-        assert len(simulator.held) == 5
-
-
 @pytest.mark.parametrize(
     ("answers", "what"),
     [
@@ -113,16 +102,6 @@ def test_a_driver_that_is_not_ready_or_another_one(answers: dict[str, str], what
             opened(simulator)
         with pytest.raises(DeviceError, match=what):  # the port was given back
             opened(simulator)
-
-
-def test_an_answer_that_was_garbled() -> None:
-    with OptotuneSimulator(Faults(garbled=frozenset({6}))) as simulator:
-        mirror = opened(simulator)
-        with pytest.raises(DeviceError, match=r"answers XY=0.1.* with .*: is the cable good\?"):
-            mirror.put(np.array([0.3, 0.0]))
-        mirror.park()
-        assert simulator.now() == (0, 0)
-        mirror.close()
 
 
 @pytest.fixture
@@ -152,16 +131,6 @@ def session(rig_of: RigOf, tmp_path: Path) -> Session:
         return record(rig, None, None, tmp_path / "a.mcap", exposures=10, report=report)
 
     return run
-
-
-@pytest.mark.slow
-def test_a_session_is_recorded_and_estimated(session: Session, tmp_path: Path) -> None:
-    with OptotuneSimulator() as simulator:
-        report = session(simulator)
-        assert simulator.now() == (0, 0)
-    bench.check_session(report, tmp_path / "a.mcap", "Optotune MR-E-3")
-    lacks = Recording(tmp_path / "a.mcap").metadata["mirror_lacks"].split("; ")
-    assert lacks == [*OptotuneMirror.lacks, Lacks.QUEUE]
 
 
 @pytest.mark.slow
@@ -249,11 +218,6 @@ def test_the_driver_is_a_mirror_without_a_queue() -> None:
         mirror.close()
         assert simulator.now() == (0, 0)
         assert simulator.held[-2][1] == pytest.approx(2 * (math.tan(0.15) / TAN_50,), abs=1e-6)
-
-
-def test_a_port_that_is_not_there() -> None:
-    with pytest.raises(PortError, match="there is no port /dev/no-such-port"):
-        OptotuneMirror(RIG, port="/dev/no-such-port", unit_rad=0.1)
 
 
 ANGLE_RAD = st.floats(-1.5, 1.5)

@@ -1,4 +1,4 @@
-"""What goes wrong on the line of any serial mirror in the middle of a session."""
+"""Sessions with any serial mirror, and what goes wrong on its line in the middle of one."""
 
 from __future__ import annotations
 
@@ -16,6 +16,18 @@ from tests.devices.mirrors.serial_mirrors import MIRRORS, PARK, UNDER_WAY, with_
 from tests.devices.simulators.serial_device import Faults
 
 Session = Callable[..., Path]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "behaviour"), [*((name, {}) for name in MIRRORS), ("pi_gcs2", {"travel_s": 5 * bench.FAST_STEP_S})]
+)
+def test_a_session_is_recorded_and_estimated(name: str, behaviour: dict[str, float], session: Session) -> None:
+    """Also with a stage that is never on its target in it: what it was told counts, its way there is the plant's."""
+    with MIRRORS[name].make(**behaviour) as device:
+        path = session(name, device, report := Report(), exposures=10)
+        assert MIRRORS[name].is_parked(device)
+    bench.check_session(report, path, MIRRORS[name].called)
 
 
 @pytest.mark.slow
@@ -71,3 +83,33 @@ def test_a_unit_whose_power_failed_for_a_moment_is_seen_not_to_follow(session: S
         np.testing.assert_allclose(last.inputs, np.tile(rest, (len(last.inputs), 1)), atol=1e-3)
 
     with_each(check, ["thorlabs_aligner", "thorlabs_piezo"])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("faults", "what"),
+    [
+        (Faults(garbled=frozenset({0}), after_moves=UNDER_WAY), "cable good|is no message|line loses bytes"),
+        (Faults(refused=frozenset({1}), after_moves=UNDER_WAY), "with 'NO'|its error 53|an error .* code 7"),
+        (Faults(unplugged_at=5, after_moves=UNDER_WAY), r"lost /dev/pts/\d+: .*is the device still there\?"),
+        (Faults(silent_from=5, after_moves=UNDER_WAY), "does not answer .*nothing came: is it switched on"),
+        (Faults(late_s=1.3, after_moves=UNDER_WAY), "does not answer .*came: is it switched on"),
+    ],
+    ids=["garbled", "refused", "unplugged", "silent", "too late"],
+)
+def test_a_line_that_fails_ends_the_session_with_the_mirror_parked_where_it_hears(
+    faults: Faults, what: str, session: Session, tmp_path: Path
+) -> None:
+    """A line that is late by more than the driver waits is one that does not answer."""
+
+    def check(name: str) -> None:
+        with MIRRORS[name].make(faults=faults) as device:
+            with pytest.raises(AolinkError, match=what) as raised:
+                session(name, device, report := Report())
+            assert "\n" not in str(raised.value)
+            assert "lost" in what or MIRRORS[name].is_parked(device)
+        assert bench.steps_ended(report) == report.steps_commanded > 0
+        bench.check_ended(report, tmp_path / f"{name}.mcap")
+
+    # The piezo's line is the aligner's, and has twice as many answers to wait for.
+    with_each(check, MIRRORS.keys() - ({"thorlabs_piezo"} if faults.late_s else {}))
