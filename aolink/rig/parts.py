@@ -259,18 +259,10 @@ class Faults:
 
 
 FAULT_NAMES = {
-    "bitflip": "bit_error_rate",
-    "lost": "byte_loss_rate",
-    "repeated": "byte_repeat_rate",
-    "inserted": "byte_insert_rate",
-    "burst": "burst_rate",
-    "stall": "stall_rate",
-    "vanish": "vanish_rate",
-    "late": "late_rate",
-    "missing": "chunk_loss_rate",
-    "saturated": "saturation_rate",
-    "dark": "dark_rate",
-}
+    "bitflip": "bit_error_rate", "lost": "byte_loss_rate", "repeated": "byte_repeat_rate",
+    "inserted": "byte_insert_rate", "burst": "burst_rate", "stall": "stall_rate", "vanish": "vanish_rate",
+    "late": "late_rate", "missing": "chunk_loss_rate", "saturated": "saturation_rate", "dark": "dark_rate",
+}  # fmt: skip
 """Short names of faults, as ``aolink sim --fault`` takes them beside the keys themselves."""
 
 

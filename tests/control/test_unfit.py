@@ -20,9 +20,6 @@ from tests.control.unfit import EXPOSURES, installed
 Run = Callable[..., "subprocess.CompletedProcess[str]"]
 UNFIT = [
     ("three", "the controller three gives an array of (3,), expected (1,) finite inputs"),
-    ("crossed", "the controller crossed failed: ValueError('matmul: Input operand 1 has a mismatch"),
-    ("not_a_number", "the controller not_a_number gives a number that is not finite, expected (1,) finite inputs"),
-    ("infinite", "the controller infinite gives a number that is not finite, expected (1,) finite inputs"),
     ("refuses", "the controller refuses cannot say whether it works on loop: ValueError('no rig like this')"),
 ]
 
@@ -60,16 +57,6 @@ def test_a_session_with_it_ends_before_a_port_is_opened(
     assert line.startswith(f"aolink: {message}")
     assert "parked" not in line
     assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("name", "message"), UNFIT[:1])
-def test_a_replay_with_it_is_one_line(
-    aolink: Run, with_unfit: dict[str, str], session: Path, name: str, message: str
-) -> None:
-    line = one_line(aolink("replay", session, "--control", name, env=with_unfit))
-    assert line.startswith(f"aolink: {message}")
-    assert "parked" not in line
 
 
 @pytest.mark.slow

@@ -39,9 +39,6 @@ def _fails(rig: Rig) -> str | None:
 
 
 THREE = row("three", lambda exposures, slopes: np.zeros(3))
-CROSSED = row("crossed", lambda exposures, slopes: np.eye(1, 3) @ slopes)
-NOT_A_NUMBER = row("not_a_number", lambda exposures, slopes: np.full(1, np.nan))
-INFINITE = row("infinite", lambda exposures, slopes: np.full(1, np.inf))
 HUGE = row("huge", lambda exposures, slopes: 1e250 * slopes)
 LATE = row("late", lambda exposures, slopes: np.full(1 if exposures <= EXPOSURES else 3, 0.5 * (exposures > 42)))
 REFUSES = ControllerRow(name="refuses", summary="", build=lambda rig: Unfit(lambda *_: np.zeros(1)), refusal=_fails)
@@ -52,7 +49,7 @@ def installed(folder: Path, environment: dict[str, str]) -> dict[str, str]:
     metadata = folder / "unfit-0.1.dist-info"
     metadata.mkdir(parents=True)
     (metadata / "METADATA").write_text("Metadata-Version: 2.1\nName: unfit\nVersion: 0.1\n")
-    rows = ("three", "crossed", "not_a_number", "infinite", "huge", "late", "refuses")
+    rows = ("three", "huge", "late", "refuses")
     points = "".join(f"{name} = {__name__}:{name.upper()}\n" for name in rows)
     (metadata / "entry_points.txt").write_text(f"[aolink.controllers]\n{points}")
     return environment | {"PYTHONPATH": f"{folder}:{environment['PYTHONPATH']}"}

@@ -101,8 +101,10 @@ class CameraBench(Bench):
         return super().time_ns() + CAMERA_ZERO_NS
 
 
-def mirror_of(bench: Bench) -> AdaptedMirror:
-    mirror = AdaptedMirror(RIG, bench, Delay(), bench.now_ns)
+def mirror_of(bench: Bench, **changes: float) -> AdaptedMirror:
+    """With a clock that was read once; changes are keys of ``[mirror]``."""
+    rig = replace(RIG, mirror=replace(RIG.mirror, **changes))
+    mirror = AdaptedMirror(rig, bench, Delay(), bench.now_ns)
     mirror.query_clock(bench.host_ns)
     mirror.poll()
     return mirror
@@ -347,10 +349,7 @@ def test_a_second_picture_is_not_to_be_had_of_a_simple_driver(bench: CameraBench
 
 def test_a_mirror_that_the_session_leaves_alone_is_parked_by_the_hosts_watchdog() -> None:
     """It takes no command until it is re-armed, and the steps between are reported as those of the watchdog."""
-    rig = replace(RIG, mirror=replace(RIG.mirror, watchdog_s=0.05))
-    bench = Bench()
-    mirror = AdaptedMirror(rig, bench, Delay(), bench.now_ns)
-    mirror.query_clock(bench.host_ns)
+    mirror = mirror_of(bench := Bench(), watchdog_s=0.05)
     mirror.send_block(10, np.full((20, 1), 0.01), 0, 0)
     mirror.poll()
     bench.host_ns += 20 * STEP_NS
@@ -367,16 +366,13 @@ def test_a_mirror_that_the_session_leaves_alone_is_parked_by_the_hosts_watchdog(
     bench.host_ns += 20 * STEP_NS
     assert mirror.rearm() == 41
     mirror.send_block(41, np.full((4, 1), 0.01), 0, 0)
-    bench.reports = [(10, np.concatenate([held(10), np.tile(rig.mirror.park, (21, 1)), held(4)]))]
+    bench.reports = [(10, np.concatenate([held(10), np.tile(RIG.mirror.park, (21, 1)), held(4)]))]
     assert ends(mirror) == [(1, 10, 10, 0), (0, 20, 21, pb.Applied.WATCHDOG), (3, 41, 4, 0)]
     mirror.close()
 
 
 def test_a_mirror_that_the_session_serves_is_left_alone_by_the_watchdog() -> None:
-    rig = replace(RIG, mirror=replace(RIG.mirror, watchdog_s=1.0))
-    bench = Bench()
-    mirror = AdaptedMirror(rig, bench, Delay(), bench.now_ns)
-    mirror.query_clock(bench.host_ns)
+    mirror = mirror_of(bench := Bench(), watchdog_s=1.0)
     mirror.send_block(10, np.full((20, 1), 0.01), 0, 0)
     until_s = time.monotonic() + 0.6
     while time.monotonic() < until_s:
@@ -387,10 +383,7 @@ def test_a_mirror_that_the_session_serves_is_left_alone_by_the_watchdog() -> Non
 
 
 def test_the_watchdog_watches_again_once_it_was_re_armed_and_no_longer_once_the_session_has_parked() -> None:
-    rig = replace(RIG, mirror=replace(RIG.mirror, watchdog_s=0.05))
-    bench = Bench()
-    mirror = AdaptedMirror(rig, bench, Delay(), bench.now_ns)
-    mirror.query_clock(bench.host_ns)
+    mirror = mirror_of(bench := Bench(), watchdog_s=0.05)
     mirror.send_block(10, np.full((20, 1), 0.01), 0, 0)
     for times in (1, 2):
         eventually(lambda: mirror.latched)
@@ -424,7 +417,6 @@ def test_a_mirror_that_could_not_be_parked_is_parked_when_it_is_closed(commanded
 
 
 def test_the_watchdog_leaves_alone_a_mirror_that_was_closed_while_it_waited_for_the_driver() -> None:
-    rig = replace(RIG, mirror=replace(RIG.mirror, watchdog_s=0.05))
     calls, bench = [], Bench()
     bench.park = lambda: calls.append("park") or 7  # type: ignore[method-assign, func-returns-value]
 
@@ -433,8 +425,7 @@ def test_the_watchdog_leaves_alone_a_mirror_that_was_closed_while_it_waited_for_
         calls.append("close")
 
     bench.close = close  # type: ignore[method-assign]
-    mirror = AdaptedMirror(rig, bench, Delay(), bench.now_ns)
-    mirror.query_clock(bench.host_ns)
+    mirror = mirror_of(bench, watchdog_s=0.05)
     mirror.send_block(10, np.full((20, 1), 0.01), 0, 0)
     bench.time_ns = lambda: time.sleep(0.3) or 0  # type: ignore[method-assign, func-returns-value]
     mirror.query_clock(bench.host_ns)  # the watchdog waits for the driver meanwhile
@@ -444,8 +435,7 @@ def test_the_watchdog_leaves_alone_a_mirror_that_was_closed_while_it_waited_for_
 
 
 def test_a_command_that_changes_too_fast_is_refused() -> None:
-    rig = replace(RIG, mirror=replace(RIG.mirror, slew_max_per_s=0.001 / RIG.timing.fast_step_s))
-    mirror = AdaptedMirror(rig, bench := Bench(), Delay(), bench.now_ns)
+    mirror = mirror_of(Bench(), slew_max_per_s=0.001 / RIG.timing.fast_step_s)
     mirror.send_block(0, np.array([[0.001], [0.002]]), 0, 0)
     with pytest.raises(DeviceError, match=r"input 0 changes by 0.0015 to fast step 3, more than mirror.slew_max_per_s"):
         mirror.send_block(2, np.array([[0.003], [0.0045]]), 0, 0)

@@ -74,26 +74,10 @@ class Scale:
                 f" {self._keys}, {device if isinstance(device, str) else device[at]} goes from {least:g} to"
                 f" {most:g}{unit}: correct one of them"
             )
-        if np.any(step):
-            check_resolution(self._mirror, np.abs(step / self.unit), str(device))
-
-
-def check_resolution(mirror: MirrorDriver, step: float | NDArray[np.float64], device: str) -> None:
-    """Refuse a rig file with finer steps of the inputs than a device takes.
-
-    Parameters
-    ----------
-    step:
-        The device's steps, in units of the inputs: a number, or (n_inputs,).
-
-    Raises
-    ------
-    DeviceError
-        It is finer: the input that the device holds would count as another input than the one commanded.
-    """
-    if (converter_margin(mirror) < step).any():
-        bits = int(np.log2(((mirror.input_max - mirror.input_min) / step).min() * (1 + _ROUNDING) + 1))
-        raise DeviceError(
-            f"mirror.dac_bits = {mirror.dac_bits} is finer than {device}, which goes in steps of"
-            f" {np.max(step):.3g} of an input: set it to {bits}"
-        )
+        mirror, step = self._mirror, np.abs(step / self.unit)
+        if (converter_margin(mirror) < step).any():  # the input that it holds would count as another one
+            bits = int(np.log2(((mirror.input_max - mirror.input_min) / step).min() * (1 + _ROUNDING) + 1))
+            raise DeviceError(
+                f"mirror.dac_bits = {mirror.dac_bits} is finer than {device}, which goes in steps of"
+                f" {np.max(step):.3g} of an input: set it to {bits}"
+            )
