@@ -57,8 +57,7 @@ class DriverFound:
 def find_drivers() -> list[DriverFound]:
     """The installed drivers of cameras and mirrors, each with the devices that it finds on this machine.
 
-    A driver looks for its devices if its module has a function ``discover()``; a text ``NOT_LISTED`` in the module says
-    which devices that function cannot find. No device is opened.
+    A driver looks for its devices if its module has a function ``discover()``. No device is opened.
     """
     return [_find(kind, name) for kind in KINDS for name in driver_names(kind)]
 
@@ -78,9 +77,8 @@ def _find(kind: DeviceKind, name: str) -> DriverFound:
         devices = [(str(address), str(text)) for address, text in discover()] if discover else []
     except Exception as error:  # a library of the maker's that is missing or broken
         return DriverFound(kind=kind, name=name, lacks=lacks, problem=printable(f"it cannot look for devices: {error}"))
-    usual = "no device found" if discover else "it does not look for devices: the rig file says where they are"
-    search = "" if devices else str(getattr(module, "NOT_LISTED", usual))
-    return DriverFound(kind=kind, name=name, lacks=lacks, devices=devices, search=search)
+    search = "no device found" if discover else "it does not look for devices: the rig file says where they are"
+    return DriverFound(kind=kind, name=name, lacks=lacks, devices=devices, search="" if devices else search)
 
 
 def list_ports() -> list[tuple[str, str]]:

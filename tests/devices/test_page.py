@@ -20,7 +20,6 @@ from aolink.session import record
 from tests.devices.mirrors import bench
 
 PAGE = Path(__file__).parents[2] / "aolink" / "pages" / "devices.md"
-WORDS = 1_500
 
 
 @pytest.fixture(autouse=True)
@@ -85,9 +84,8 @@ def test_a_port_that_is_not_there_is_one_line(tmp_path: Path) -> None:
         record(bench.rig_with(tables), None, None, tmp_path / "a.mcap", exposures=5)
 
 
-def test_the_page_is_short_and_says_first_that_no_driver_has_met_hardware() -> None:
+def test_the_page_names_each_driver_and_says_first_that_none_has_met_hardware() -> None:
     text = PAGE.read_text()
-    assert len(text.split()) <= WORDS
     assert text.splitlines()[2].startswith("**No driver here has met hardware.**")
     for group in ("cameras", "mirrors"):
         own = {name for name, point in installed(f"aolink.{group}").items() if point.value.startswith("aolink.")}

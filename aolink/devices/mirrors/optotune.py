@@ -25,7 +25,6 @@ from aolink.rig import Rig
 _BAUD_RATE = 256_000
 _USB_ID = 0x0483, 0xA31E
 """USB vendor and product ids, by which the maker's Python package finds an MR-E-2."""
-NOT_LISTED = "no device found by the USB id of the MR-E-2 (0483:a31e): if yours has another, give devices.mirror.port"
 _LIMIT_DEG = 50.0
 _LIMIT = math.tan(math.radians(_LIMIT_DEG))
 """Tangent of the optical angle at the edge of the unit circle."""
