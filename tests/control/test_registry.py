@@ -14,6 +14,7 @@ from aolink.errors import ControlError
 from aolink.recording.reader import Recording
 from tests.commands import simulated_rig
 from tests.control.rigs import DRIFT, small_rig
+from tests.packages import package
 
 Run = Callable[..., "subprocess.CompletedProcess[str]"]
 
@@ -55,11 +56,8 @@ def test_it_may_refuse_a_rig(with_example: dict[str, str]) -> None:
 def test_a_broken_package_is_one_line_for_who_asks_for_it(
     with_example: dict[str, str], tmp_path: Path, value: str, why: str
 ) -> None:
-    metadata = tmp_path / "site" / "broken-0.1.dist-info"
-    metadata.mkdir(parents=True)
-    (metadata / "METADATA").write_text("Metadata-Version: 2.1\nName: broken\nVersion: 0.1\n")
-    (metadata / "entry_points.txt").write_text(f"[aolink.controllers]\ncracked = {value}\n")
-    environment = with_example | {"PYTHONPATH": f"{metadata.parent}:{with_example['PYTHONPATH']}"}
+    site = package(tmp_path / "site", "broken", f"[aolink.controllers]\ncracked = {value}\n")
+    environment = with_example | {"PYTHONPATH": f"{site}:{with_example['PYTHONPATH']}"}
     code = (
         "from aolink.control import find_controller; from tests.control.rigs import small_rig; rig = small_rig();"
         "find_controller('lqg', rig); find_controller('cracked', rig)"

@@ -10,6 +10,7 @@ import numpy as np
 from aolink.control import ControllerRow, Seen
 from aolink.numerics.arrays import FloatArray
 from aolink.rig import Rig
+from tests.packages import package
 
 EXPOSURES = 45
 """Exposures after which `late` fails: more than its stability is computed for."""
@@ -46,10 +47,7 @@ REFUSES = ControllerRow(name="refuses", summary="", build=lambda rig: Unfit(lamb
 
 def installed(folder: Path, environment: dict[str, str]) -> dict[str, str]:
     """An environment in which a package in ``folder`` adds these controllers by their entry points."""
-    metadata = folder / "unfit-0.1.dist-info"
-    metadata.mkdir(parents=True)
-    (metadata / "METADATA").write_text("Metadata-Version: 2.1\nName: unfit\nVersion: 0.1\n")
     rows = ("three", "huge", "late", "refuses")
     points = "".join(f"{name} = {__name__}:{name.upper()}\n" for name in rows)
-    (metadata / "entry_points.txt").write_text(f"[aolink.controllers]\n{points}")
+    package(folder, "unfit", f"[aolink.controllers]\n{points}")
     return environment | {"PYTHONPATH": f"{folder}:{environment['PYTHONPATH']}"}

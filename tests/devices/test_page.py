@@ -18,20 +18,19 @@ from aolink.extensions import installed
 from aolink.recording.reader import Recording
 from aolink.session import record
 from tests.devices.mirrors import bench
+from tests.packages import package
 
 PAGE = Path(__file__).parents[2] / "aolink" / "pages" / "devices.md"
 
 
 @pytest.fixture(autouse=True)
-def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+def _drivers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """A package of the page's two blocks of Python."""
     camera, mirror = re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.DOTALL)
     for name, text in (("page_camera", camera), ("page_mirror", mirror)):
         (tmp_path / f"{name}.py").write_text(text)
-    (info := tmp_path / "page-1.0.dist-info").mkdir()
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: page\nVersion: 1.0\n")
     points = "[aolink.cameras]\npage = page_camera:Camera\n[aolink.mirrors]\npage = page_mirror:Mirror\n"
-    (info / "entry_points.txt").write_text(points)
+    package(tmp_path, "page", points)
     monkeypatch.syspath_prepend(tmp_path)
     installed.cache_clear()
     yield

@@ -30,6 +30,7 @@ from aolink.rig.device_tables import Delay, DeviceTable
 from aolink.session.account import Account
 from aolink.session.report import Report
 from aolink.wire import messages_pb2 as pb
+from tests.packages import package
 
 RIG = load_rig("section-vi")
 STEP_NS = RIG.timing.fast_step_ns
@@ -560,26 +561,20 @@ class CameraWithoutClock(WatchedMirror):
 
 
 @pytest.fixture
-def package(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def odd(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """An installed package that has these drivers."""
-    (info := tmp_path / "odd-1.0.dist-info").mkdir()
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: odd\nVersion: 1.0\n")
-    drivers = {
-        "cameras": {"clockless": CameraWithoutClock, "winged": WingedMirror},
-        "mirrors": {"good": WatchedMirror, "winged": WingedMirror},
-    }
-    (info / "entry_points.txt").write_text(
-        "".join(
-            f"[aolink.{kind}]\n" + "".join(f"{name} = {each.__module__}:{each.__name__}\n" for name, each in of.items())
-            for kind, of in drivers.items()
-        )
-    )
+    here = f"{__name__}:"
+    package(
+        tmp_path, "odd",
+        f"[aolink.cameras]\nclockless = {here}CameraWithoutClock\nwinged = {here}WingedMirror\n"
+        f"[aolink.mirrors]\ngood = {here}WatchedMirror\nwinged = {here}WingedMirror\n",
+    )  # fmt: skip
     monkeypatch.syspath_prepend(tmp_path)
     installed.cache_clear()
     WatchedMirror.closed.clear()
 
 
-@pytest.mark.usefixtures("package")
+@pytest.mark.usefixtures("odd")
 @pytest.mark.parametrize(
     ("mirror", "what", "closed"),
     [
@@ -599,7 +594,7 @@ def test_a_driver_that_turns_out_to_be_of_no_use_is_closed(mirror: str, what: st
     assert WatchedMirror.closed == closed
 
 
-@pytest.mark.usefixtures("package")
+@pytest.mark.usefixtures("odd")
 def test_a_driver_with_an_unknown_lack_is_a_line_among_those_found() -> None:
     problems = [found.problem for found in find_drivers() if found.name == "winged"]
     assert [problem.split(":")[0] for problem in problems] == [

@@ -20,6 +20,7 @@ from aolink.recording.reader import Recording
 from aolink.rig import Rig, load_rig, parse_rig
 from aolink.session import Report
 from tests.devices.simulators import spot_camera
+from tests.packages import package
 
 FAST_STEP_S = 0.01
 Measured = TypeVar("Measured")
@@ -48,13 +49,9 @@ def rig_with(devices: str) -> Rig:
 
 def install(monkeypatch: pytest.MonkeyPatch, folder: Path, **drivers: str) -> None:
     """A package with the camera of the tests, and with these drivers of mirrors."""
-    info = folder / "bench-1.0.dist-info"
-    info.mkdir()
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: bench\nVersion: 1.0\n")
     points = "".join(f"{name} = {target}\n" for name, target in drivers.items())
-    (info / "entry_points.txt").write_text(
-        f"[aolink.cameras]\nspot = tests.devices.simulators.spot_camera:SpotCamera\n[aolink.mirrors]\n{points}"
-    )
+    camera = "[aolink.cameras]\nspot = tests.devices.simulators.spot_camera:SpotCamera\n"
+    package(folder, "bench", f"{camera}[aolink.mirrors]\n{points}")
     monkeypatch.syspath_prepend(folder)
     installed.cache_clear()
     monkeypatch.setattr(spot_camera.mirror, "held", None)
