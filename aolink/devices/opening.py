@@ -28,12 +28,9 @@ from aolink.wire.port import SerialPort
 
 @contextmanager
 def open_devices(
-    rig: Rig,
-    camera_port: str | None = None,
-    mirror_port: str | None = None,
-    stop: Callable[[], bool] = lambda: False,
-    reconnect_s: float = 0.0,
-) -> Iterator[Opened]:
+    rig: Rig, camera_port: str | None = None, mirror_port: str | None = None,
+    stop: Callable[[], bool] = lambda: False, reconnect_s: float = 0.0,
+) -> Iterator[Opened]:  # fmt: skip
     """Open both devices, ask for their identities, and check these against the rig file.
 
     Parameters

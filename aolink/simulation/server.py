@@ -321,15 +321,8 @@ class RigServer:
         if not self._real_time:
             self._now_ns += self._draw_latency() + line.to_host.delay_ns()
             self._tell_time(line)
-        self._send(
-            line,
-            pb.ClockReply(
-                query_id=query.query_id,
-                host_send_ns=query.host_send_ns,
-                device_receive_ns=received,
-                device_send_ns=sent,
-            ),
-        )
+        times = {"host_send_ns": query.host_send_ns, "device_receive_ns": received, "device_send_ns": sent}
+        self._send(line, pb.ClockReply(query_id=query.query_id, **times))
 
     def _send(self, line: LineEnd, message: Message) -> None:
         line.put(message, self._host_ns() + line.to_host.delay_ns() if self._real_time else 0)

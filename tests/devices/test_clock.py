@@ -34,6 +34,14 @@ class Line:
         return ClockExchange(sent, self.device_ns(arrived), self.device_ns(arrived + 5000), arrived + 5000 + back)
 
 
+def changed(exchange: ClockExchange, lie_ns: int = 0, late_ns: int = 0) -> ClockExchange:
+    """With another time of the device, on a line that takes longer there and back alike."""
+    e = exchange
+    return ClockExchange(
+        e.host_send_ns - late_ns, e.device_receive_ns + lie_ns, e.device_send_ns + lie_ns, e.host_receive_ns + late_ns
+    )
+
+
 def settled(line: Line, queries: int = 60) -> tuple[ClockRegression, int]:
     clock = ClockRegression()
     for k in range(queries):
@@ -70,11 +78,8 @@ def test_slow_round_trips_and_outliers_are_refused() -> None:
     clock, now = settled(line)
     before = clock.device_ns(now)
     assert not clock.add(line.exchange(61.0, extra_ns=5_000_000))
-    exchange = line.exchange(62.0)
     lie = 50_000_000
-    outlier = ClockExchange(
-        exchange.host_send_ns, exchange.device_receive_ns + lie, exchange.device_send_ns + lie, exchange.host_receive_ns
-    )
+    outlier = changed(line.exchange(62.0), lie)
     assert clock.device_ns(now) == before  # a slow one is no reason to doubt
     assert not clock.add(outlier)
     assert clock.device_ns(now)[0] == before[0]
@@ -103,20 +108,7 @@ def test_a_reply_from_before_its_query_is_refused() -> None:
 def test_a_line_that_has_become_slower_for_good_is_taken_as_it_is() -> None:
     line = Line(7, drift_ppm=10.0)
     clock, _ = settled(line)
-    slow = []
-    for k in range(8):
-        exchange = line.exchange(60 + k)
-        late = 2_000_000  # there and back alike
-        slow.append(
-            clock.add(
-                ClockExchange(
-                    exchange.host_send_ns - late,
-                    exchange.device_receive_ns,
-                    exchange.device_send_ns,
-                    exchange.host_receive_ns + late,
-                )
-            )
-        )
+    slow = [clock.add(changed(line.exchange(60 + k), late_ns=2_000_000)) for k in range(8)]
     assert slow == [False, False, False, True, True, True, True, True]
     now = START + 68 * 10**9
     device_ns, sigma = clock.device_ns(now)
@@ -141,13 +133,7 @@ def test_replies_that_do_not_agree_with_each_other_are_never_a_step() -> None:
     line = Line(9, drift_ppm=10.0)
     clock, now = settled(line)
     for k in range(50):
-        honest = line.exchange(60 + 0.1 * k)
-        lie = (-1) ** k * (k + 1) * 10**8
-        assert not clock.add(
-            ClockExchange(
-                honest.host_send_ns, honest.device_receive_ns + lie, honest.device_send_ns + lie, honest.host_receive_ns
-            )
-        )
+        assert not clock.add(changed(line.exchange(60 + 0.1 * k), (-1) ** k * (k + 1) * 10**8))
     assert clock.step is None
     assert clock.device_ns(now)[1] > 49e8
 
