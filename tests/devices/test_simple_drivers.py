@@ -102,7 +102,7 @@ class CameraBench(Bench):
         return super().time_ns() + CAMERA_ZERO_NS
 
 
-def mirror_of(bench: Bench, **changes: float) -> AdaptedMirror:
+def mirror_of(bench: Bench, **changes: Any) -> AdaptedMirror:
     """With a clock that was read once; changes are keys of ``[mirror]``."""
     rig = replace(RIG, mirror=replace(RIG.mirror, **changes))
     mirror = AdaptedMirror(rig, bench, Delay(), bench.now_ns)
