@@ -98,7 +98,7 @@ def read_disturbance(values: dict[str, Any], n_outputs: int, fast_step_s: float)
         raise RigError("disturbance.zernike_m: each row begins with one of Noll's indices, a whole number from 2")
     if air and not air.layers:
         raise RigError("disturbance.turbulence.layers is empty: give each layer's r0_m and wind_m_s")
-    shared = {"outer_scale_m": air.outer_scale_m, "wavelength_m": air.wavelength_m} if air else {}
+    shared: dict[str, Any] = {"outer_scale_m": air.outer_scale_m, "wavelength_m": air.wavelength_m} if air else {}
     layers = tuple(
         read(Layer, each, f"disturbance.turbulence.layers[{k}]", **shared)
         for k, each in enumerate(air.layers if air else ())
