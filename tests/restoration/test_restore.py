@@ -275,6 +275,12 @@ def test_an_even_picture_stays_as_it_is(method: str) -> None:
         (np.zeros((5, 5), bool), np.ones(2), {}, "type bool"),
         (np.zeros((5, 5), complex), np.ones(2), {}, "type complex128"),
         (np.full((5, 5), np.nan), np.ones(2), {}, "25 of the picture's 25 pixels are not finite.*mask=np.isfinite"),
+        (
+            np.dstack([np.zeros((6, 8)), np.diag([np.inf] + [0.0] * 7)[:6], np.zeros((6, 8))]),
+            UNIFORM,
+            {},
+            "1 of the .* 48",
+        ),
         (np.zeros((5, 5)), np.ones(2), {"method": "magic"}, "use one of tv, pnp"),
         (np.zeros((5, 5)), np.ones(2), {"method": "lag", "direction": "up"}, "expected one of forward, backward"),
         (np.zeros((5, 5)), np.eye(3), {"method": "inverse"}, "along the picture's rows or columns"),
@@ -289,10 +295,3 @@ def test_what_cannot_be_restored_is_refused_with_what_was_expected(
 ) -> None:
     with pytest.raises(RestorationError, match=says):
         restore(image, psf, **options)
-
-
-def test_one_bad_pixel_in_a_colour() -> None:
-    image = np.zeros((6, 8, 3))
-    image[2, 3, 1] = np.inf
-    with pytest.raises(RestorationError, match="1 of the picture's 48 pixels"):
-        restore(image, UNIFORM)
