@@ -185,9 +185,9 @@ def estimate(exposures: Series | str | Path, estimators: str | Sequence[str]) ->
 
 
 def smooth(series: Series | str | Path, lag: int | None = None, *, estimators: str | Sequence[str] = ()) -> Series:
-    """The same series with estimates that are each corrected by later exposures. It works offline only.
+    """The same series with estimates that are each corrected by later exposures: the Rauch-Tung-Striebel smoother.
 
-    It is the Rauch-Tung-Striebel smoother, or backward simulation for estimators that carry a Gaussian mixture.
+    It works offline only.
 
     Parameters
     ----------

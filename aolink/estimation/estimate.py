@@ -13,7 +13,7 @@ import numpy as np
 from aolink.estimation.model.base import ExposureModel
 from aolink.estimation.model.exposure_model import path_of, path_sd_of
 from aolink.estimation.verdict import Verdict
-from aolink.numerics.arrays import FloatArray, Indices
+from aolink.numerics.arrays import FloatArray
 from aolink.numerics.covariance import from_correlation_steps, in_correlation_steps, psd_root
 from aolink.plain import plain_data
 
@@ -53,33 +53,6 @@ class AlignmentError:
         """A covariance (axes, n, n) of the first n of these numbers, with this error in it."""
         change = getattr(self, name)[:, : covariance.shape[-1]]
         return np.asarray(covariance + change[:, :, None] * change[:, None, :])
-
-
-@dataclass(frozen=True, eq=False)
-class Components:
-    """The posterior of an exposure as a Gaussian mixture for each axis, of few coefficients t: z = expand t + a rest.
-
-    It holds what one mean and one covariance cannot: for example, that a path may have run in either direction.
-    """
-
-    parts: Sequence[tuple[Indices, FloatArray, FloatArray, FloatArray]]
-    """Some of the axes, their log-weights (axes, components), means (axes, components, n) and covariances (axes,
-    components, n, n). For an axis that is in several parts the last one counts."""
-    expand: FloatArray
-    """(n_coefficients, n)"""
-    left_out: FloatArray
-    """Covariance of the rest, (n_coefficients, n_coefficients)."""
-    unseen: tuple[FloatArray, FloatArray]
-    """Mean (axes, n_states) and covariance (axes, n_states, n_states) of the start state, predicted from the inputs
-    without any measurement."""
-
-    def of(self, axis: int) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Log-weights (components,), means and covariances of one axis."""
-        for axes, *arrays in reversed(self.parts):
-            if len(row := np.flatnonzero(axes == axis)):
-                log_weight, mean, covariance = (each[row[0]] for each in arrays)
-                return log_weight, mean, covariance
-        raise KeyError(axis)
 
 
 @plain_data
@@ -127,9 +100,6 @@ class Estimate:
     """
     alignment: AlignmentError | None = field(default=None, compare=False)
     """The effect of the alignment's error, where camera and mirror count by different clocks."""
-    components: Components | None = field(default=None, compare=False, repr=False)
-    """The mixture's components, where the estimator carries a mixture; recordings do not have them. `smooth` uses
-    them."""
     verdict: Verdict | None = field(default=None, compare=False)
     """Whether the model fits, by the exposures up to this one; None where that is not judged.
     Where it does not fit, the covariances are those of the filter times ``verdict.widening`` squared."""

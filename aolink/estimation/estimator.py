@@ -54,7 +54,8 @@ class Estimator:
         """
         try:
             for exposure, estimate in zip(batch.exposures, self._steps(batch), strict=True):
-                yield estimate if self.judge is None else self.judge.take(exposure, estimate)
+                assert self.posterior is not None
+                yield estimate if self.judge is None else self.judge.take(exposure, estimate, self.posterior.likeliest)
         except (ArithmeticError, np.linalg.LinAlgError) as error:
             raise EstimatorError(
                 f"{self.name} cannot compute with this rig: {error}; are its numbers too large or too small?"
@@ -136,7 +137,7 @@ class Estimator:
             start_state=posterior.start.mean, start_covariance=covariance[:, :n, :n], end_state=posterior.end.mean,
             end_covariance=as_recorded(posterior.end.covariance), coefficients=posterior.coefficients.mean,
             coefficient_covariance=covariance, innovation=posterior.innovation,
-            innovation_covariance=posterior.innovation_covariance, nis=posterior.nis, components=posterior.components,
+            innovation_covariance=posterior.innovation_covariance, nis=posterior.nis,
         )  # fmt: skip
 
     def _bridge(self, exposure: Exposure, finite: bool) -> list[str]:

@@ -40,7 +40,7 @@ PIXELS_OFF, MOTION_OFF = 4.5, 4.0
 chosen on some 40 right recordings of `moments`, and judged on others (`tools/verdict`)."""
 FITS = 0.7
 _NIS_SPREAD, _NIS_SPREAD_OF_MIXTURES = 1.5, 3.2
-"""Standard deviation of the summed NIS where the model is right: of `moments`, and of `profile` and `sampled`."""
+"""Standard deviation of the summed NIS where the model is right: of `moments`, and of `profile`."""
 _STATIC = 7.0
 """Student's t of a single pixel's mean residual from which on it is no chance."""
 _GATED = 0.2
@@ -85,6 +85,7 @@ class Judge:
         self._nis: deque[tuple[float, float]] = deque(maxlen=2 * WINDOW)
         """NIS made normal, and over its expectation; means over the axes, whose errors may be alike."""
         self._gated: deque[bool] = deque(maxlen=2 * WINDOW)
+        self._nis_spread = _NIS_SPREAD
         self._exposures = self._compared = 0
         self._before: tuple[int, Gaussian] | None = None
         self.verdict = Verdict(fit=Fit.UNKNOWN)
@@ -92,14 +93,18 @@ class Judge:
         self._able = plant.n_outputs <= 2 and plant.n_states <= MANY_STATES and rig.sensor.spot_light is None
         self._every = max(EVERY, EVERY * -(-plant.axes // _AT_ONCE) // 2)
 
-    def take(self, exposure: Exposure, estimate: Estimate) -> Estimate:
-        """The estimate with the verdict on the exposures up to it, wider where the model does not fit."""
+    def take(self, exposure: Exposure, estimate: Estimate, likeliest: FloatArray | None) -> Estimate:
+        """The estimate with the verdict on the exposures up to it, wider where the model does not fit.
+
+        ``likeliest`` is that of the posterior.
+        """
+        self._nis_spread = _NIS_SPREAD if likeliest is None else _NIS_SPREAD_OF_MIXTURES
         if not self._able or estimate.status is Status.PREDICTED:
             return estimate
         if self._exposures >= FIRST:
             self._gated.append(estimate.status in _REFUSED)
             if self._exposures % self._every == 0:
-                self._compare(exposure, estimate)
+                self._compare(exposure, estimate, likeliest)
             due = len(self._gated) >= FEWEST and self._exposures % (self._every * BETWEEN) == 0
             if due and np.mean(self._gated) > _GATED:
                 self._judge(exposure, estimate)
@@ -112,11 +117,11 @@ class Judge:
         self._before = end, Gaussian(estimate.end_state, estimate.end_covariance)
         return widened(estimate, self.verdict)
 
-    def _compare(self, exposure: Exposure, estimate: Estimate) -> None:
+    def _compare(self, exposure: Exposure, estimate: Estimate, likeliest: FloatArray | None) -> None:
         axes = np.arange(self._rig.plant.axes)
         if len(axes) > _AT_ONCE:
             axes = np.sort(np.roll(axes, -_AT_ONCE * self._compared)[:_AT_ONCE])
-        found = residuals(self._rig, exposure, estimate, self._prediction(exposure, estimate), axes)
+        found = residuals(self._rig, exposure, estimate, self._prediction(exposure, estimate), axes, likeliest)
         if found is None:
             return
         self._seen.append(found)
@@ -126,8 +131,7 @@ class Judge:
 
     def _judge(self, exposure: Exposure, estimate: Estimate) -> None:
         nis, ratio = np.array(self._nis or [(0.0, 1.0)]).T
-        spread = _NIS_SPREAD if estimate.components is None else _NIS_SPREAD_OF_MIXTURES
-        own, gated = float(nis.sum()) / math.sqrt(len(nis)) / spread, float(np.mean(self._gated))
+        own, gated = float(nis.sum()) / math.sqrt(len(nis)) / self._nis_spread, float(np.mean(self._gated))
         found = statistics(self._seen) if len(self._seen) >= FEWEST else _NOTHING
         after = judged(found, own, float(ratio.mean()), gated, self.verdict, self._compared)
         since = self.verdict.since if after.fit is self.verdict.fit else exposure.frame_id
@@ -231,5 +235,5 @@ def widened(estimate: Estimate, verdict: Verdict) -> Estimate:
     return replace(
         estimate, verdict=verdict, reason="; ".join(filter(None, [estimate.reason, verdict.text])),
         start_covariance=estimate.start_covariance * square, end_covariance=estimate.end_covariance * square,
-        coefficient_covariance=estimate.coefficient_covariance * square, alignment=alignment, components=None,
+        coefficient_covariance=estimate.coefficient_covariance * square, alignment=alignment,
     )  # fmt: skip

@@ -9,9 +9,6 @@ and all that is known of it N(x+, P+),
 
 Rauch, Tung, Striebel, Maximum likelihood estimates of linear dynamic systems, AIAA J. 3 (1965), (3.30) to (3.32).
 The posteriors are those of the estimator: its approximations remain in the result.
-
-Estimators that carry a Gaussian mixture give its components with an estimate. Where all estimates have them, backward
-simulation reweights them by the later exposures (`aolink.estimation.pixels.backward`).
 """
 
 from __future__ import annotations
@@ -23,7 +20,6 @@ import numpy as np
 
 from aolink.errors import EstimatorError
 from aolink.estimation.estimate import AlignmentError, Estimate, Status
-from aolink.estimation.kalman.gaussian import Gaussian
 from aolink.estimation.model.base import over_steps
 from aolink.exposure import Exposure
 from aolink.numerics import batched
@@ -71,8 +67,6 @@ def smooth(
 
 def _backward(plant: Plant, exposures: Sequence[Exposure], estimates: Sequence[Estimate]) -> list[Estimate]:
     """Each estimate corrected by all later ones of the series."""
-    if estimates and all(each.components is not None for each in estimates):
-        return _through_mixtures(plant, exposures, estimates)
     smoothed: list[Estimate] = []
     for k in reversed(range(len(estimates))):
         estimate = estimates[k]
@@ -80,32 +74,6 @@ def _backward(plant: Plant, exposures: Sequence[Exposure], estimates: Sequence[E
             estimate = _corrected(plant, exposures[k], estimate, exposures[k + 1], smoothed[-1])
         smoothed.append(estimate)
     return smoothed[::-1]
-
-
-def _through_mixtures(plant: Plant, exposures: Sequence[Exposure], estimates: Sequence[Estimate]) -> list[Estimate]:
-    """Each estimate corrected by backward simulation, for estimates with components."""
-    from aolink.estimation.pixels.backward import Next, Smoothed, smoothed  # its imports take long
-
-    done: list[Estimate] = []
-    later: Smoothed | None = None
-    after: Next | None = None
-    for k in reversed(range(len(estimates))):
-        estimate, components = estimates[k], estimates[k].components
-        assert components is not None
-        if later is not None:
-            following = estimates[k + 1].components
-            assert following is not None
-            gap = _gap(plant, exposures[k], exposures[k + 1])
-            after = Next(*gap, Gaussian(*following.unseen), later.draws)
-        later = smoothed(estimate, components, after)
-        if after is not None:
-            (z, P), n = (later.joint.mean, later.joint.covariance), plant.n_states
-            estimate = _replaced(
-                estimate, done[-1], after.transition, (z[:, :-n], P[:, :-n, :-n], later.gain[:, :-n]),
-                (z[:, -n:], P[:, -n:, -n:], later.gain[:, -n:]),
-            )  # fmt: skip
-        done.append(estimate)
-    return done[::-1]
 
 
 def _corrected(
@@ -135,16 +103,6 @@ def _corrected(
     end_gain = batched.matmul(batched.matmul(P_end, np.broadcast_to(transition.T, P_end.shape)), inverse)
     z, P = corrected(z, P, gain)
     end, P_end = corrected(end, P_end, end_gain)
-    return _replaced(estimate, later, transition, (z, P, gain), (end, P_end, end_gain))
-
-
-def _replaced(
-    estimate: Estimate, later: Estimate, transition: FloatArray,
-    coefficients: tuple[FloatArray, FloatArray, FloatArray], end_state: tuple[FloatArray, FloatArray, FloatArray],
-) -> Estimate:  # fmt: skip
-    """The estimate with another mean and covariance of its coefficients and its end state, and their gains."""
-    (z, P, gain), (end, P_end, end_gain) = coefficients, end_state
-    n, alignment = end.shape[1], estimate.alignment
     P_start = P[:, :n, :n]
     if alignment is not None and later.alignment is not None:
         moved = later.alignment.coefficients[:, :n] - batched.matvec(transition, alignment.end_state)
@@ -157,7 +115,7 @@ def _replaced(
         P_start, P_end = alignment.added_to(P_start, "coefficients"), alignment.added_to(P_end, "end_state")
     return replace(
         estimate, start_state=z[:, :n], start_covariance=P_start, end_state=end, end_covariance=P_end, coefficients=z,
-        coefficient_covariance=P, alignment=alignment, components=None,
+        coefficient_covariance=P, alignment=alignment,
     )  # fmt: skip
 
 

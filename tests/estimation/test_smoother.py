@@ -9,13 +9,13 @@ from scipy import linalg
 
 import aolink
 from aolink.errors import EstimatorError
-from aolink.estimation import Measurement, exposure_model, make_estimator, run, score, smooth
+from aolink.estimation import Measurement, Status, exposure_model, make_estimator, run, score, smooth
 from aolink.estimation.frames.moments import measure_moments, noise_integrals
 from aolink.optics.camera import effective_noise_density
 from aolink.plant.lifting import input_response, lift
 from aolink.rig import load_rig
 from aolink.simulation.model import simulate
-from tests.kinds import must_be
+from tests.kinds import must_be, truth_of
 
 RIG = load_rig("section-vi-lively")
 
@@ -79,6 +79,38 @@ def test_the_last_estimate_is_the_filters_and_the_others_know_more():
         for estimate in smoothed:
             assert np.linalg.eigvalsh(estimate.coefficient_covariance[0]).min() >= -1e-12
             np.testing.assert_allclose(estimate.coefficients[:, :2], estimate.start_state)
+
+
+def test_a_lag_is_so_many_later_exposures():
+    exposures = simulate(RIG, 6, seed=6)
+    estimates = run(RIG, exposures, ["moments"])["moments"]
+    assert smooth(RIG.plant, exposures, estimates, lag=0) == estimates
+    for k, each in enumerate(smooth(RIG.plant, exposures, estimates, lag=2)[:-2]):
+        own = smooth(RIG.plant, exposures[k : k + 3], estimates[k : k + 3])[0]
+        assert each.path.tobytes() == own.path.tobytes()
+    long, whole = (smooth(RIG.plant, exposures, estimates, lag) for lag in (100, None))
+    assert [e.path.tobytes() for e in long] == [e.path.tobytes() for e in whole]
+    with pytest.raises(EstimatorError, match="lag"):
+        smooth(RIG.plant, exposures, estimates, lag=-1)
+
+
+def test_a_frame_that_is_lost_is_found_by_those_after_it():
+    exposures = list(simulate(RIG, 12, seed=4))
+    exposures[5] = dark = dataclasses.replace(exposures[5], mask=np.zeros_like(exposures[5].mask))
+    estimates = run(RIG, exposures, ["profile"])["profile"]
+    assert estimates[5].status == Status.INPUT_INVALID
+    smoothed = smooth(RIG.plant, exposures, estimates)
+    assert smoothed[5].path_sd.max() < 0.6 * estimates[5].path_sd.max()
+    assert np.mean(np.abs(smoothed[5].path - truth_of(dark).path) < 3 * smoothed[5].path_sd) > 0.9
+
+
+def test_several_axes_are_smoothed_side_by_side():
+    rig = load_rig("single-lenslet")
+    exposures = simulate(rig, 8, seed=2)
+    estimates = run(rig, exposures, ["profile"])["profile"]
+    smoothed = smooth(rig.plant, exposures, estimates)
+    before, after = (score(exposures, each, 0).path_rmse for each in (estimates, smoothed))
+    assert after < before
 
 
 def test_in_python_it_is_one_call():

@@ -133,7 +133,7 @@ def test_the_fit_finds_the_mode_that_scipy_finds(rig: Rig, right: list[Exposure]
     assert isinstance(measured, Profile)
     y = measured.density[None]
     prior = fit.reduced.prior(Gaussian(estimate.start_state, estimate.start_covariance + 0.01 * np.eye(2)))
-    found = fit.to(y, np.ones(y.shape, dtype=bool), fit.start(estimate, axes), prior)
+    found = fit.to(y, np.ones(y.shape, dtype=bool), estimate.coefficients @ fit.reduced.expand, prior)
     root = np.linalg.inv(np.linalg.cholesky(prior.covariance[0]))
     edges, rows, width = rig.sensor.profile.edges, fit.basis[0], np.sqrt(fit.variance[0, 0])
 
@@ -158,7 +158,7 @@ def test_a_wider_kernel_has_the_signature_of_the_heat_equation(name: str) -> Non
     assert isinstance(measured, Profile)
     y = measured.density.reshape(len(axes), rig.plant.n_outputs, -1)
     prior = fit.reduced.prior(Gaussian(estimate.start_state, estimate.start_covariance))
-    found = fit.to(y, np.ones(y.shape, dtype=bool), fit.start(estimate, axes), prior)
+    found = fit.to(y, np.ones(y.shape, dtype=bool), estimate.coefficients @ fit.reduced.expand, prior)
 
     def light(factor: float) -> FloatArray:
         width = np.sqrt(factor * fit.variance)[..., None, None]

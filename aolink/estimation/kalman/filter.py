@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from aolink.estimation.estimate import Components, Status
+from aolink.estimation.estimate import Status
 from aolink.estimation.frames.frame_data import Measurement, Needs
 from aolink.estimation.kalman.gaussian import MOST_COVARIANCES, Gaussian, Update
 from aolink.estimation.kalman.path_moments import MOST_OUTPUTS, Observation, PathMoments
@@ -55,8 +55,8 @@ class Posterior:
     they are not searched for."""
     remark: str = ""
     """A note for the estimate's reason about unusual steps of the filter on some axes; otherwise empty."""
-    components: Components | None = None
-    """The mixture's components, where the posterior is a mixture."""
+    likeliest: FloatArray | None = None
+    """Mean of the heaviest component where the posterior is a mixture, of its reduced coefficients, (axes, n)."""
     log_evidence: FloatArray | None = None
     """Log-likelihood of the measurement, up to a constant that is the same for all plants and cameras, (axes,), NaN
     without a measurement; None where it follows from innovation and covariance."""

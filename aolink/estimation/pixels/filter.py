@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aolink.estimation.compiled.modes import drop_repeats
-from aolink.estimation.estimate import Components, Status
+from aolink.estimation.estimate import Status
 from aolink.estimation.frames.frame_data import HALF, Needs, Profile, SpotWindows
 from aolink.estimation.kalman.filter import PATIENCE, Filter, Posterior, gate_status
 from aolink.estimation.kalman.gaussian import Gaussian
@@ -136,14 +136,13 @@ class MixtureFilter(Filter):
         axes = self.plant.axes
         reduced = self._updater.reduction(model, self.sensor)
         lost = self._missed >= PATIENCE
-        unseen = self._unseen
-        prior = _chosen(lost, single(unseen), self.prior)
+        prior = _chosen(lost, single(self._unseen), self.prior)
         status = np.full(axes, int(Status.INPUT_INVALID), dtype=np.int64)
         new = _spread([], np.zeros(0, dtype=np.intp), axes)
         several, poor = np.zeros(axes, dtype=bool), np.zeros(axes, dtype=bool)
         log_evidence = np.full(axes, np.nan)
         done: list[MixtureUpdate] = []
-        components: list[tuple[Indices, FloatArray, FloatArray, FloatArray]] = []
+        likeliest = np.zeros((axes, reduced.size))
         took = np.zeros(0, dtype=np.intp)
         if measured is not None:
             usable = np.arange(axes) if measured.usable is None else np.flatnonzero(measured.usable)
@@ -164,7 +163,8 @@ class MixtureFilter(Filter):
                 return replace(u, coefficients=reduced.coefficients(u.coefficients))
 
             done = in_threads(updated, parts)
-            components = [(p, *each.posterior) for p, each in zip(parts, done, strict=True)]
+            for p, each in zip(parts, done, strict=True):
+                likeliest[p] = each.posterior.likeliest
             new = _spread([each.innovation for each in done], seen, axes)
             log_evidence[seen] = np.concatenate([log_evidence[:0], *(each.log_evidence for each in done)])
             # The pixels' own noise is left out of their likelihoods, being the same at all points of one camera.
@@ -177,9 +177,8 @@ class MixtureFilter(Filter):
             coefficients = reduced.coefficients(reduced.prior(prior.gaussian))
             end = _moved(prior, model.transition, model.process_noise, response.end)
             rest = np.setdiff1d(np.arange(axes), took)
-            before = prior.part(rest)
-            own = reduced.prior(Gaussian(before.mean, before.covariance))
-            components.append((rest, before.log_weight, own.mean, own.covariance))
+            likeliest[rest] = 0.0
+            likeliest[rest, : self.plant.n_states] = prior.part(rest).likeliest
         if len(took):
             most = max(each.end.mean.shape[1] for each in done)
             after = [np.concatenate(each) for each in zip(*(_arrays(d, most) for d in done), strict=True)]
@@ -197,8 +196,7 @@ class MixtureFilter(Filter):
         return Posterior(
             coefficients=coefficients, end=end.gaussian, status=status, innovation=new.value,
             innovation_covariance=new.covariance, nis=new.nis, several=several,
-            remark=_remark(poor), log_evidence=log_evidence,
-            components=Components(components, reduced.expand, reduced.left_out, (unseen.mean, unseen.covariance)),
+            remark=_remark(poor), log_evidence=log_evidence, likeliest=likeliest,
         )  # fmt: skip
 
 

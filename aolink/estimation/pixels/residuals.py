@@ -57,11 +57,13 @@ class Residuals(NamedTuple):
 
 
 def residuals(
-    rig: Rig, exposure: Exposure, estimate: Estimate, before: Gaussian | None, axes: Indices
-) -> Residuals | None:
+    rig: Rig, exposure: Exposure, estimate: Estimate, before: Gaussian | None, axes: Indices,
+    likeliest: FloatArray | None = None,
+) -> Residuals | None:  # fmt: skip
     """The residuals of some axes of an exposure, or None where its pixels cannot be used.
 
-    ``before`` is the prediction of the start states of all axes.
+    ``before`` is the prediction of the start states of all axes. A fit begins at the ``likeliest`` reduced coefficients
+    of all axes, or else at the estimate's mean.
     """
     plant, model = rig.plant, estimate.model
     measured = None if exposure.slopes is not None else measure(rig, exposure, _NEEDS)[0]
@@ -75,7 +77,8 @@ def residuals(
         return None
     fit = _Fit(rig.sensor.profile, reduction(model, rig.sensor), estimate, axes)
     y, seen = density[axes], mask[axes]
-    start = fit.start(estimate, axes)
+    z = estimate.coefficients[axes]
+    start = z @ fit.reduced.expand[: z.shape[1]] if likeliest is None else likeliest[axes]
     spread = plant.initial_covariance + model.process_noise + estimate.start_covariance[axes]
     wide = fit.reduced.prior(Gaussian(estimate.start_state[axes], spread))
     fitted = fit.to(y, seen, start, wide)
@@ -125,16 +128,6 @@ class _Fit:
         self.variance = np.array([float(self.line.kernel.variance + reduced.widening) for _ in outputs])[:, None]
         self.read_noise = effective_noise_density(line) / line.pixel_size
         self.gain = shot_gain(line)
-
-    def start(self, estimate: Estimate, axes: Indices) -> FloatArray:
-        """Where a fit begins: the likeliest component of an estimate, otherwise its mean, (axes, n)."""
-        if estimate.components is not None:
-            each = (estimate.components.of(axis) for axis in axes.tolist())
-            likeliest = np.stack([mean[np.argmax(log_weight)] for log_weight, mean, _ in each])
-            if likeliest.shape[1] == self.reduced.expand.shape[1]:  # `sampled` has more coefficients
-                return likeliest
-        z = estimate.coefficients[axes]
-        return z @ self.reduced.expand[: z.shape[1]]
 
     def to(self, y: FloatArray, seen: BoolArray, t: FloatArray, prior: Gaussian) -> _Fitted:
         """The mode that a start leads to, by Levenberg and Marquardt's method."""
