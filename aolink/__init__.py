@@ -160,7 +160,7 @@ def estimate(exposures: Series | str | Path, estimators: str | Sequence[str]) ->
     exposures:
         The result of `simulate`, `exposures` or `read`, a part of it, or the path of a recording.
     estimators:
-        One or several of `aolink.estimation.ESTIMATOR_NAMES`, which options may follow: ``"moments:orders=012"``.
+        One or several of `aolink.estimation.ESTIMATOR_NAMES`, which options may follow: ``"o3:second_order"``.
 
     Returns
     -------

@@ -19,7 +19,6 @@ from aolink.control.registry import find_controller
 from aolink.errors import ControlError
 from aolink.estimation import exposure_model
 from aolink.estimation.frames.centroid_noise import centroid_covariance
-from aolink.estimation.kalman.predict import added_noise
 from aolink.estimation.kalman.steady_gain import steady_gain
 from aolink.numerics.arrays import FloatArray
 from aolink.rig import Rig
@@ -99,7 +98,7 @@ def check_stable(rig: Rig, name: str) -> Stability:
 def _observer_gain(rig: Rig) -> FloatArray:
     """Gain of the correction of the state at an exposure's end by its centroids, (n_states, n_outputs)."""
     model = exposure_model(rig.plant, rig.timing.exposure_steps, rig.timing.exposure_offset)
-    gain = steady_gain(model, added_noise(model, "lifted"), centroid_covariance(rig)[0])
+    gain = steady_gain(model, model.process_noise, centroid_covariance(rig)[0])
     if gain is None:
         raise ControlError(f"the loop on {rig.name} cannot be checked: its centroids lose a state that does not decay")
     return np.asarray(model.transition @ gain)

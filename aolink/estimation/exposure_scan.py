@@ -16,7 +16,6 @@ from scipy import linalg
 
 from aolink.errors import EstimatorError
 from aolink.estimation.frames.centroid_noise import centroid_covariance
-from aolink.estimation.kalman.predict import added_noise
 from aolink.estimation.kalman.steady_gain import steady_gain
 from aolink.estimation.model.exposure_model import exposure_model
 from aolink.numerics.arrays import FloatArray
@@ -103,7 +102,7 @@ def _expected_of(rig: Rig, R: FloatArray) -> ExpectedError:
     plant = replace(plant, delays=()) if plant.delays else plant
     model = exposure_model(plant, n)
     H, F = model.mean_row, model.transition
-    K = steady_gain(model, added_noise(model, "lifted"), R)
+    K = steady_gain(model, model.process_noise, R)
     if K is None:
         raise EstimatorError(
             f"exposures of {n} fast steps do not observe an eigenmode that does not decay: o1 has no steady state;"

@@ -14,7 +14,6 @@ from aolink.estimation.frames.frame_data import Profile, SpotWindows
 from aolink.estimation.kalman.filter import BlurFilter, Filter, PathFilter
 from aolink.estimation.kalman.filterpy_engine import FilterpyMoments
 from aolink.estimation.kalman.path_moments import Observation, PathMoments
-from aolink.estimation.kalman.predict import added_noise
 from aolink.estimation.kalman.steady_gain import steady_gain
 from aolink.estimation.model.exposure_model import exposure_model
 from aolink.estimation.moments.joint_moments import JointMoments
@@ -31,7 +30,7 @@ _WARM: set[tuple[type, int]] = set()
 
 
 def _blur_filter(rig: Rig, options: Options, observation: Observation[Any] | None, **more: Any) -> BlurFilter:
-    return BlurFilter(rig.plant, observation, process_noise=options.process_noise, gate=options.gate, **more)
+    return BlurFilter(rig.plant, observation, gate=options.gate, **more)
 
 
 def open_loop(rig: Rig, options: Options) -> Filter:
@@ -40,14 +39,14 @@ def open_loop(rig: Rig, options: Options) -> Filter:
 
 def paper(rig: Rig, options: Options, *orders: int) -> Filter:
     """The filters of Mishra & Wen with these moments."""
-    gain = _steady_gain(rig, options) if orders == (1,) and options.gain == "steady-state" else None
+    gain = _steady_gain(rig) if orders == (1,) else None
     if options.engine == "filterpy":
-        theirs = FilterpyMoments(rig.plant, orders, gain, flux=options.flux)
+        theirs = FilterpyMoments(rig.plant, orders, gain)
         return _blur_filter(rig, options, theirs, predictor=theirs.predict)
     second_order = options.second_order and 2 in orders
-    observation = PathMoments(rig.plant, orders, gain, flux=options.flux, second_order=second_order)
+    observation = PathMoments(rig.plant, orders, gain, second_order=second_order)
     if PathFilter.suits(rig.plant):
-        few = PathFilter(rig.plant, observation, process_noise=options.process_noise, gate=options.gate)
+        few = PathFilter(rig.plant, observation, gate=options.gate)
         few.warm_up(exposure_model(rig.plant, rig.window_steps, rig.timing.exposure_offset))
         return few
     if second_order:
@@ -57,13 +56,12 @@ def paper(rig: Rig, options: Options, *orders: int) -> Filter:
 
 
 @lru_cache(maxsize=4)
-def _steady_gain(rig: Rig, options: Options) -> FloatArray | None:
+def _steady_gain(rig: Rig) -> FloatArray | None:
     """The steady-state gain of o1 by the noise in the rig file, one for all axes or one each; None if there is none."""
     model = exposure_model(rig.plant, rig.window_steps, rig.timing.exposure_offset)
-    Q = added_noise(model, options.process_noise)
     # Axes whose spots have the same light share a gain.
     noises, of_axis = np.unique(centroid_covariance(rig), axis=0, return_inverse=True)
-    gains = [steady_gain(model, Q, noise) for noise in noises]
+    gains = [steady_gain(model, model.process_noise, noise) for noise in noises]
     if len(gains) == 1:
         return gains[0]
     known = [gain for gain in gains if gain is not None]
@@ -72,23 +70,23 @@ def _steady_gain(rig: Rig, options: Options) -> FloatArray | None:
 
 def moments(rig: Rig, options: Options) -> Filter:
     if rig.plant.n_outputs == 1:
-        _warm_up_line(rig, options)
+        _warm_up_line(rig)
     if alike_systems(rig.plant) is not None:
         _warm_up(rig)
-    return _blur_filter(rig, options, _windowed(rig, options))
+    return _blur_filter(rig, options, _windowed(rig))
 
 
-def _windowed(rig: Rig, options: Options) -> Observation[Any]:
+def _windowed(rig: Rig) -> Observation[Any]:
     """Windowed moments of a line sensor, of spots, or of all spots of a plant with hundreds of states."""
-    orders, flux, n_outputs = options.orders, options.flux, rig.plant.n_outputs
+    n_outputs = rig.plant.n_outputs
     if n_outputs == 1:
         from aolink.estimation.moments.lines import WindowedMoments
 
-        return WindowedMoments(rig.sensor.profile, orders, flux=flux)
+        return WindowedMoments(rig.sensor.profile)
     sensor = _spots(rig)
     if alike_systems(rig.plant) is not None:
-        return JointMoments(sensor, n_outputs, orders, flux=flux)
-    return WindowedSpots(sensor, n_outputs // 2, orders, flux=flux)
+        return JointMoments(sensor, n_outputs)
+    return WindowedSpots(sensor, n_outputs // 2)
 
 
 def _spots(rig: Rig) -> SpotSensor:
@@ -108,12 +106,12 @@ def _warm_up(rig: Rig) -> None:
         blur_filter.step(model, model.response(np.zeros((steps, rig.n_inputs))), dark)
 
 
-def _warm_up_line(rig: Rig, options: Options) -> None:
+def _warm_up_line(rig: Rig) -> None:
     """Estimate a dark exposure of one line, so that what this loads is loaded before the session."""
     plant, pixels = replace(rig.plant, axes=1), rig.sensor.profile.pixels
     model = exposure_model(plant, 2)
     dark = Profile(density=np.zeros((1, pixels)), mask=np.ones((1, pixels), dtype=bool))
-    one = BlurFilter(plant, _windowed(rig, options))
+    one = BlurFilter(plant, _windowed(rig))
     one.step(model, model.response(np.zeros((2, plant.n_inputs))), dark)
 
 

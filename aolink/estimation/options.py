@@ -6,25 +6,16 @@ from dataclasses import dataclass
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from aolink.errors import EstimatorError
-from aolink.estimation.frames.frame_data import Flux
-from aolink.estimation.kalman.predict import Noise
 
 Engine = Literal["aolink", "filterpy"]
 
-_HIGHEST_ORDER = 8
 _MOST_DRAWS = 400
 
 
 @dataclass(frozen=True)
 class Options:
-    """Choices that the paper leaves open."""
+    """Choices that a rig leaves open."""
 
-    gain: Literal["steady-state", "time-varying"] = "steady-state"
-    """The gain of o1: "steady-state", or "time-varying", which a plant without a steady-state gain always gets."""
-    process_noise: Noise = "lifted"
-    """Noise that an exposure adds to the state: "lifted", or "printed" for the paper's B_w W B_w'."""
-    flux: Flux = "known"
-    """"known": the light of a frame sums to one; "measured": moments are divided by what it sums to."""
     gate: bool = True
     """Whether a measurement too far from its prediction is left out."""
     engine: Engine = "aolink"
@@ -33,8 +24,6 @@ class Options:
     """Whether o2 and o3 include the second-order terms that their linearisation leaves out (`PathMoments`):
     their covariance is then right where the prior is as wide as the spot's motion, at the price of a weaker
     correction."""
-    orders: tuple[int, ...] = (0, 1, 2, 3)
-    """Orders of the moments that `moments` takes; 0 is the light in the window."""
     draws: int = 100
     """Points that `profile` draws for importance sampling, in per cent of the usual number: the budget of work. With 5
     an exposure takes a sixth of the time, the estimates have larger errors, and the log-evidence, which is not from
@@ -47,7 +36,7 @@ _NAMES = tuple(Options.__dataclass_fields__)
 def with_options(text: str) -> tuple[str, dict[str, Any]]:
     """An estimator's name and options from a text such as ``o3:second_order`` or ``o1:engine=filterpy,gate=false``.
 
-    ``orders`` are digits, ``orders=012``; an option without a value is switched on. Raises EstimatorError.
+    An option without a value is switched on. Raises EstimatorError.
     """
     name, colon, listed = text.partition(":")
     if colon and not listed:
@@ -63,8 +52,6 @@ def with_options(text: str) -> tuple[str, dict[str, Any]]:
 
 
 def _no_option(key: str) -> str:
-    if key == "basis":
-        return "moments are monomials: leave basis out"
     return f"estimators have no option {key!r}: use {', '.join(_NAMES)}"
 
 
@@ -76,9 +63,8 @@ def _read(text: str, key: str, default: object, value: str) -> object:
     if isinstance(default, str):
         return value
     if not value.isdecimal():
-        expected = "digits, such as 012" if key == "orders" else "a whole number"
-        raise EstimatorError(f"{text}: {key} = {value!r}, expected {expected}")
-    return tuple(map(int, value)) if key == "orders" else int(value)
+        raise EstimatorError(f"{text}: {key} = {value!r}, expected a whole number")
+    return int(value)
 
 
 def checked_options(**options: Any) -> Options:
@@ -94,7 +80,4 @@ def checked_options(**options: Any) -> Options:
         raise EstimatorError(f"draws = {chosen.draws}: use 1 to {_MOST_DRAWS} per cent of the usual points")
     if chosen.second_order and chosen.engine == "filterpy":
         raise EstimatorError("second_order is not for the engine 'filterpy', whose filters are of first order")
-    orders = tuple(chosen.orders)
-    if len(set(orders)) < len(orders) or not any(orders) or not set(orders) <= set(range(_HIGHEST_ORDER + 1)):
-        raise EstimatorError(f"orders = {orders}: use different ones from 0 to {_HIGHEST_ORDER}, not 0 alone")
     return chosen

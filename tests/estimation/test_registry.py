@@ -42,14 +42,13 @@ def test_a_row_refuses_what_making_the_estimator_refuses():
 
 def test_options_may_follow_the_name():
     rig = load_rig("section-vi-lively")
-    named = make_estimator(rig, "o3:second_order,flux=measured")
-    given = make_estimator(rig, "o3", second_order=True, flux="measured")
+    named = make_estimator(rig, "o3:second_order,gate=false")
+    given = make_estimator(rig, "o3", second_order=True, gate=False)
     for exposure in simulate(rig, 4):
         ours, theirs = named.step(exposure), given.step(exposure)
-        assert ours.estimator == "o3:second_order,flux=measured"
+        assert ours.estimator == "o3:second_order,gate=false"
         assert np.array_equal(ours.end_state, theirs.end_state)
     assert with_options("profile:draws=50,gate=false") == ("profile", {"draws": 50, "gate": False})
-    assert with_options("moments:orders=012,gate=false") == ("moments", {"orders": (0, 1, 2), "gate": False})
     assert by_rank(["moments", "o3:second_order", "o3", "o1"]) == ["o1", "o3", "o3:second_order", "moments"]
     assert estimator_colour("o3:second_order") != estimator_colour("o3")
 
@@ -57,14 +56,13 @@ def test_options_may_follow_the_name():
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("o3:tuning=3", "o3:tuning=3: estimators have no option 'tuning': use gain, process_noise"),
+        ("o3:tuning=3", "o3:tuning=3: estimators have no option 'tuning': use gate, engine"),
         ("o3:", "no estimator 'o3:': after the colon"),
         ("o3:second_order=maybe", "second_order = 'maybe', expected true or false"),
         ("profile:draws=many", "draws = 'many', expected a whole number"),
-        ("moments:orders=0-2", "orders = '0-2', expected digits, such as 012"),
-        ("o3:flux=some", "flux = 'some' is not known"),
+        ("o3:engine=some", "engine = 'some' is not known"),
         ("o4:second_order", "no estimator 'o4': use one of open-loop, o1"),
-        ("profile:tempered=0", "profile:tempered=0: estimators have no option 'tempered': use gain"),
+        ("profile:tempered=0", "profile:tempered=0: estimators have no option 'tempered': use gate"),
     ],
 )
 def test_an_option_that_makes_no_sense_is_named(text, message):

@@ -9,7 +9,17 @@ from scipy import linalg
 
 import aolink
 from aolink.errors import EstimatorError
-from aolink.estimation import Measurement, Status, exposure_model, make_estimator, run, score, smooth
+from aolink.estimation import (
+    BlurFilter,
+    Estimator,
+    Measurement,
+    PathMoments,
+    Status,
+    exposure_model,
+    run,
+    score,
+    smooth,
+)
 from aolink.estimation.frames.moments import measure_moments, noise_integrals
 from aolink.optics.camera import effective_noise_density
 from aolink.plant.lifting import input_response, lift
@@ -55,7 +65,7 @@ def batch(rig, exposures):
 def test_it_is_one_least_squares_solve_where_all_is_linear(period):
     rig = dataclasses.replace(RIG, timing=dataclasses.replace(RIG.timing, frame_period_steps=period))
     exposures = simulate(rig, 12, seed=5)
-    o1 = make_estimator(rig, "o1", gain="time-varying", gate=False)
+    o1 = Estimator(rig, "o1", BlurFilter(rig.plant, PathMoments(rig.plant, (1,)), gate=False))
     smoothed = smooth(rig.plant, exposures, [o1.step(e) for e in exposures])
     mean, covariance = batch(rig, exposures)
     np.testing.assert_allclose([e.start_state[0] for e in smoothed], mean, atol=1e-8)

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 import aolink
 from aolink.colours import estimator_colour
-from aolink.estimation import Estimate, make_estimator, run
+from aolink.estimation import BlurFilter, Estimate, Estimator, PathMoments, run
 from aolink.estimation.frames.moments import measure_moments
 from aolink.exposure import Exposure
 from aolink.numerics.arrays import FloatArray
@@ -162,7 +162,7 @@ def _start_errors(rig: Rig, runs: int, count: int) -> dict[str, FloatArray]:
     """Squared norms of the start state's errors from a wrong start, (runs, exposures), by estimator."""
     there, believed = (side_by_side(each, runs) for each in displaced(rig))
     series = with_pixel_noise(there, clean_exposures(there, count, seed=14), seed=15)
-    varying = make_estimator(believed, "o1", gain="time-varying")
+    varying = Estimator(believed, "o1", BlurFilter(believed.plant, PathMoments(believed.plant, (1,))))
     found = {**run(believed, series, ["o1", "o3"]), "o1, time-varying gain": [varying.step(e) for e in series]}
     return {name: errors(series, estimates, 0).start for name, estimates in found.items()}
 

@@ -21,9 +21,7 @@ class Step(NamedTuple):
     transition: FloatArray
     """A of an exposure, (n, n)."""
     noise: FloatArray
-    """What an exposure adds to the covariance of the estimate, (n, n)."""
-    lifted_noise: FloatArray
-    """And to that of the prediction without measurements, (n, n)."""
+    """What an exposure adds to the covariance, (n, n)."""
     mean_row: FloatArray
     """C-bar, (outputs, n)."""
     quadratic: FloatArray
@@ -106,9 +104,7 @@ def filter_series(step: Step, series: Series, carried: Carried, out: Filtered) -
     """Kalman's update with the moments of each exposure, the gate, and the prediction to the next exposure: Mishra &
     Wen (16) to (20), with the moments of `path_moments.predicted_moments`. ``carried`` and ``out`` are filled."""
     # Fields by themselves: those of a tuple have their references counted at each use.
-    A, Q, lifted, gains, gate, patience = (
-        step.transition, step.noise, step.lifted_noise, step.gains, step.gate, step.patience,
-    )  # fmt: skip
+    A, Q, gains, gate, patience = step.transition, step.noise, step.gains, step.gate, step.patience
     C_bar, M, first, second, second_order = step.mean_row, step.quadratic, step.first, step.second, step.second_order
     means, slopes, squares, kicks, values, noises, usable = series
     x, P, unseen, unseen_P, missed = carried
@@ -166,7 +162,7 @@ def filter_series(step: Step, series: Series, carried: Carried, out: Filtered) -
             for j in range(n):
                 unseen[axis, i] += A[i, j] * s[j]
         if axis == axes - 1:
-            _congruence(A, unseen_P, product, lifted, unseen_P)
+            _congruence(A, unseen_P, product, Q, unseen_P)
 
 
 @inlined

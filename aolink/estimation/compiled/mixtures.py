@@ -182,48 +182,6 @@ def _log_densities(
 
 
 @compiled
-def log_densities_and_gradients(
-    log_weight: FloatArray, mean: FloatArray, covariance: FloatArray, points: FloatArray, out: FloatArray,
-    gradients: FloatArray,
-) -> None:  # fmt: skip
-    """Log-densities (axes, points) of mixtures with components (axes, components, ...) at points (axes, points, n), and
-    their gradients by the points, (axes, points, n)."""
-    axes, count, n = mean.shape
-    many = points.shape[1]
-    root, inverse, constant = np.empty((count, n, n)), np.empty((count, n, n)), np.empty(count)
-    t, white, logs = np.empty((n, many)), np.empty((n, many)), np.empty((count, many))
-    share, pulled = np.empty(many), np.empty((n, many))
-    for axis in range(axes):
-        w, m = log_weight[axis], mean[axis]
-        for k in range(many):
-            for i in range(n):
-                t[i, k] = points[axis, k, i]
-        _roots(w, covariance[axis], root, inverse, constant)
-        _log_densities(w, m, inverse, constant, t, 0, many, share, logs, out[axis])
-        pulled[:] = 0.0
-        for c in range(count):
-            if w[c] == -math.inf:
-                continue
-            for k in range(many):
-                share[k] = math.exp(logs[c, k] - out[axis, k])
-            for i in range(n):
-                for k in range(many):
-                    white[i, k] = 0.0
-                for j in range(i + 1):
-                    x, middle = inverse[c, i, j], m[c, j]
-                    for k in range(many):
-                        white[i, k] += x * (t[j, k] - middle)
-            for i in range(n):
-                for j in range(i, n):
-                    x = inverse[c, j, i]
-                    for k in range(many):
-                        pulled[i, k] -= share[k] * x * white[j, k]
-        for k in range(many):
-            for i in range(n):
-                gradients[axis, k, i] = pulled[i, k]
-
-
-@compiled
 def correct_by_importance(
     seen: Pixels, prior_weight: FloatArray, prior_mean: FloatArray, prior_covariance: FloatArray,
     log_weight: FloatArray, mean: FloatArray, covariance: FloatArray, uniform: FloatArray, normal: FloatArray,
@@ -256,7 +214,7 @@ def correct_by_importance(
             old_weight[r], old_mean[r], old_inverse[r], old_constant[r] = w, x, inverse, constant
             begin, end = r * points, (r + 1) * points
             _draw(w, x, root, uniform[r], normal[r], total, t, begin)
-            log_likelihoods_of_row(seen, axis, t, begin, end, target, np.empty((0, 0)))
+            log_likelihoods_of_row(seen, axis, t, begin, end, target)
             _log_densities(
                 prior_weight[axis], prior_mean[axis], prior_inverse, prior_constant, t, begin, end, some, prior_logs,
                 prior_density,

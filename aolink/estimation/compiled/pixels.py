@@ -62,20 +62,18 @@ def places_of(
     Of each node of ``count`` paths (nodes, points), without a branch, so that several are computed at a time; all
     results are (nodes, points). Where the first pixel is -1 the others mean nothing.
     """
-    number = paths.dtype.type  # of constants as well: otherwise single precision would be left here
-    least, most, nowhere, half = number(-0.5 * reach), number(pixels + 0.5 * reach), number(0.0), number(0.5)
-    low, per_unit, density = number(low), number(per_unit), number(points)
+    least, most = -0.5 * reach, pixels + 0.5 * reach
     for node in range(len(paths)):
         for k in range(count):
             v = (paths[node, k] - low) * per_unit
             lit = v > least and v < most
-            v = v if lit else nowhere
-            cell = number(math.floor(v))
+            v = v if lit else 0.0
+            cell = math.floor(v)
             u = v - cell
-            point = min(int(u * density), points - 1)
+            point = min(int(u * points), points - 1)
             firsts[node, k] = int(cell) + reach // 2 if lit else -1
             nearest[node, k] = point
-            away[node, k] = u - (number(point) + half) / density
+            away[node, k] = u - (point + 0.5) / points
 
 
 @inlined
@@ -107,24 +105,21 @@ def _padding(seen: Pixels) -> tuple[int, int]:
 
 
 @compiled
-def log_likelihoods_of_row(
-    seen: Pixels, row: int, t: FloatArray, begin: int, end: int, out: FloatArray, gradients: FloatArray
-) -> None:
+def log_likelihoods_of_row(seen: Pixels, row: int, t: FloatArray, begin: int, end: int, out: FloatArray) -> None:
     """Log-likelihoods of the points ``begin`` to ``end`` of t (n, points) in one row.
 
-    Their gradients by t are added to ``gradients``, (n, points), unless it is empty. In the loop over points no part of
-    an array and no field of the `Pixels` is taken: each would be counted as another reference, and that would take as
-    long as all the rest.
+    In the loop over points no part of an array and no field of the `Pixels` is taken: each would be counted as another
+    reference, and that would take as long as all the rest.
     """
     weights, terms, low, per_unit = seen.weights, seen.terms, seen.low, seen.per_unit
     across, down, read_noise, gain = seen.across, seen.down, seen.read_noise, seen.gain
     (_, spots, height, width), (high, wide) = seen.y.shape, _padding(seen)
-    number, nodes, directions = across.dtype, len(weights), len(seen.basis) // spots
-    f = np.zeros((height + 2 * high, width + 2 * wide), number)
-    columns, rows = np.empty((2, wide), number), np.empty((2, down.shape[3]), number)
-    path, pulls = np.empty((nodes, _AT_ONCE), number), np.empty((2, nodes, _AT_ONCE), number)
+    nodes, directions = len(weights), len(seen.basis) // spots
+    f = np.zeros((height + 2 * high, width + 2 * wide))
+    columns, rows = np.empty((2, wide)), np.empty((2, down.shape[3]))
+    path = np.empty((nodes, _AT_ONCE))
     firsts, nearest = np.zeros((2, nodes, _AT_ONCE), np.int64), np.zeros((2, nodes, _AT_ONCE), np.int64)
-    away = np.zeros((2, nodes, _AT_ONCE), number)
+    away = np.zeros((2, nodes, _AT_ONCE))
     for first in range(begin, end, _AT_ONCE):
         count = min(_AT_ONCE, end - first)
         for k in range(count):
@@ -142,27 +137,9 @@ def log_likelihoods_of_row(
                 top, bottom, left, right = _add_light(
                     k, firsts, nearest, away, weights, terms, across, down, columns, rows, f
                 )
-                out[first + k] += _scores(
+                out[first + k] += _log_likelihood(
                     light, usable, f, high, wide, top, bottom, left, right, dark, read_noise, gain
                 )
-                if len(gradients):
-                    _put_pulls(
-                        k, firsts, nearest, away, weights, terms, across, down, columns, rows, f, per_unit, pulls
-                    )
-                for r in range(top, bottom):
-                    for c in range(left, right):
-                        f[r, c] = 0.0
-            if len(gradients):
-                for d in range(directions):
-                    _add_gradients(seen.basis[directions * spot + d], pulls[d], first, count, gradients)
-
-
-@compiled
-def log_likelihoods_and_gradients(seen: Pixels, t: FloatArray, out: FloatArray, gradients: FloatArray) -> None:
-    """Log-likelihoods (rows, points) of points t (rows, n, points); their gradients by t are added to ``gradients``,
-    (rows, n, points)."""
-    for row in range(len(t)):
-        log_likelihoods_of_row(seen, row, t[row], 0, t.shape[2], out[row], gradients[row])
 
 
 @inlined
@@ -206,22 +183,21 @@ def _add_product(f: FloatArray, top: int, left: int, rows: FloatArray, columns: 
 @inlined
 def _taylor(table: FloatArray, term: int, point: int, d: float, factor: float, out: FloatArray) -> None:
     """The light of a spot at a distance d from a point of the table, out[0]."""
-    weight, row = out.dtype.type(factor), np.uintp(point)  # without a sign: nothing asks if it counts from the end
+    row = np.uintp(point)  # without a sign: nothing asks if it counts from the end
     for k in range(out.shape[1]):
         p = np.uintp(k)
         slope = table[term, row, 1, p] + d * (table[term, row, 2, p] + d * table[term, row, 3, p])
-        out[0, p] = weight * (table[term, row, 0, p] + d * slope)
+        out[0, p] = factor * (table[term, row, 0, p] + d * slope)
 
 
 @inlined
 def _taylor_slope(table: FloatArray, term: int, point: int, d: float, factor: float, out: FloatArray) -> None:
     """The derivative of `_taylor` by d, out[1]."""
-    number, row = out.dtype.type, np.uintp(point)
-    weight, two, three = number(factor), number(2.0), number(3.0)
+    row = np.uintp(point)
     for k in range(out.shape[1]):
         p = np.uintp(k)
-        steeper = two * table[term, row, 2, p] + three * d * table[term, row, 3, p]
-        out[1, p] = weight * (table[term, row, 1, p] + d * steeper)
+        steeper = 2.0 * table[term, row, 2, p] + 3.0 * d * table[term, row, 3, p]
+        out[1, p] = factor * (table[term, row, 1, p] + d * steeper)
 
 
 @compiled_sums
@@ -234,101 +210,50 @@ def _squares(y: FloatArray, usable: BoolArray) -> float:
 
 
 @compiled_sums
-def _scores(
+def _log_likelihood(
     y: FloatArray, usable: BoolArray, f: FloatArray, down: int, across: int, top: int, bottom: int, left: int,
     right: int, dark: float, read_noise: float, gain: float,
 ) -> float:  # fmt: skip
-    """Log-likelihood of the usable pixels of y (height, width) with padded expected densities f.
+    """Log-likelihood of the usable pixels of y (height, width) with padded expected densities f, which become zero.
 
-    Only the padded rows ``top`` to ``bottom`` and columns ``left`` to ``right`` have light; there the log-likelihood's
-    derivatives take the place of the densities, and zeros that of the padding. ``dark`` are the `_squares` of y.
+    Only the padded rows ``top`` to ``bottom`` and columns ``left`` to ``right`` have light. ``dark`` are the `_squares`
+    of y.
     """
-    (height, width), number = y.shape, f.dtype.type
-    nothing, one, noise, growth, half = number(0.0), number(1.0), number(read_noise), number(gain), number(0.5)
-    squares, logs, quiet, still = dark, 0.0, 1.0 / read_noise, number(1.0 / read_noise)
+    height, width = y.shape
+    squares, logs, quiet = dark, 0.0, 1.0 / read_noise
     first, end = max(left - across, 0), min(right - across, width)
     for padded in range(top, bottom):
         r = padded - down
         if r < 0 or r >= height:
             for c in range(left, right):
-                f[padded, c] = nothing
+                f[padded, c] = 0.0
             continue
         for c in range(left, across):
-            f[padded, c] = nothing
+            f[padded, c] = 0.0
         for c in range(across + width, right):
-            f[padded, c] = nothing
+            f[padded, c] = 0.0
         if gain:
             product = 1.0
             for c in range(first, end):
-                if usable[r, c] and f[padded, across + c] > nothing:
+                if usable[r, c] and f[padded, across + c] > 0.0:
                     # One logarithm of a product is taken: one a pixel would take longer than everything else here.
                     product *= 1.0 + gain * quiet * f[padded, across + c]
                     if product > LARGE:
                         logs += math.log(product)
                         product = 1.0
             logs += math.log(product)
-        less, base, line = nothing, np.uintp(across), np.uintp(r)
+        less, base, line = 0.0, np.uintp(across), np.uintp(r)
         for k in range(first, end):
             p = np.uintp(k)
-            light, seen = f[padded, base + p], one if usable[line, p] else nothing
-            grows = growth if light > nothing else nothing
-            information = one / (noise + grows * light) if gain else still
+            light, seen = f[padded, base + p], 1.0 if usable[line, p] else 0.0
+            grows = gain if light > 0.0 else 0.0
+            information = 1.0 / (read_noise + grows * light) if gain else quiet
             e = seen * (y[line, p] - light)
             score = e * information
-            less += seen * y[line, p] * y[line, p] - noise * e * score
-            f[padded, base + p] = score + half * grows * information * (e * score - seen)
+            less += seen * y[line, p] * y[line, p] - read_noise * e * score
+            f[padded, base + p] = 0.0
         squares -= less
     return -0.5 * (squares * quiet + logs)
-
-
-@compiled
-def _put_pulls(
-    point: int, firsts: IntArray, nearest: IntArray, away: FloatArray, weights: FloatArray, terms: FloatArray,
-    across: FloatArray, down: FloatArray, columns: FloatArray, rows: FloatArray, scores: FloatArray, per_unit: float,
-    pulls: FloatArray,
-) -> None:  # fmt: skip
-    """Derivatives of the log-likelihood by the path at the nodes, (2, nodes, points), of the point of `_add_light`,
-    from those by the densities: its adjoint."""
-    for k in range(len(weights)):
-        left, top = firsts[0, k, point], firsts[1, k, point]
-        pulls[0, k, point] = pulls[1, k, point] = 0.0
-        if left < 0 or top < 0:
-            continue
-        for j in range(len(terms)):
-            weight = terms[j] * weights[k] * per_unit
-            _taylor(down, j, nearest[1, k, point], away[1, k, point], 1.0, rows)
-            _taylor_slope(down, j, nearest[1, k, point], away[1, k, point], 1.0, rows)
-            _taylor(across, j, nearest[0, k, point], away[0, k, point], weight, columns)
-            _taylor_slope(across, j, nearest[0, k, point], away[0, k, point], weight, columns)
-            by_x, by_y = _slopes(scores, top, left, rows, columns)
-            pulls[0, k, point] += by_x
-            pulls[1, k, point] += by_y
-
-
-@compiled_sums
-def _slopes(scores: FloatArray, top: int, left: int, rows: FloatArray, columns: FloatArray) -> tuple[float, float]:
-    """Sums of scores times the slopes of `_add_product` by x and by y."""
-    nothing = scores.dtype.type(0.0)
-    by_x = by_y = nothing
-    for k in range(rows.shape[1]):
-        r, along, aside = np.uintp(top) + np.uintp(k), nothing, nothing
-        for m in range(columns.shape[1]):
-            score = scores[r, np.uintp(left) + np.uintp(m)]
-            along += score * columns[1, m]
-            aside += score * columns[0, m]
-        by_x += rows[0, k] * along
-        by_y += rows[1, k] * aside
-    return by_x, by_y
-
-
-@compiled
-def _add_gradients(basis: FloatArray, pulls: FloatArray, first: int, count: int, gradients: FloatArray) -> None:
-    """Add gradients by t, (n, points), of ``count`` points from ``first`` on: derivatives by the path at the nodes,
-    (nodes, points), times those of the path. The adjoint of `_paths_of`."""
-    for i in range(len(gradients)):
-        for node in range(len(pulls)):
-            for k in range(count):
-                gradients[i, np.uintp(first) + np.uintp(k)] += basis[i, node] * pulls[node, k]
 
 
 @compiled

@@ -198,32 +198,3 @@ def _four_sums(c: FloatArray, g: FloatArray, a: int, end: int, second: FloatArra
         t3 += cube * g[2, a + 3, j]
     second[a], second[a + 1], second[a + 2], second[a + 3] = s0, s1, s2, s3
     third[a], third[a + 1], third[a + 2], third[a + 3] = t0, t1, t2, t3
-
-
-@compiled
-def _light(values: FloatArray) -> float:
-    """The light that the sums are divided by; without any there is no ratio, and the significance says so."""
-    return 1.0 if values[0] == 0.0 else values[0]
-
-
-@compiled
-def divide_by_first(values: FloatArray, covariance: FloatArray) -> None:
-    """Sums after the first one divided by it, and their covariance, to first order: as `Windowed.ratios`."""
-    light, sums = _light(values), len(values)
-    for a in range(1, sums):
-        values[a] /= light
-    for a in range(1, sums):
-        for b in range(1, sums):
-            covariance[a, b] += (
-                values[a] * values[b] * covariance[0, 0] - values[a] * covariance[0, b] - values[b] * covariance[a, 0]
-            )
-            covariance[a, b] /= light * light
-
-
-@compiled
-def divide_slopes(values: FloatArray, slope: FloatArray) -> None:
-    """The slopes of sums after the first one divided by it, before `divide_by_first`."""
-    light = _light(values)
-    for a in range(1, len(values)):
-        for i in range(slope.shape[1]):
-            slope[a, i] = (slope[a, i] - values[a] / light * slope[0, i]) / light

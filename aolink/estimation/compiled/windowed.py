@@ -14,8 +14,6 @@ from aolink.estimation.compiled.small import cholesky_solve, compiled, floored_c
 from aolink.estimation.compiled.window_sums import (
     SUMS,
     VECTOR,
-    divide_by_first,
-    divide_slopes,
     edges_of,
     padded,
     remainder_of,
@@ -62,12 +60,10 @@ class Lines(NamedTuple):
     """Variance of the path about its nodes that no coefficient covers, slope units squared."""
     orders: IntArray
     """Orders of the moments, (sums,)."""
-    ratios: bool
-    """Whether the sums are divided by the first one, the light in the window."""
 
 
 class Fits(NamedTuple):
-    """The results of a pass, one row for each axis; a sum that the others are divided by is not in them."""
+    """The results of a pass, one row for each axis."""
 
     mean: FloatArray
     """The posterior, (rows, n); before the pass the Gaussian about which the sums are linearised."""
@@ -81,8 +77,6 @@ class Fits(NamedTuple):
     """Without the remainder's memory, (rows, m, m)."""
     nis: FloatArray
     """(rows,)"""
-    significance: FloatArray
-    """The light in the window over its standard deviation, (rows,)."""
     closed_loop: FloatArray
     """How an error of the start state goes on to the next exposure's, A (I - K H), (rows, n_states, n_states)."""
 
@@ -94,15 +88,13 @@ def linearise(
 ) -> None:  # fmt: skip
     """Priors (rows, n) and (rows, n, n) updated with the sums, linearised about the previous pass."""
     n, nodes = lines.basis.shape
-    sums, pixels = len(lines.orders), lines.density.shape[1]
-    first = 1 if lines.ratios else 0
-    m, width = sums - first, lines.shared.shape[1]
+    m, pixels, width = len(lines.orders), lines.density.shape[1], lines.shared.shape[1]
     path, variance = np.empty(nodes), np.empty(nodes)
     left, right = np.zeros((lines.free + m, width)), np.zeros((lines.free + m, width))
-    W, change, places = np.empty((sums, pixels)), np.empty((pixels + 1, sums)), np.empty(pixels + 1)
-    g = np.zeros((3, padded(sums, SUMS), width))
-    y, expected, slope = np.empty(sums), np.empty(sums), np.empty((sums, n))
-    noise, remainder = np.empty((sums, sums)), np.empty((sums, sums))
+    W, change, places = np.empty((m, pixels)), np.empty((pixels + 1, m)), np.empty(pixels + 1)
+    g = np.zeros((3, padded(m, SUMS), width))
+    y, expected, slope = np.empty(m), np.empty(m), np.empty((m, n))
+    noise, remainder = np.empty((m, m)), np.empty((m, m))
     for row in range(len(prior_mean)):
         _spread(
             row, lines.basis, lines.inputs, fits.mean, prior_covariance, fits.known, lines.shared, path, variance,
@@ -121,33 +113,27 @@ def linearise(
         responses_at_nodes(edges, path, variance, lines.weights, kernel_variance, places, change, expected, g)
         slopes_of(lines.basis, g, slope)
         remainder_of(lines.shared, left, right, g, remainder)
-        if lines.ratios:
-            fits.significance[row] = y[0] / math.sqrt(noise[0, 0])
-            divide_slopes(expected, slope)
-            divide_by_first(y, noise)
-            divide_by_first(expected, remainder)
         _update(
-            row, first, y, expected, slope, noise, remainder, memory[row], prior_mean, prior_covariance, last,
+            row, y, expected, slope, noise, remainder, memory[row], prior_mean, prior_covariance, last,
             lines.end_rows, fits,
         )  # fmt: skip
 
 
 @compiled
 def _update(
-    row: int, first: int, y: FloatArray, expected: FloatArray, slope: FloatArray, noise: FloatArray,
+    row: int, y: FloatArray, expected: FloatArray, slope: FloatArray, noise: FloatArray,
     remainder: FloatArray, memory: float, prior_mean: FloatArray, prior_covariance: FloatArray, last: bool,
     end_rows: FloatArray, fits: Fits,
 ) -> None:  # fmt: skip
-    """A Kalman update of one row with the sums from ``first`` on, as `joseph_update`."""
-    sums, n = slope.shape
-    m, states = sums - first, len(end_rows)
+    """A Kalman update of one row with the sums, as `joseph_update`."""
+    (m, n), states = slope.shape, len(end_rows)
     H, HP, R = np.empty((m, n)), np.empty((m, n)), np.empty((m, m))
     S, own, root = np.empty((m, m)), np.empty((m, m)), np.empty((m, m))
     new, x, K = np.empty(m), np.empty(m), np.empty((n, m))
     for a in range(m):
-        new[a] = y[first + a] - expected[first + a]
+        new[a] = y[a] - expected[a]
         for i in range(n):
-            H[a, i] = slope[first + a, i]
+            H[a, i] = slope[a, i]
             new[a] -= H[a, i] * (prior_mean[row, i] - fits.mean[row, i])
     times(H, prior_covariance[row], HP)
     for a in range(m):
@@ -155,9 +141,9 @@ def _update(
             total = 0.0
             for i in range(n):
                 total += HP[a, i] * H[b, i]
-            R[a, b] = noise[first + a, first + b] + memory * remainder[first + a, first + b]
+            R[a, b] = noise[a, b] + memory * remainder[a, b]
             S[a, b] = total + R[a, b]
-            own[a, b] = total + (noise[first + a, first + b] + remainder[first + a, first + b])
+            own[a, b] = total + (noise[a, b] + remainder[a, b])
     floored_cholesky_into(S, root)
     for i in range(n):
         for a in range(m):

@@ -7,8 +7,6 @@ from typing import ClassVar, Literal, Self
 
 from aolink.numerics.arrays import BoolArray, FloatArray, Indices
 
-Flux = Literal["known", "measured"]
-
 HALF = 0.5
 """Least share of a spot's pixels that estimators which take windows or profiles can use; and least share of the spots,
 on a plant with hundreds of states."""
@@ -23,8 +21,6 @@ class Needs:
     moves whole spots."""
     orders: tuple[int, ...] = ()
     """Orders of the moments, from 1."""
-    flux: Flux = "known"
-    """"known": the light of a frame sums to one; "measured": moments are divided by the measured light."""
     least_usable: float = 1.0
     """Share of a spot's pixels that must be usable. Moments need all of them: whole spots."""
     least_spots: float = 1.0

@@ -88,8 +88,7 @@ def _moments_of_lines(sensor: Sensor, pixels: NDArray[np.uint16], needs: Needs) 
     """Which frames of a line sensor, (frames, pixels), show a spot without a flaw, and the moments of these."""
     lit = spot_significance(sensor, to_density(sensor, pixels)) >= least_significance(sensor)
     good = np.flatnonzero(lit & ~is_saturated(sensor, pixels).any(axis=1))
-    moments = measure_moments(sensor, pixels[good], needs.orders, needs.flux) if len(good) else ""
-    return good, moments if isinstance(moments, Measurement) else None
+    return good, measure_moments(sensor, pixels[good], needs.orders) if len(good) else None
 
 
 def measure(rig: Rig, exposure: Exposure, needs: Needs | None) -> MeasuredFrame:
@@ -124,8 +123,7 @@ def measure(rig: Rig, exposure: Exposure, needs: Needs | None) -> MeasuredFrame:
     rows = (rig.plant.axes, -1)
     if needs.what != "moments":
         return Profile(density=density.reshape(rows), mask=usable.reshape(rows)), remark
-    moments = measure_moments(sensor, pixels.reshape(rows), needs.orders, needs.flux)
-    return (None, moments) if isinstance(moments, str) else (moments, "")
+    return measure_moments(sensor, pixels.reshape(rows), needs.orders), ""
 
 
 def _measured_slopes(rig: Rig, frame_id: int, slopes: FloatArray, needs: Needs) -> MeasuredFrame:

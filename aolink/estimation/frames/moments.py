@@ -14,17 +14,15 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from aolink.estimation.frames.frame_data import Flux, Measurement
+from aolink.estimation.frames.frame_data import Measurement
 from aolink.numerics import batched
-from aolink.numerics.arrays import BoolArray, FloatArray, Indices
+from aolink.numerics.arrays import BoolArray, FloatArray
 from aolink.optics.camera import effective_noise_density
 from aolink.optics.kernel import kernel_moments
 from aolink.optics.sensor import Sensor
 
 Counts = NDArray[np.uint16] | FloatArray
 
-# Where the flux is measured, its sd must be this many times smaller: a ratio's variance is not finite otherwise.
-LEAST_FLUX = 5.0
 # A smeared spot falls short of the first about once in eighty; a frame without one reaches the second once in 270.
 _LEAST, _ENOUGH = 2.0, 4.0
 
@@ -49,25 +47,10 @@ def raw_moments(sensor: Sensor, counts: Counts, highest: int) -> FloatArray:
 def noise_integrals(sensor: Sensor, highest: int) -> FloatArray:
     """I(n), integral of omega^n over the field, for n = 0 .. highest, (highest + 1,).
 
-    With the flux known, Cov(M_p, M_q) = V I(p + q): on [-1, 1], 2/3 V and 2/5 V for orders 1 and 2, and 0 between. (11)
+    Cov(M_p, M_q) = V I(p + q): on [-1, 1], 2/3 V and 2/5 V for orders 1 and 2, and 0 between. (11)
     """
     low, high = sensor.field
     return np.array([(high ** (n + 1) - low ** (n + 1)) / (n + 1) for n in range(highest + 1)])
-
-
-def measured_flux_covariance(
-    sums: FloatArray, orders: Sequence[int] | Indices, ratios: FloatArray, total: FloatArray
-) -> FloatArray:
-    """Cov(y_p, y_q) of y_p = M_p/M_0 to first order: [C(p+q) - y_p C(q) - y_q C(p) + y_p y_q C(0)] / M_0^2.
-
-    ``sums`` are C(p+q) = Cov(M_p, M_q), from p + q = 0, (n,), or of each axis, (axes, n); ``ratios`` y_p, kernel
-    included, (axes, orders); ``total`` M_0, (axes,).
-    """
-    p = np.asarray(orders)
-    y, first = ratios, sums[..., p]
-    spread = sums[..., p[:, None] + p] - y[:, :, None] * first[..., None, :] - first[..., :, None] * y[:, None, :]
-    spread = spread + y[:, :, None] * y[:, None, :] * sums[..., 0, None, None]
-    return np.asarray(spread / total[:, None, None] ** 2)
 
 
 def without_kernel(kernel: FloatArray) -> FloatArray:
@@ -88,9 +71,11 @@ def _binomial_sums(of: Sequence[float] | FloatArray) -> FloatArray:
 
 
 def measure_moments(
-    sensor: Sensor, counts: Counts, orders: Sequence[int], flux: Flux = "known", light: FloatArray | None = None
-) -> Measurement | str:
+    sensor: Sensor, counts: Counts, orders: Sequence[int], light: FloatArray | None = None
+) -> Measurement:
     """Moments of line-sensor frames without the kernel, y_p with E[y_p] = mean(theta^p).
+
+    The total is one, as Mishra & Wen (9) to (11) take it.
 
     Parameters
     ----------
@@ -98,14 +83,8 @@ def measure_moments(
         One row for each axis, (axes, pixels), none missing or saturated.
     orders:
         Orders of the moments, from 1.
-    flux:
-        "known": the total is one, as Mishra & Wen (9) to (11) take it; "measured": divide by it, as (7) does.
     light:
         Light of each spot as a share of a whole one's, (axes,); one where None.
-
-    Returns
-    -------
-    The moments, or why there are none.
     """
     highest = max(orders)
     noise = effective_noise_density(sensor) * noise_integrals(sensor, 2 * highest)
@@ -115,16 +94,9 @@ def measure_moments(
     if light is not None:
         raw, noise = raw / light[:, None], noise / light[:, None] ** 2
     everything = np.arange(raw.shape[1])
-    if flux == "measured":
-        total, sd = raw[:, 0].copy(), np.sqrt(noise[..., 0])
-        if (total < LEAST_FLUX * sd).any():
-            return f"the flux, {total.min():.3g}, is under {LEAST_FLUX:g} of its standard deviations, {sd.max():.3g}"
-        raw = raw / total[:, None]
-        covariance = measured_flux_covariance(noise, everything, raw, total)
-    else:
-        raw[:, 0] = 1.0
-        covariance = np.array(noise[..., everything[:, None] + everything])
-        covariance[..., 0, :] = covariance[..., :, 0] = 0.0
+    raw[:, 0] = 1.0
+    covariance = np.array(noise[..., everything[:, None] + everything])
+    covariance[..., 0, :] = covariance[..., :, 0] = 0.0
     unmix = _unmixing(sensor, highest)[list(orders)]
     covariance = batched.congruence(unmix, covariance if covariance.ndim == 3 else covariance[None])
     return Measurement(

@@ -11,8 +11,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from aolink.estimation.frames.frame_data import Flux, Measurement
-from aolink.estimation.frames.moments import LEAST_FLUX
+from aolink.estimation.frames.frame_data import Measurement
 from aolink.numerics import batched
 from aolink.numerics.arrays import FloatArray
 from aolink.optics.plane import kernel_moments_2d
@@ -22,9 +21,9 @@ Order = tuple[int, int]
 
 def measure_moments_2d(
     density: FloatArray, x_edges: FloatArray, y_edges: FloatArray, kernel: FloatArray, noise_density: float,
-    orders: Sequence[Order], flux: Flux = "known", light: FloatArray | None = None, photoelectrons: float = 0.0,
-) -> Measurement | str:  # fmt: skip
-    """Moments of frames without the kernel.
+    orders: Sequence[Order], light: FloatArray | None = None, photoelectrons: float = 0.0,
+) -> Measurement:  # fmt: skip
+    """Moments of frames without the kernel, whose light sums to one.
 
     Parameters
     ----------
@@ -38,16 +37,10 @@ def measure_moments_2d(
         V of the plane.
     orders:
         Pairs (p, q).
-    flux:
-        As in `aolink.estimation.frames.moments.measure_moments`.
     light:
         Light of each spot as a share of a whole one's, (axes,); one where None.
     photoelectrons:
         Photoelectrons of a whole spot; 0 where shot noise is negligible.
-
-    Returns
-    -------
-    The moments, or why there are none.
     """
     highest = max(p + q for p, q in orders)
     every = [(p, n - p) for n in range(highest + 1) for p in range(n + 1)]
@@ -67,20 +60,9 @@ def measure_moments_2d(
     if light is not None:
         raw, spread = raw / light[:, None], spread / light[:, None, None] ** 2
     unmix = _without_kernel(every, kernel_moments_2d(kernel, pixel, highest))[[every.index(o) for o in orders]]
-    if flux == "measured":
-        total, sd = raw[:, :1], np.sqrt(spread[:, :1, 0])
-        if (total < LEAST_FLUX * sd).any():
-            return f"the flux, {total.min():.3g}, is under {LEAST_FLUX:g} of its standard deviations, {sd.max():.3g}"
-        raw = raw / total
-        # To first order d(M_p / M_0) = (dM_p - y_p dM_0) / M_0.
-        J = np.tile(np.eye(len(every)), (len(raw), 1, 1))
-        J[:, :, 0] -= raw
-        covariance = batched.congruence(J, spread) / total[:, :, None] ** 2
-    else:
-        raw[:, 0] = 1.0
-        spread[:, 0], spread[:, :, 0] = 0.0, 0.0
-        covariance = spread
-    covariance = batched.congruence(unmix, covariance)
+    raw[:, 0] = 1.0
+    spread[:, 0], spread[:, :, 0] = 0.0, 0.0
+    covariance = batched.congruence(unmix, spread)
     return Measurement(
         value=batched.matvec(unmix, raw), covariance=np.broadcast_to(covariance, (len(raw), *covariance.shape[1:]))
     )

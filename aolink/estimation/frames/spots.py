@@ -8,17 +8,13 @@ that cannot be used takes its whole column out of the one and its whole row out 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from aolink.estimation.frames.frame_data import FrameData, Measurement, Needs, Profile, SpotWindows
 from aolink.estimation.frames.moments import (
-    LEAST_FLUX,
     measure_moments,
-    noise_integrals,
-    raw_moments,
     significance_scale,
     spot_significance,
 )
@@ -26,7 +22,7 @@ from aolink.estimation.frames.plane_moments import measure_moments_2d
 from aolink.numerics.arrays import BoolArray, FloatArray, Indices
 from aolink.optics.camera import effective_noise_density, is_saturated, to_density
 from aolink.optics.frame import spot_windows
-from aolink.optics.sensor import Sensor, SpotSensor
+from aolink.optics.sensor import SpotSensor
 from aolink.rig import Plant
 
 
@@ -80,16 +76,13 @@ def moments_of_frames(
     counts, stretches = seen.T, np.empty(seen.shape[1])
     brightest_stretches(to_density(line, seen), stretches)
     lit = (stretches * significance_scale(line)).reshape(count, -1) >= least_significance
-    if needs.flux == "measured":
-        lit &= _enough_light(line, counts).reshape(count, -1)
     good = np.flatnonzero(lit.all(axis=1) & (ends[:, 0] > 0) & (ends[:, 1] < sensor.full_scale))
     if len(good) < count:
         counts = counts.reshape(count, -1, line.pixels)[good].reshape(-1, line.pixels)
     if not len(good):
         return good, None
     light = None if sensor.spot_light is None else np.tile(np.repeat(sensor.spot_light, 2), len(good))
-    moments = measure_moments(line, counts, needs.orders, needs.flux, light)
-    return good, moments if isinstance(moments, Measurement) else None
+    return good, measure_moments(line, counts, needs.orders, light)
 
 
 def measure_spots(
@@ -115,8 +108,6 @@ def measure_spots(
         density = np.where(found.mask, to_density(sensor.profile, found.counts), 0.0)
     whole: BoolArray = share >= needs.least_usable
     lit = spot_significance(sensor.profile, density) >= least_significance
-    if needs.what == "moments" and needs.flux == "measured":
-        lit &= _enough_light(sensor.profile, found.counts)
     good: BoolArray = np.asarray((whole & lit).reshape(plant.axes, plant.n_outputs))
     usable: BoolArray = np.asarray(good.all(axis=1))
     left_out = 0
@@ -140,7 +131,7 @@ def measure_spots(
         remark += ": left out"
     if not usable.any():
         return None, remark
-    measured: FrameData | str
+    measured: FrameData
     if seen is not None:
         measured = seen.per_light(sensor.spot_light)
     elif needs.what == "profile":
@@ -150,13 +141,9 @@ def measure_spots(
         measured = Profile(density=density, mask=found.mask | ~usable.repeat(plant.n_outputs)[:, None], light=light)
     elif plant.n_outputs == 1:
         counts = found.counts if usable.all() else found.counts[usable]
-        measured = measure_moments(
-            sensor.profile, counts, needs.orders, needs.flux, None if light is None else light[usable]
-        )
+        measured = measure_moments(sensor.profile, counts, needs.orders, None if light is None else light[usable])
     else:
         measured = _coupled_moments(sensor, plant, pixels, usable, needs)
-    if isinstance(measured, str):
-        return None, measured
     if not usable.all():
         measured = replace(_spread(measured, usable), usable=usable)
     return measured, remark
@@ -174,18 +161,9 @@ def _seen(sensor: SpotSensor, plant: Plant, pixels: NDArray[np.uint16], good: Bo
     return SpotWindows(density=spot_windows(sensor, density).reshape(shape), mask=mask)
 
 
-def _enough_light(line: Sensor, counts: NDArray[Any]) -> BoolArray:
-    """Whether moments can be divided by the light of each profile, (n_outputs,)."""
-    total = raw_moments(line, counts, 0)[:, 0]
-    variance = effective_noise_density(line) * noise_integrals(line, 0)[0]
-    if line.photoelectrons:
-        variance = variance + np.maximum(total, 0.0) / line.photoelectrons
-    return np.asarray(total >= LEAST_FLUX * np.sqrt(variance))
-
-
 def _coupled_moments(
     sensor: SpotSensor, plant: Plant, pixels: NDArray[np.uint16], usable: BoolArray, needs: Needs
-) -> Measurement | str:
+) -> Measurement:
     """Moments where one copy of the plant moves whole spots: a spot's two slopes share the noise of its pixels."""
     spots = plant.n_outputs // 2
     used = np.repeat(usable, spots)
@@ -195,10 +173,8 @@ def _coupled_moments(
     along = [(p, 0) for p in needs.orders] + [(0, p) for p in needs.orders]
     noise = effective_noise_density(sensor)
     found = measure_moments_2d(
-        density, edges, edges, sensor.kernel.covariance, noise, along, needs.flux, light, sensor.photoelectrons
+        density, edges, edges, sensor.kernel.covariance, noise, along, light, sensor.photoelectrons
     )
-    if isinstance(found, str):
-        return found
     copies, m = len(density) // spots, len(along)
     value = found.value.reshape(copies, spots * m)
     return Measurement(value=value, covariance=found.covariance.reshape(copies, spots, m, m))

@@ -16,7 +16,7 @@ from aolink.estimation.estimate import Status
 from aolink.estimation.frames.frame_data import Measurement, Needs
 from aolink.estimation.kalman.gaussian import MOST_COVARIANCES, Gaussian, Update
 from aolink.estimation.kalman.path_moments import MOST_OUTPUTS, Observation, PathMoments
-from aolink.estimation.kalman.predict import Noise, Predict, added_noise, predict, predicted_mean
+from aolink.estimation.kalman.predict import Predict, predict, predicted_mean
 from aolink.estimation.model.base import ExposureModel, InputResponse, over_steps
 from aolink.numerics import batched
 from aolink.numerics.arrays import BoolArray, FloatArray, IntArray
@@ -101,8 +101,6 @@ class BlurFilter(Filter):
     ----------
     observation:
         The measurement of an exposure, and the update with it; None for prediction only.
-    process_noise:
-        Covariance that one exposure adds: "lifted", that of N fast steps, or "printed", the paper's B_w W B_w'.
     gate:
         Whether measurements that are too far from their prediction are left out.
     predictor:
@@ -110,11 +108,11 @@ class BlurFilter(Filter):
     """
 
     def __init__(
-        self, plant: Plant, observation: Observation[Any] | None, *, process_noise: Noise = "lifted",
-        gate: bool = True, predictor: Predict | None = None,
+        self, plant: Plant, observation: Observation[Any] | None, *, gate: bool = True,
+        predictor: Predict | None = None,
     ) -> None:  # fmt: skip
         self.plant, self.observation = plant, observation
-        self._process_noise, self._predict = process_noise, predictor or predict
+        self._predict = predictor or predict
         prior = self.prior = Gaussian(
             batched.tile(plant.initial_mean, plant.axes), batched.tile(plant.initial_covariance, plant.axes)
         )
@@ -156,8 +154,7 @@ class BlurFilter(Filter):
         if with_noise:
             self.prior = predict(coefficients, model.end_rows, model.end_remainder, response.end)
         else:
-            noise = added_noise(model, self._process_noise)
-            self.prior = self._predict(coefficients, model.transition, noise, response.end)
+            self.prior = self._predict(coefficients, model.transition, model.process_noise, response.end)
         self._predict_unseen(model.transition, model.process_noise, response.end)
         return Posterior(
             coefficients=coefficients, end=self.prior, status=status, innovation=_numbers(done.innovation),
@@ -276,10 +273,10 @@ class PathFilter(BlurFilter):
         if self._of_model is None or self._of_model[0] is not model:
             from aolink.estimation.compiled.kalman import Step
 
-            looks, n, noise = self.observation, self.plant.n_states, added_noise(model, self._process_noise)
+            looks, n = self.observation, self.plant.n_states
             gains = np.zeros((0, n, looks.n_measurements)) if looks.gain is None else looks.gain
             self._of_model = model, Step(
-                transition=_own(model.transition), noise=_own(noise), lifted_noise=_own(model.process_noise),
+                transition=_own(model.transition), noise=_own(model.process_noise),
                 mean_row=_own(model.mean_row), quadratic=_own(model.quadratic), first=1 in looks.orders,
                 second=2 in looks.orders, second_order=looks.second_order,
                 gains=_own(gains.reshape(-1, n, looks.n_measurements)), gate=self._gate, patience=PATIENCE,

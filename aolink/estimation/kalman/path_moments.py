@@ -7,7 +7,7 @@ from typing import Protocol, TypeVar
 
 import numpy as np
 
-from aolink.estimation.frames.frame_data import Flux, Measurement, Needs
+from aolink.estimation.frames.frame_data import Measurement, Needs
 from aolink.estimation.kalman.gaussian import Gaussian, Update
 from aolink.estimation.kalman.update import blocked_update
 from aolink.estimation.model.base import ExposureModel, InputResponse
@@ -35,7 +35,7 @@ class PathMoments:
     """Moments of the path, as the paper's filters take them: no process noise inside the exposure.
 
     The plant's number of outputs is that of the measurements of each moment, of the orders 1 and 2. ``gain`` is a
-    constant one, (n_states, n_measurements), instead of the optimal one; ``flux`` is as in `Needs`.
+    constant one, (n_states, n_measurements), instead of the optimal one.
 
     ``second_order`` takes the terms that the linearisation leaves out: the second-order extended Kalman filter of
     Athans, Wishner, Bertolini, IEEE Trans. Automatic Control 13 (1968). The second moment is quadratic in the start
@@ -46,11 +46,10 @@ class PathMoments:
     models_noise = False
 
     def __init__(
-        self, plant: Plant, orders: Sequence[int], gain: FloatArray | None = None, *, flux: Flux = "known",
-        second_order: bool = False,
-    ) -> None:  # fmt: skip
+        self, plant: Plant, orders: Sequence[int], gain: FloatArray | None = None, *, second_order: bool = False
+    ) -> None:
         self.orders, self.gain, self.second_order = tuple(orders), gain, second_order
-        self.needs = Needs(what="moments", orders=self.orders, flux=flux)
+        self.needs = Needs(what="moments", orders=self.orders)
         self.n_measurements = plant.n_outputs * len(self.orders)
 
     def update(self, model: ExposureModel, response: InputResponse, prior: Gaussian, measured: Measurement) -> Update:

@@ -3,25 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Literal
 
 import numpy as np
 
 from aolink.estimation.kalman.gaussian import Gaussian
-from aolink.estimation.model.base import ExposureModel
 from aolink.numerics import batched
 from aolink.numerics.arrays import FloatArray
 from aolink.numerics.single_thread import congruence_one_thread
 from aolink.plant.alike import MANY_STATES
 
-Noise = Literal["lifted", "printed"]
 Predict = Callable[[Gaussian, FloatArray, FloatArray, FloatArray], Gaussian]
-
-
-def added_noise(model: ExposureModel, kind: Noise) -> FloatArray:
-    """Q, the contribution of one exposure's process noise to the state's covariance, (n_states, n_states)."""
-    plant = model.plant
-    return model.process_noise if kind == "lifted" else plant.B_w @ plant.process_noise @ plant.B_w.T
 
 
 def predict(state: Gaussian, transition: FloatArray, noise: FloatArray, kick: FloatArray) -> Gaussian:

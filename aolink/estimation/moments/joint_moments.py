@@ -10,18 +10,16 @@ no difference: path RMSE 0.119 here and 0.121 there, NEES 73 and 74 for 72 state
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
 
 import numpy as np
 
-from aolink.estimation.frames.frame_data import HALF, Flux, Needs, SpotWindows
-from aolink.estimation.frames.moments import LEAST_FLUX
+from aolink.estimation.frames.frame_data import HALF, Needs, SpotWindows
 from aolink.estimation.kalman.gaussian import Gaussian, Update
 from aolink.estimation.model.base import ExposureModel, InputResponse
 from aolink.estimation.model.factored import FactoredModel
 from aolink.estimation.model.joint_paths import LEFT_OUT, JointPaths, joint_paths
 from aolink.estimation.moments.spots import WindowedSpots
-from aolink.estimation.moments.windowed import NOT_BELIEVED, PASSES, Regression, Windowed, error_memory, slowest
+from aolink.estimation.moments.windowed import PASSES, Regression, Windowed, error_memory, slowest
 from aolink.numerics import batched
 from aolink.numerics.arrays import FloatArray
 from aolink.numerics.single_thread import by_one_thread, covariance_of_information, matmul_one_thread, solve_information
@@ -68,16 +66,13 @@ class JointObservation(ABC):
 
 
 class JointMoments(JointObservation):
-    """The estimator `moments` of a plant with hundreds of states: iterated statistical linearisation. Orders and flux
-    are as in `WindowedSpots`."""
+    """The estimator `moments` of a plant with hundreds of states: iterated statistical linearisation."""
 
     most_memory = Windowed.most_memory
     """As in `Windowed`."""
 
-    def __init__(
-        self, sensor: SpotSensor, n_outputs: int, orders: Sequence[int] = (0, 1, 2, 3), *, flux: Flux = "known"
-    ) -> None:
-        self._spot = WindowedSpots(sensor, 1, orders, flux=flux)
+    def __init__(self, sensor: SpotSensor, n_outputs: int) -> None:
+        self._spot = WindowedSpots(sensor, 1)
         super().__init__(sensor, self._spot.n_measurements * (n_outputs // 2))
 
     def corrected(
@@ -93,15 +88,11 @@ class JointMoments(JointObservation):
         # Frames have hardly any information about some of hundreds of states, whose errors last for the plant's own
         # memory.
         memory = error_memory(slowest(paths.model.transition_of_one[None]), self.most_memory)[0]
-        t, P, lit = prior.mean, wide, windows.mask.any(axis=(1, 2, 3))
+        t, P = prior.mean, wide
         spread = first = paths.spread(wide)
         for to_come in reversed(range(PASSES)):
             y, noise, fit = self._spot.look(nodes, Gaussian(of_spots(t), spread), windows)
             noise = noise + _NO_NOISE * np.eye(noise.shape[-1])
-            light = None
-            if self._spot.flux == "measured":
-                light = (y[lit] / np.sqrt(np.einsum("skk->sk", noise[lit])))[:, 0].min()
-                y, noise, fit = self._spot.ratios(y, noise, fit)
             new = y - fit.expected - batched.matvec(fit.slope, of_spots(prior.mean - t))
             H, score = _information_and_score(paths, fit, noise + memory * fit.remainder, new)
             P = covariance_of_information(precision + H)
@@ -113,8 +104,6 @@ class JointMoments(JointObservation):
         H, score = _information_and_score(paths, fit, own, new)
         weighted = batched.solve(own, new)
         nis = np.asarray((new * weighted).sum() - score @ solve_information(precision + H, score))
-        if light is not None and light < LEAST_FLUX:
-            nis = np.asarray(NOT_BELIEVED)
         S = np.einsum("skk->sk", batched.congruence(fit.slope, first) + own)
         return t, P, new.ravel(), S.ravel(), nis
 

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from itertools import pairwise
 
 import numpy as np
 
 from aolink.estimation.compiled.windowed import Fits, Lines, linearise, noise_spread
-from aolink.estimation.frames.frame_data import HALF, Flux, Needs, Profile
-from aolink.estimation.frames.moments import LEAST_FLUX
+from aolink.estimation.frames.frame_data import HALF, Needs, Profile
 from aolink.estimation.kalman.gaussian import Gaussian, Update
 from aolink.estimation.model.base import ExposureModel, InputResponse
 from aolink.estimation.model.quadrature import QuadraturePaths, equal_parts, quadrature_paths
@@ -17,7 +15,6 @@ from aolink.estimation.moments.windowed import (
     KERNEL_REACH,
     MOST_MEMORY,
     MOST_NODES,
-    NOT_BELIEVED,
     PASSES,
     PATH_REACH,
     error_memory,
@@ -28,30 +25,27 @@ from aolink.numerics.workers import in_threads, thread_count
 from aolink.optics.camera import effective_noise_density
 from aolink.optics.sensor import Sensor
 
+ORDERS = (0, 1, 2, 3)
+"""Of the moments; 0 is the light in the window."""
 # With fewer axes a second thread costs more than it saves.
 _AXES_OF_A_THREAD = 16
 
 
 class WindowedMoments:
-    """Windowed moments of line-sensor profiles, one output for each axis.
-
-    ``orders`` are those of the moments; 0 is the light in the window. ``flux`` is as in `Windowed`.
-    """
+    """Windowed moments of line-sensor profiles, of the `ORDERS`, one output for each axis."""
 
     models_noise = True
+    n_measurements = len(ORDERS)
+    needs = Needs(what="profile", least_usable=HALF)
 
-    def __init__(self, sensor: Sensor, orders: Sequence[int] = (0, 1, 2, 3), *, flux: Flux = "known") -> None:
-        self.sensor, self.flux = sensor, flux
-        # A ratio to the light in the window needs the light first.
-        self.orders = tuple(orders) if flux == "known" else (0, *(p for p in orders if p))
-        self.n_measurements = len(self.orders) - (flux == "measured")
-        self.needs = Needs(what="profile", least_usable=HALF)
+    def __init__(self, sensor: Sensor) -> None:
+        self.sensor = sensor
 
     def update(self, model: ExposureModel, response: InputResponse, prior: Gaussian, measured: Profile) -> Update:
         """Iterated statistical linearisation, from the prior to the posterior."""
         nodes = quadrature_paths(model, response, equal_parts(model.exposed_steps, MOST_NODES))
         axes, n_states = len(prior.mean), len(model.transition)
-        lines = _lines(self.sensor, self.orders, self.flux, nodes, measured, n_states, model.end_rows)
+        lines = _lines(self.sensor, nodes, measured, n_states, model.end_rows)
         mean, covariance = _contiguous(prior.mean), _contiguous(prior.covariance)
         fits = _no_fits(prior, self.n_measurements, n_states)
         rho = slowest(model.transition[None])
@@ -71,22 +65,19 @@ class WindowedMoments:
         threads = min(thread_count(), -(-axes // _AXES_OF_A_THREAD))
         ends = [axes * k // threads for k in range(threads + 1)]
         in_threads(update, [slice(*each) for each in pairwise(ends)])
-        nis = fits.nis
-        if self.flux == "measured":
-            nis = np.where(fits.significance < LEAST_FLUX, NOT_BELIEVED, nis)
-        return Update(Gaussian(fits.mean, fits.covariance), fits.innovation, fits.innovation_covariance, nis)
+        return Update(Gaussian(fits.mean, fits.covariance), fits.innovation, fits.innovation_covariance, fits.nis)
 
 
 def updated(
     sensor: Sensor, nodes: QuadraturePaths, prior: Gaussian, measured: Profile, memory: FloatArray, passes: int
 ) -> Gaussian:
-    """Priors of a path's coefficients, of any covariance, updated with the moments of orders 0 to 3.
+    """Priors of a path's coefficients, of any covariance, updated with the moments.
 
     ``memory`` is the factor of the covariance of what the linearisation leaves out, (axes,), the same in all passes.
     """
-    orders, n = (0, 1, 2, 3), prior.mean.shape[1]
-    lines = _lines(sensor, orders, "known", nodes, measured, n, np.empty((0, n)))
-    fits, mean, covariance = _no_fits(prior, len(orders), 0), _contiguous(prior.mean), _contiguous(prior.covariance)
+    n = prior.mean.shape[1]
+    lines = _lines(sensor, nodes, measured, n, np.empty((0, n)))
+    fits, mean, covariance = _no_fits(prior, len(ORDERS), 0), _contiguous(prior.mean), _contiguous(prior.covariance)
     for to_come in reversed(range(passes)):
         linearise(lines, mean, covariance, memory, PATH_REACH, KERNEL_REACH, not to_come, fits)
     return Gaussian(fits.mean, fits.covariance)
@@ -98,14 +89,11 @@ def _no_fits(prior: Gaussian, m: int, n_states: int) -> Fits:
     return Fits(
         mean=prior.mean.copy(order="C"), covariance=np.empty((axes, n, n)), known=np.zeros((axes, n, m)),
         innovation=np.empty((axes, m)), innovation_covariance=np.empty((axes, m, m)), nis=np.empty(axes),
-        significance=np.empty(axes), closed_loop=np.empty((axes, n_states, n_states)),
+        closed_loop=np.empty((axes, n_states, n_states)),
     )  # fmt: skip
 
 
-def _lines(
-    sensor: Sensor, orders: Sequence[int], flux: Flux, nodes: QuadraturePaths, measured: Profile,
-    free: int, end_rows: FloatArray,
-) -> Lines:  # fmt: skip
+def _lines(sensor: Sensor, nodes: QuadraturePaths, measured: Profile, free: int, end_rows: FloatArray) -> Lines:
     """The frames for compiled code."""
     edges, pixel, rows = sensor.edges, sensor.pixel_size, _contiguous(nodes.basis[0].T)
     light = np.ones(len(measured.density)) if measured.light is None else measured.light
@@ -115,8 +103,7 @@ def _lines(
         shared=noise_spread(rows, free), end_rows=_contiguous(end_rows), low=float(edges[0]), high=float(edges[-1]),
         pixel=pixel, read_noise=effective_noise_density(sensor) * pixel,
         shot_noise=pixel / sensor.photoelectrons if sensor.photoelectrons else 0.0,
-        kernel_variance=float(sensor.kernel.variance), widening=float(nodes.widening), orders=np.array(orders),
-        ratios=flux == "measured",
+        kernel_variance=float(sensor.kernel.variance), widening=float(nodes.widening), orders=np.array(ORDERS),
     )  # fmt: skip
 
 

@@ -13,11 +13,10 @@ along one diagonal from motion along the other, which the moments of the two dir
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 
 import numpy as np
 
-from aolink.estimation.frames.frame_data import HALF, Flux, Needs, SpotWindows
+from aolink.estimation.frames.frame_data import HALF, Needs, SpotWindows
 from aolink.estimation.kalman.gaussian import Gaussian
 from aolink.estimation.model.quadrature import QuadraturePaths
 from aolink.estimation.moments.windowed import Regression, Windowed, expected_response, weighted_sums
@@ -38,23 +37,16 @@ class WindowedSpots(Windowed[SpotWindows]):
     """Windowed moments of all spots that one copy of the plant moves; its outputs are spot 0's x and y, spot 1's x and
     y, ...
 
-    ``orders`` are those of the moments along x and along y; 0 is the light in the window. The first along both belongs
-    to the sums as well, y_11. Flux is as in `Windowed`.
+    Of each spot the light in its window, the moments of the orders 1 to 3 along x and along y, and y_11 are taken.
     """
 
     most_nodes = _MOST_NODES
+    orders = ((0, 0), (1, 0), (2, 0), (3, 0), (0, 1), (0, 2), (0, 3), (1, 1))
+    needs = Needs(what="windows", least_usable=HALF)
 
-    def __init__(
-        self, sensor: SpotSensor, spots: int, orders: Sequence[int] = (0, 1, 2, 3), *, flux: Flux = "known"
-    ) -> None:
+    def __init__(self, sensor: SpotSensor, spots: int) -> None:
         self.sensor, self.spots = sensor, spots
-        beyond = [p for p in orders if p]
-        light = [(0, 0)] if flux == "measured" or 0 in orders else []
-        self.orders = [*light, *((p, 0) for p in beyond), *((0, p) for p in beyond), (1, 1)]
-        each = len(self.orders)
-        lights = [k * each for k in range(spots)]
-        self.needs = Needs(what="windows", least_usable=HALF)
-        super().__init__(flux, lights=lights, light_of=[k for k in lights for _ in range(each)])
+        self.n_measurements = spots * len(self.orders)
 
     def look(
         self, nodes: QuadraturePaths, about: Gaussian, measured: SpotWindows

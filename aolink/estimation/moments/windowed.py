@@ -24,14 +24,12 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Generic, TypeVar
 
 import numpy as np
 
-from aolink.estimation.frames.frame_data import Densities, Flux
-from aolink.estimation.frames.moments import LEAST_FLUX
+from aolink.estimation.frames.frame_data import Densities
 from aolink.estimation.kalman.gaussian import Gaussian, Update
 from aolink.estimation.kalman.update import joseph_update
 from aolink.estimation.model.base import ExposureModel, InputResponse
@@ -51,9 +49,6 @@ MOST_NODES = 100
 MOST_MEMORY = 1e3
 # Axes together: more of them do not fit into the processor's cache.
 _AT_ONCE = 8
-# NIS of moments that are divided by a light that its noise hides: they are gated.
-NOT_BELIEVED = 1e12
-
 
 Data = TypeVar("Data", bound=Densities)
 
@@ -71,28 +66,12 @@ class Regression:
 
 
 class Windowed(ABC, Generic[Data]):
-    """Iterated statistical linearisation: the common part for line sensors and spots on a plane.
-
-    Parameters
-    ----------
-    flux:
-        "known": the light of a frame sums to one; "measured": all is divided by the light in the window,
-        and order 0 left out.
-    lights:
-        Which of the sums are the light in a window.
-    light_of:
-        Index of the light that each sum is divided by, (sums,).
-    """
+    """Iterated statistical linearisation: the common part for line sensors and spots on a plane."""
 
     models_noise = True
     most_nodes = MOST_NODES
     most_memory = MOST_MEMORY
     """Bound of `error_memory`; with 1, errors of an exposure count as independent of those before."""
-
-    def __init__(self, flux: Flux, lights: Sequence[int], light_of: Sequence[int]) -> None:
-        self.flux = flux
-        self._lights, self._light_of = list(lights), np.array(light_of)
-        self.n_measurements = len(light_of) - (len(self._lights) if flux == "measured" else 0)
 
     def update(self, model: ExposureModel, response: InputResponse, prior: Gaussian, measured: Data) -> Update:
         """Iterated statistical linearisation, from the prior to the posterior."""
@@ -111,9 +90,6 @@ class Windowed(ABC, Generic[Data]):
         memory = error_memory(rho, self.most_memory)
         for to_come in reversed(range(PASSES)):
             y, noise, fit = self.look(nodes, about, measured)
-            if self.flux == "measured":
-                light = (y / np.sqrt(np.einsum("akk->ak", noise)))[:, self._lights].min(axis=1)
-                y, noise, fit = self.ratios(y, noise, fit)
             innovation = y - fit.expected - batched.matvec(fit.slope, prior.mean - about.mean)
             R = noise + memory[:, None, None] * fit.remainder
             done = joseph_update(prior, innovation, fit.slope, R)
@@ -125,8 +101,6 @@ class Windowed(ABC, Generic[Data]):
         HP = batched.matmul(fit.slope, prior.covariance)
         S = batched.symmetric(batched.matmul(HP, batched.transpose(fit.slope)) + noise + fit.remainder)
         nis = batched.dot(innovation, batched.matvec(batched.inverse(S), innovation))
-        if self.flux == "measured":
-            nis = np.where(light < LEAST_FLUX, NOT_BELIEVED, nis)
         return Update(about, innovation, S, nis)
 
     @abstractmethod
@@ -153,26 +127,6 @@ class Windowed(ABC, Generic[Data]):
         edges = sensor.edges
         inside = (edges[1:] > low[:, None]) & (edges[:-1] < high[:, None]) & mask
         return (sensor.centres - (low + high)[:, None] / 2) / ((high - low)[:, None] / 2), inside
-
-    def ratios(self, y: FloatArray, noise: FloatArray, fit: Regression) -> tuple[FloatArray, FloatArray, Regression]:
-        """All sums divided by the light that belongs to each, to first order."""
-        kept = [k for k in range(y.shape[1]) if k not in self._lights]
-        lights = self._light_of[kept]
-
-        def divided(values: FloatArray) -> tuple[FloatArray, FloatArray]:
-            light = values[:, lights]
-            # Without any light there is no ratio; the NIS says so.
-            light = np.where(light == 0, 1.0, light)
-            ratio = values[:, kept] / light
-            J = np.zeros((*ratio.shape, values.shape[1]))
-            rows = np.arange(len(kept))
-            J[:, rows, kept], J[:, rows, lights] = 1 / light, -ratio / light
-            return ratio, J
-
-        (ratio, at_measured), (expected, at_expected) = divided(y), divided(fit.expected)
-        remainder = batched.congruence(at_expected, fit.remainder)
-        slope = batched.matmul(at_expected, fit.slope)
-        return ratio, batched.congruence(at_measured, noise), Regression(expected, slope, remainder)
 
 
 def weighted_sums(

@@ -22,7 +22,7 @@ from aolink.estimation.kalman.gaussian import Gaussian
 from aolink.estimation.kalman.predict import predict
 from aolink.estimation.model.base import ExposureModel, InputResponse, over_steps
 from aolink.estimation.model.exposure_model import exposure_model
-from aolink.estimation.pixels.gaussian_mixture import GaussianMixture, joined, single, with_noise_and_gradient
+from aolink.estimation.pixels.gaussian_mixture import GaussianMixture, joined, single
 from aolink.estimation.pixels.likelihood import PixelView, Reduction
 from aolink.numerics.arrays import BoolArray, FloatArray, Indices
 from aolink.numerics.workers import in_threads, thread_count
@@ -108,9 +108,6 @@ class MixtureFilter(Filter):
         response = model.response(np.zeros((2, self.plant.n_inputs * self.plant.axes)))
         view = PixelView(self.sensor, model, response, dark, updater.reduction(model, self.sensor))
         updater.update(view.part(one), self.prior.part(one), self._unseen.part(one))
-        point = np.zeros((1, 1, view.reduced.size))
-        view.rough().log_likelihoods_and_gradients(point)
-        with_noise_and_gradient(twice, point)
 
     @property
     def needs(self) -> Needs:

@@ -138,19 +138,6 @@ def stacked_axes(mixtures: Sequence[GaussianMixture]) -> GaussianMixture:
     return GaussianMixture(*map(np.concatenate, zip(*mixtures, strict=True)))
 
 
-def with_noise_and_gradient(prior: GaussianMixture, t: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Log-densities of t = (start state, standard normal noise coefficients), (axes, points, n) -> (axes, points), and
-    their gradients by t."""
-    states, gradient = prior.mean.shape[2], -t
-    density, pulled = np.empty(t.shape[:2]), np.empty((*t.shape[:2], states))
-    compiled_mixtures.log_densities_and_gradients(
-        *prior.contiguous, np.ascontiguousarray(t[..., :states]), density, pulled
-    )
-    gradient[..., :states] = pulled
-    rest = t[..., states:]
-    return density - 0.5 * np.add.reduce(rest * rest, axis=-1) - 0.5 * rest.shape[-1] * math.log(2 * math.pi), gradient
-
-
 def log_sum(values: FloatArray, axis: int) -> FloatArray:
     """log sum exp along an axis; minus infinity where all are."""
     top = np.maximum.reduce(values, axis=axis, keepdims=True)

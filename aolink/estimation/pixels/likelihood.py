@@ -24,12 +24,11 @@ import math
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 
 from aolink.errors import EstimatorError
-from aolink.estimation.compiled.pixels import Pixels, log_likelihoods_and_gradients
+from aolink.estimation.compiled.pixels import Pixels
 from aolink.estimation.frames.frame_data import Profile, SpotWindows
 from aolink.estimation.kalman.gaussian import Gaussian
 from aolink.estimation.model import quadrature
@@ -69,8 +68,6 @@ _POINTS = 16
 _REACH = 5.0
 # The most pairs of a point and a pixel in that table, which has some hundreds.
 _MOST_LIGHT = 1 << 22
-# Where a spot's light falls below this share of a pixel's noise, rough likelihoods leave it out.
-_UNSEEN = 0.03
 # Reductions and tables that are kept: more than the estimators that a scan of frequencies runs side by side.
 _SIDE_BY_SIDE = 256
 
@@ -236,24 +233,12 @@ class PixelView:
         self.gain = shot_gain(self.optics)
         self.kernel = sensor.kernel.covariance + reduced.widening * np.eye(2)
         """Covariance of the kernel with that widening, slope units squared, (2, 2)."""
-        self._number: np.dtype[Any] = np.dtype(np.float64)
-        self._reach = _REACH
 
     def part(self, axes: slice | Indices) -> PixelView:
         """The part of these axes."""
         view = copy(self)
         view.y, view.mask, view.axes = self.y[axes], self.mask[axes], self.axes[axes]
         view.nodes, view.measured = self.nodes.part(axes), self.measured.part(axes)
-        return view
-
-    def rough(self) -> PixelView:
-        """The same with log-likelihoods in about half the time, right to 1e-6 of them and some 0.01: in single
-        precision, and without the light that the noise of a pixel hides."""
-        kernel = self.kernel[:1, :1] if self.on_line else self.kernel
-        brightest = 1 / math.sqrt(np.linalg.det(2 * math.pi * kernel))
-        view = copy(self)
-        view._number = np.dtype(np.float32)
-        view._reach = min(_REACH, math.sqrt(2 * math.log(max(1.0, brightest / (_UNSEEN * math.sqrt(self.read_noise))))))
         return view
 
     @property
@@ -274,7 +259,7 @@ class PixelView:
     @property
     def work(self) -> int:
         """Products that the log-likelihood of a point takes, about."""
-        each = [2 * _half(float(v), self.optics.profile.pixel_size, self._reach) for v in np.diag(self.kernel)]
+        each = [2 * _half(float(v), self.optics.profile.pixel_size) for v in np.diag(self.kernel)]
         lit = each[0] if self.on_line else math.prod(each) * self.outputs // 2
         return len(self.nodes.weights) * (self.outputs * self.reduced.size + lit)
 
@@ -294,53 +279,35 @@ class PixelView:
         assert isinstance(self.measured, SpotWindows)
         return WindowedSpots(self.sensor, self.outputs // 2).look(self.nodes, about, self.measured)
 
-    def log_likelihoods_and_gradients(self, t: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Log-likelihoods of many points (axes, points, n), (axes, points), and their gradients, (axes, points, n)."""
-        out, points = np.empty(t.shape[:2]), np.ascontiguousarray(batched.transpose(t), self._number)
-        gradients = np.zeros_like(points)
-        log_likelihoods_and_gradients(self.seen, points, out, gradients)
-        return out, batched.transpose(gradients).astype(np.float64)
-
     @property
     def seen(self) -> Pixels:
         """The frame for compiled code."""
         profile, nodes = self.sensor.profile, self.nodes
         terms = np.ones(1) if self.on_line else np.array(mehler_series(self.kernel))
-        # In single precision, high derivatives are too large and their factors too small for it.
-        scale = np.sqrt(np.abs(terms)) if self._number == np.float32 else np.ones_like(terms)
         across, down = (
-            np.stack([
-                _light_table(float(self.kernel[d, d]), profile.pixel_size, j, self._reach, each, self._number)
-                for j, each in enumerate(scale.tolist())
-            ])
+            np.stack([_light_table(float(self.kernel[d, d]), profile.pixel_size, j) for j in range(len(terms))])
             for d in (0, 1)
-        )  # fmt: skip
+        )
         windows = (len(self.y), self.outputs // 2, profile.pixels, profile.pixels)
         if self.on_line:
-            windows, down = (len(self.y), 1, 1, profile.pixels), self._array([[[[1.0], [0.0], [0.0], [0.0]]]])
+            windows, down = (len(self.y), 1, 1, profile.pixels), np.array([[[[1.0], [0.0], [0.0], [0.0]]]])
         return Pixels(
-            y=self._array(self.y).reshape(windows), usable=np.ascontiguousarray(self.mask).reshape(windows),
-            inputs=self._array(nodes.inputs), basis=self._array(batched.transpose(nodes.basis)),
-            weights=self._array(nodes.weights), across=across, down=down, terms=self._array(terms / scale**2),
+            y=np.ascontiguousarray(self.y).reshape(windows), usable=np.ascontiguousarray(self.mask).reshape(windows),
+            inputs=np.ascontiguousarray(nodes.inputs), basis=np.ascontiguousarray(batched.transpose(nodes.basis)),
+            weights=np.ascontiguousarray(nodes.weights), across=across, down=down, terms=terms,
             low=float(profile.edges[0]), per_unit=1 / profile.pixel_size, read_noise=self.read_noise, gain=self.gain,
         )  # fmt: skip
 
-    def _array(self, values: Any) -> FloatArray:
-        """Contiguous, of the view's type."""
-        return np.ascontiguousarray(values, self._number)
-
 
 @lru_cache(maxsize=_SIDE_BY_SIDE)
-def _light_table(
-    variance: float, pixel: float, order: int, reach: float, scale: float, number: np.dtype[Any]
-) -> FloatArray:
+def _light_table(variance: float, pixel: float, order: int) -> FloatArray:
     """Taylor coefficients of the densities of pixels about a spot, for points in its own pixel, (points, 4, pixels).
 
     They are those of powers of its distance from the point, in pixels; of the derivative of this ``order`` by the
-    spot's position, times ``scale``. ``reach`` is in standard deviations.
+    spot's position.
     """
     points = math.ceil(_POINTS * pixel / math.sqrt(variance))
-    half = _half(variance, pixel, reach)
+    half = _half(variance, pixel)
     if points * half > _MOST_LIGHT:
         raise EstimatorError(
             f"a spot is {math.sqrt(variance) / pixel:.3g} pixels wide (sd): check sensor.kernel, sensor.field and the"
@@ -348,10 +315,9 @@ def _light_table(
         )
     places = (np.arange(points) + 0.5) * pixel / points
     masses = pixel_masses(variance, pixel * np.arange(-half, half + 1.0), places, order + 3)[order:]
-    table = np.stack([mass * pixel ** (k - 1) / math.factorial(k) for k, mass in enumerate(masses)], axis=1)
-    return (scale * table).astype(number)
+    return np.stack([mass * pixel ** (k - 1) / math.factorial(k) for k, mass in enumerate(masses)], axis=1)
 
 
-def _half(variance: float, pixel: float, reach: float) -> int:
+def _half(variance: float, pixel: float) -> int:
     """Pixels on either side of a spot that it lights."""
-    return math.ceil(reach * math.sqrt(variance) / pixel) + 1
+    return math.ceil(_REACH * math.sqrt(variance) / pixel) + 1

@@ -96,9 +96,9 @@ def looked_at(kind):
 
 def log_likelihoods(seen, t):
     """Log-likelihoods of points (rows, points, n), (rows, points)."""
-    out, none = np.empty(t.shape[:2]), np.empty((0, 0), seen.y.dtype)
-    for row, points in enumerate(np.ascontiguousarray(t.transpose(0, 2, 1), seen.y.dtype)):
-        log_likelihoods_of_row(seen, row, points, 0, t.shape[1], out[row], none)
+    out = np.empty(t.shape[:2])
+    for row, points in enumerate(np.ascontiguousarray(t.transpose(0, 2, 1))):
+        log_likelihoods_of_row(seen, row, points, 0, t.shape[1], out[row])
     return out
 
 
@@ -365,9 +365,9 @@ def test_points_have_the_same_likelihood_wherever_they_are_among_others(kind):
     view, _, state = looked_at_plane(kind, 0) if kind in PLANES else looked_at(kind)
     t = np.random.default_rng(7).standard_normal((view.reduced.size, MANY)) * 0.3
     t += view.reduced.prior(state).mean[1 if view.on_line else 0, :, None]
-    whole, part, none = np.empty(MANY), np.full(MANY, np.nan), np.empty((0, 0))
-    log_likelihoods_of_row(view.seen, len(view.y) - 1, t, 0, MANY, whole, none)
-    log_likelihoods_of_row(view.seen, len(view.y) - 1, t, 37, 133, part, none)
+    whole, part = np.empty(MANY), np.full(MANY, np.nan)
+    log_likelihoods_of_row(view.seen, len(view.y) - 1, t, 0, MANY, whole)
+    log_likelihoods_of_row(view.seen, len(view.y) - 1, t, 37, 133, part)
     assert np.isfinite(whole).all()
     assert part[37:133].tobytes() == whole[37:133].tobytes()
     assert np.isnan(part[:37]).all()

@@ -8,11 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from aolink.estimation.frames.frame_data import Flux, Measurement
 from aolink.estimation.frames.moments import (
     least_significance,
     measure_moments,
-    measured_flux_covariance,
     noise_integrals,
     raw_moments,
     spot_significance,
@@ -22,7 +20,7 @@ from aolink.optics.camera import effective_noise_density, to_counts, to_density
 from aolink.optics.kernel import exposure_density
 from aolink.optics.sensor import Sensor
 from aolink.rig import load_rig
-from tests.kinds import line_of, must_be
+from tests.kinds import line_of
 
 SENSOR = line_of(load_rig("section-vi"))
 # As many counts as can be, so that rounding does not show.
@@ -37,14 +35,8 @@ def frames(sensor: Sensor, paths: np.ndarray, seed: int | None = None) -> np.nda
     return to_counts(sensor, density)
 
 
-def measured_of(
-    sensor: Sensor, counts: np.ndarray, orders: Sequence[int] = (1, 2), flux: Flux = "known"
-) -> Measurement:
-    return must_be(Measurement, measure_moments(sensor, counts, orders, flux))
-
-
-def values(sensor: Sensor, counts: np.ndarray, orders: Sequence[int] = (1, 2), flux: Flux = "known") -> np.ndarray:
-    return measured_of(sensor, counts, orders, flux).value
+def values(sensor: Sensor, counts: np.ndarray, orders: Sequence[int] = (1, 2)) -> np.ndarray:
+    return measure_moments(sensor, counts, orders).value
 
 
 @given(centre=st.floats(-0.4, 0.4), swing=st.floats(0, 0.3), turns=st.floats(0.1, 3))
@@ -53,9 +45,7 @@ def test_moments_are_those_of_the_path(centre, swing, turns):
     path = centre + swing * np.sin(2 * np.pi * turns * np.linspace(0, 1, 200))
     sensor = dataclasses.replace(FINE, kernel=dataclasses.replace(FINE.kernel, sigma=0.09))
     expected = [np.mean(path**p) for p in (1, 2, 3, 4)]
-    for flux in ("known", "measured"):
-        found = values(sensor, frames(sensor, path[None]), (1, 2, 3, 4), flux=flux)[0]
-        np.testing.assert_allclose(found, expected, atol=3e-4)
+    np.testing.assert_allclose(values(sensor, frames(sensor, path[None]), (1, 2, 3, 4))[0], expected, atol=3e-4)
 
 
 def test_the_kernel_left_in_would_bias_the_second_moment():
@@ -75,8 +65,8 @@ def test_raw_moments_are_sums_over_pixels_on_any_field():
     np.testing.assert_allclose(raw_moments(sensor, counts, 3), np.transpose(expected), rtol=1e-12)
 
 
-def test_noise_covariance_of_known_flux_is_the_papers():
-    R = measured_of(SENSOR, frames(SENSOR, np.zeros((1, 200)), seed=1)).covariance[0]
+def test_noise_covariance_is_the_papers():
+    R = measure_moments(SENSOR, frames(SENSOR, np.zeros((1, 200)), seed=1)).covariance[0]
     V = effective_noise_density(SENSOR)
     np.testing.assert_allclose(R, [[2 / 3 * V, 0], [0, 2 / 5 * V]], atol=1e-12 * V)
 
@@ -92,25 +82,13 @@ def test_noise_integrals_are_integrals():
 def test_moments_scatter_as_their_covariance_says(field, orders):
     sensor = dataclasses.replace(SENSOR, field=field)
     counts = frames(sensor, np.full((20_000, 1), 0.3), seed=1)
-    measured = measured_of(sensor, counts, orders)
+    measured = measure_moments(sensor, counts, orders)
     spread = np.cov(measured.value.T)
     scale = np.sqrt(np.outer(spread.diagonal(), spread.diagonal()))
     np.testing.assert_allclose(measured.covariance[0] / scale, spread / scale, atol=0.04)
 
 
-@pytest.mark.parametrize("field", [(-1.0, 1.0), (-0.6, 1.4)])
-def test_ratios_scatter_as_their_covariance_says(field):
-    sensor = dataclasses.replace(SENSOR, field=field, noise_density=1e-3)
-    counts = frames(sensor, np.full((20_000, 1), 0.3), seed=2)
-    measured = measured_of(sensor, counts, (1, 2), flux="measured")
-    spread, predicted = np.cov(measured.value.T), measured.covariance.mean(axis=0)
-    scale = np.sqrt(np.outer(spread.diagonal(), spread.diagonal()))
-    np.testing.assert_allclose(predicted / scale, spread / scale, atol=0.04)
-    assert abs(spread[0, 1]) > 0.05 * scale[0, 1]  # off centre or not, the two are not independent here
-
-
-@pytest.mark.parametrize("flux", ["known", "measured"])
-def test_shot_noise_is_in_the_covariance(flux):
+def test_shot_noise_is_in_the_covariance():
     """Mishra & Wen have read-out noise only; Poisson light adds y_(p+q) / photoelectrons."""
     sensor = dataclasses.replace(SENSOR, noise_density=1e-4, photoelectrons=1000.0)
     rng, light = np.random.default_rng(4), sensor.photoelectrons * sensor.pixel_width
@@ -119,36 +97,21 @@ def test_shot_noise_is_in_the_covariance(flux):
         (10_000, 40)
     )
     counts = to_counts(sensor, density)
-    measured = measured_of(sensor, counts, (1, 2), flux)
+    measured = measure_moments(sensor, counts, (1, 2))
     spread = np.cov(measured.value.T)
     scale = np.sqrt(np.outer(spread.diagonal(), spread.diagonal()))
     np.testing.assert_allclose(measured.covariance.mean(axis=0) / scale, spread / scale, atol=0.05)
-    without = measured_of(dataclasses.replace(sensor, photoelectrons=0.0), counts, (1, 2), flux)
+    without = measure_moments(dataclasses.replace(sensor, photoelectrons=0.0), counts, (1, 2))
     assert (without.covariance.mean(axis=0).diagonal() < 0.9 * spread.diagonal()).all()
-    np.testing.assert_array_equal(measured_of(sensor, counts[:3], (1, 2), flux).covariance, measured.covariance[:3])
+    np.testing.assert_array_equal(measure_moments(sensor, counts[:3], (1, 2)).covariance, measured.covariance[:3])
 
 
 def test_a_covariance_with_shot_noise_is_one_whatever_noise_does():
     sensor = dataclasses.replace(SENSOR, noise_density=1e-6, photoelectrons=3.0)
     rng = np.random.default_rng(5)
     counts = to_counts(sensor, 0.5 * rng.standard_normal((500, 40)))
-    covariance = measured_of(sensor, counts, (1, 2)).covariance
+    covariance = measure_moments(sensor, counts, (1, 2)).covariance
     assert np.linalg.eigvalsh(covariance).min() > 0
-
-
-def test_ratio_covariance_by_finite_differences():
-    """First order: J V I J' with J the derivative of M_p/M_0, differenced."""
-    integrals, orders = noise_integrals(dataclasses.replace(SENSOR, field=(-0.6, 1.4)), 4), (1, 2)
-    M, h = np.array([0.9, 0.3, 0.2]), 1e-6
-    J = np.zeros((2, 3))
-    for k in range(3):
-        up, down = M.copy(), M.copy()
-        up[k] += h
-        down[k] -= h
-        J[:, k] = (up[1:] / up[0] - down[1:] / down[0]) / (2 * h)
-    expected = J @ (0.01 * integrals[np.add.outer(np.arange(3), np.arange(3))]) @ J.T
-    ours = measured_flux_covariance(0.01 * integrals, orders, (M[1:] / M[0])[None], M[:1])
-    np.testing.assert_allclose(ours[0], expected, rtol=1e-6)
 
 
 def test_taking_the_kernel_out_undoes_the_binomial():
@@ -159,11 +122,6 @@ def test_taking_the_kernel_out_undoes_the_binomial():
     assert (weights @ blur**2, weights @ blur**4) == pytest.approx((0.02, 0.001))
     both = [np.mean([weights @ (t + blur) ** p for t in path]) for p in range(5)]
     np.testing.assert_allclose(without_kernel(kernel) @ both, [np.mean(path**p) for p in range(5)], atol=1e-12)
-
-
-def test_a_flux_that_its_noise_drowns_is_not_divided_by():
-    counts = frames(SENSOR, np.zeros((1, 200)), seed=1)
-    assert "flux" in must_be(str, measure_moments(SENSOR, counts, (1, 2), flux="measured"))
 
 
 def test_a_spot_stands_out_and_its_absence_does_not():
@@ -189,10 +147,9 @@ def test_a_blank_frame_is_seldom_taken_for_a_spot_where_light_can_be_told_from_n
 
 
 @pytest.mark.parametrize("axes", [1, 7])
-@pytest.mark.parametrize("flux", ["known", "measured"])
-def test_moments_do_not_depend_on_the_axes_beside_them(axes, flux):
+def test_moments_do_not_depend_on_the_axes_beside_them(axes):
     sensor = dataclasses.replace(SENSOR, field=(-0.6, 1.4), noise_density=1e-3)
     counts = frames(sensor, np.random.default_rng(1).uniform(0, 0.5, (64, 50)), seed=4)
-    many, few = measured_of(sensor, counts, (1, 2), flux), measured_of(sensor, counts[:axes], (1, 2), flux)
+    many, few = measure_moments(sensor, counts, (1, 2)), measure_moments(sensor, counts[:axes], (1, 2))
     np.testing.assert_array_equal(few.value, many.value[:axes])
     np.testing.assert_array_equal(few.covariance, many.covariance[:axes])

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from filterpy.kalman import ExtendedKalmanFilter
 
-from aolink.estimation import Measurement
 from aolink.estimation.frames.plane_moments import measure_moments_2d
 from aolink.estimation.kalman.filter import BlurFilter
 from aolink.estimation.kalman.path_moments import PathMoments, predicted_moments
@@ -15,7 +14,6 @@ from aolink.optics.plane import pixel_mass_2d
 from aolink.optics.sensor import Kernel
 from aolink.plant.lifting import lift
 from aolink.rig import Plant
-from tests.kinds import must_be
 
 KERNEL = Kernel(shape="gaussian", sigma=0.12, matrix=((0.14, 0.04), (0.04, 0.1))).covariance
 X, Y = np.linspace(-1, 1, 21), np.linspace(-1, 1, 21)
@@ -50,36 +48,25 @@ def density(path, noise_density=0.0, seed=0, frames=1):
     return clean + sd * np.random.default_rng(seed).standard_normal((frames, *clean.shape))
 
 
-@pytest.mark.parametrize("flux", ["known", "measured"])
-def test_moments_are_those_of_the_path(flux):
+def test_moments_are_those_of_the_path():
     path, orders = lissajous(), [*WITH_CROSS, (2, 1), (3, 0), (2, 2)]
-    measured = must_be(Measurement, measure_moments_2d(density(path), X, Y, KERNEL, 1e-6, orders, flux))
+    measured = measure_moments_2d(density(path), X, Y, KERNEL, 1e-6, orders)
     expected = [np.mean(path[:, 0] ** p * path[:, 1] ** q) for p, q in orders]
     np.testing.assert_allclose(measured.value[0], expected, atol=2e-4)
 
 
 def test_a_coupled_kernel_left_in_would_bias_the_cross_moment():
     path = lissajous()
-    plain = must_be(Measurement, measure_moments_2d(density(path), X, Y, KERNEL * np.eye(2), 1e-6, [(1, 1)]))
+    plain = measure_moments_2d(density(path), X, Y, KERNEL * np.eye(2), 1e-6, [(1, 1)])
     bias = plain.value[0, 0] - np.mean(path[:, 0] * path[:, 1])
     assert bias == pytest.approx(KERNEL[0, 1], abs=2e-4)
 
 
-@pytest.mark.parametrize("flux", ["known", "measured"])
-def test_moments_scatter_as_their_covariance_says(flux):
-    measured = must_be(
-        Measurement,
-        measure_moments_2d(density(lissajous(), 1e-3, 1, 20_000), X, Y, KERNEL, 1e-3, WITH_CROSS, flux=flux),
-    )
+def test_moments_scatter_as_their_covariance_says():
+    measured = measure_moments_2d(density(lissajous(), 1e-3, 1, 20_000), X, Y, KERNEL, 1e-3, WITH_CROSS)
     spread, predicted = np.cov(measured.value.T), measured.covariance.mean(axis=0)
     scale = np.sqrt(np.outer(spread.diagonal(), spread.diagonal()))
     np.testing.assert_allclose(predicted / scale, spread / scale, atol=0.04)
-
-
-def test_light_lost_in_noise_is_not_divided_by():
-    assert "flux" in must_be(
-        str, measure_moments_2d(density(lissajous(), 0.1), X, Y, KERNEL, 0.1, WITH_CROSS, flux="measured")
-    )
 
 
 def path_of(plant, x, u):
@@ -120,7 +107,7 @@ def test_every_step_is_the_one_of_filterpy(tilt):
     for j in range(10):
         u = 0.3 * rng.standard_normal((N, 2))
         frame = density(path_of(tilt, truth, u), 1e-4, seed=j)
-        measured = must_be(Measurement, measure_moments_2d(frame, X, Y, KERNEL, 1e-4, ALONG))
+        measured = measure_moments_2d(frame, X, Y, KERNEL, 1e-4, ALONG)
         step = ours.step(model, model.response(u), measured)
         ekf.R = measured.covariance[0]
         jacobian = np.empty((4, 2))

@@ -11,7 +11,7 @@ from scipy import linalg
 from aolink.estimation import Measurement, run
 from aolink.estimation.estimate import Status
 from aolink.estimation.frames.centroid_noise import centroid_covariance
-from aolink.estimation.frames.frame_data import Flux, Needs
+from aolink.estimation.frames.frame_data import Needs
 from aolink.estimation.frames.moments import measure_moments, spot_significance
 from aolink.estimation.frames.plane_moments import measure_moments_2d
 from aolink.estimation.frames.spots import measure_spots, profiles
@@ -52,10 +52,10 @@ def counts_of(sensor: SpotSensor, frames: list[np.ndarray]) -> np.ndarray:
 
 
 def measured_of(
-    sensor: SpotSensor, plant: Plant, frame: np.ndarray, orders: tuple[int, ...] = (1, 2), flux: Flux = "known"
+    sensor: SpotSensor, plant: Plant, frame: np.ndarray, orders: tuple[int, ...] = (1, 2)
 ) -> tuple[Measurement, str]:
     everywhere = np.ones(frame.shape, dtype=bool)
-    needs = Needs(what="moments", orders=orders, flux=flux)
+    needs = Needs(what="moments", orders=orders)
     found, remark = measure_spots(sensor, plant, frame, everywhere, needs, least_significance=4.0)
     return must_be(Measurement, found), remark
 
@@ -92,13 +92,12 @@ def test_profiles_are_the_sums_in_whole_numbers(grid, window):
     assert np.array_equal(profiles(sensor, pixels, np.ones_like(usable)).counts, sums)
 
 
-@pytest.mark.parametrize("flux", ["known", "measured"])
-def test_moments_of_spots_are_those_of_the_plane_without_its_cross_terms(exposures, flux):
-    measured, _ = measured_of(SENSOR, RIG.plant, exposures[0].pixels, (1, 2), flux)
+def test_moments_of_spots_are_those_of_the_plane_without_its_cross_terms(exposures):
+    measured, _ = measured_of(SENSOR, RIG.plant, exposures[0].pixels, (1, 2))
     edges, orders = SENSOR.profile.edges, [(1, 0), (2, 0), (0, 1), (0, 2)]
     density = spot_windows(SENSOR, to_density(SENSOR, exposures[0].pixels))
     kernel, noise = SENSOR.kernel.covariance, effective_noise_density(SENSOR)
-    theirs = must_be(Measurement, measure_moments_2d(density, edges, edges, kernel, noise, orders, flux))
+    theirs = measure_moments_2d(density, edges, edges, kernel, noise, orders)
     np.testing.assert_allclose(measured.value.reshape(16, 4), theirs.value, atol=1e-12)
     for direction, block in enumerate((slice(0, 2), slice(2, 4))):
         expected = theirs.covariance[:, block, block]
@@ -106,24 +105,22 @@ def test_moments_of_spots_are_those_of_the_plane_without_its_cross_terms(exposur
 
 
 @pytest.mark.parametrize("photoelectrons", [0.0, 300.0])
-@pytest.mark.parametrize("flux", ["known", "measured"])
-def test_a_spots_moments_do_not_depend_on_those_beside_it(exposures, flux, photoelectrons):
+def test_a_spots_moments_do_not_depend_on_those_beside_it(exposures, photoelectrons):
     few = replace(SENSOR, grid=(1, 4), photoelectrons=photoelectrons)
     many = replace(SENSOR, photoelectrons=photoelectrons)
     pixels = exposures[3].pixels
-    whole, _ = measured_of(many, RIG.plant, pixels, flux=flux)
-    part, _ = measured_of(few, replace(RIG.plant, axes=8), pixels[:24], flux=flux)
+    whole, _ = measured_of(many, RIG.plant, pixels)
+    part, _ = measured_of(few, replace(RIG.plant, axes=8), pixels[:24])
     assert np.array_equal(part.value, whole.value[:8])
     assert np.array_equal(part.covariance, whole.covariance[:8])
 
 
-@pytest.mark.parametrize("flux", ["known", "measured"])
-def test_moments_of_both_directions_are_unbiased_and_scatter_as_they_say(flux):
+def test_moments_of_both_directions_are_unbiased_and_scatter_as_they_say():
     sensor = replace(ONE, noise_density=0.001)
     frames = noisy_frames(sensor, (0.4, -0.2), FRAMES)
     for direction, position in enumerate((0.4, -0.2)):
         counts = counts_of(sensor, frames)[:, direction]
-        found = must_be(Measurement, measure_moments(sensor.profile, counts, (1, 2), flux))
+        found = measure_moments(sensor.profile, counts, (1, 2))
         sd = np.sqrt(found.covariance[0].diagonal() / FRAMES)
         np.testing.assert_allclose(found.value.mean(axis=0), [position, position**2], atol=5 * sd.max())
         claimed = found.covariance.mean(axis=0)
@@ -271,15 +268,14 @@ def test_nis_is_scored_over_the_axes_that_were_measured(exposures):
     assert score(damaged, found).nis.mean == pytest.approx(nis.mean())
 
 
-@pytest.mark.parametrize("flux", ["known", "measured"])
-def test_a_window_without_light_costs_its_spot_alone(exposures, flux):
+def test_a_window_without_light_costs_its_spot_alone(exposures):
     pixels = exposures[0].pixels.copy()
     pixels[24:48, 72:96] = round(SENSOR.black_level)  # spot 7
-    measured, remark = measured_of(SENSOR, RIG.plant, pixels, flux=flux)
+    measured, remark = measured_of(SENSOR, RIG.plant, pixels)
     assert remark == "2 of 32 axes predicted: 2 of 32 profiles show no spot"
     usable = must_be(np.ndarray, measured.usable)
     np.testing.assert_array_equal(np.flatnonzero(~usable), [14, 15])
-    whole, _ = measured_of(SENSOR, RIG.plant, exposures[0].pixels, flux=flux)
+    whole, _ = measured_of(SENSOR, RIG.plant, exposures[0].pixels)
     assert np.array_equal(measured.value[usable], whole.value[usable])
     assert np.isfinite(measured.value).all()
 

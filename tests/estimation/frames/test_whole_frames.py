@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from aolink.estimation.compiled.frames import brightest_stretches, window_sums
-from aolink.estimation.frames.frame_data import Flux, Measurement, Needs
+from aolink.estimation.frames.frame_data import Measurement, Needs
 from aolink.estimation.frames.measure import Measurements, measure
 from aolink.estimation.frames.moments import significance_scale, spot_significance
 from aolink.estimation.frames.spots import profiles
@@ -18,9 +18,8 @@ from aolink.simulation.model import simulate
 from tests.kinds import must_be
 
 
-@pytest.mark.parametrize("flux", ["known", "measured"])
 @pytest.mark.parametrize("photoelectrons", [0.0, 2000.0])
-def test_as_each_frame_alone(flux: Flux, photoelectrons: float) -> None:
+def test_as_each_frame_alone(photoelectrons: float) -> None:
     rig = load_rig("sh-4x4")
     assert isinstance(rig.sensor, SpotSensor)
     rig = replace(rig, sensor=replace(rig.sensor, photoelectrons=photoelectrons))
@@ -28,7 +27,7 @@ def test_as_each_frame_alone(flux: Flux, photoelectrons: float) -> None:
     exposures[1].pixels[40, 50] = 0
     exposures[2].pixels[3, 4] = rig.sensor.full_scale
     exposures[4].pixels[24:48, 24:48] = round(rig.sensor.black_level)  # a spot without light
-    needs = Needs(what="moments", orders=(1, 2), flux=flux)
+    needs = Needs(what="moments", orders=(1, 2))
     together = Measurements(rig, exposures, needs)
     alone = [measure(rig, each, needs) for each in exposures]
     assert [row >= 0 for row in together.rows] == [not remark for _, remark in alone]

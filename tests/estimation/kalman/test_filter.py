@@ -201,20 +201,6 @@ def test_misprint_3_the_moments_belong_to_the_start_of_their_exposure():
     assert np.abs(late[0] - y).max() > 0.01
 
 
-def test_misprint_4_the_noise_of_an_exposure():
-    """(17) adds B_w W B_w', the noise of one fast step. With it the filter claims far too much."""
-    u, moments, states = scenario(200, seed=3)
-    nees = {}
-    for kind in ("lifted", "printed"):
-        steps = list(our_steps(PLANT, (1,), u, moments, process_noise=kind, gate=False))
-        errors = np.array([s.start.mean[0] for s in steps]) - states
-        nees[kind] = np.mean(
-            [e @ np.linalg.solve(s.start.covariance[0], e) for e, s in zip(errors, steps, strict=True)]
-        )
-    assert nees["printed"] > 3 * nees["lifted"]
-    assert nees["lifted"] < 3
-
-
 def test_at_zero_state_and_input_the_second_moment_says_nothing():
     """Remark 2: o2 needs an offset, x and -x look alike."""
     model = exposure_model(PLANT, N)

@@ -3,7 +3,7 @@
 import numpy as np
 
 from aolink.estimation.frames.frame_data import Profile
-from aolink.estimation.moments.lines import WindowedMoments
+from aolink.estimation.moments.lines import ORDERS, WindowedMoments
 from aolink.estimation.moments.windowed import Regression, Windowed, expected_response, weighted_sums
 from aolink.numerics import batched
 
@@ -11,10 +11,10 @@ from aolink.numerics import batched
 class PlainMoments(Windowed[Profile]):
     """`WindowedMoments` with the arithmetic of `Windowed`."""
 
-    def __init__(self, sensor, orders=(0, 1, 2, 3), *, flux="known"):
-        twin = WindowedMoments(sensor, orders, flux=flux)
-        self.sensor, self.orders, self.needs = twin.sensor, twin.orders, twin.needs
-        super().__init__(flux, lights=[0], light_of=[0] * len(self.orders))
+    n_measurements, needs = WindowedMoments.n_measurements, WindowedMoments.needs
+
+    def __init__(self, sensor):
+        self.sensor = sensor
 
     def look(self, nodes, about, measured):
         """The weighted sums, their noise, and their regression on the coefficients."""
@@ -28,7 +28,7 @@ class PlainMoments(Windowed[Profile]):
     def window_weights(self, mean, variance, mask):
         """Weights of the pixels about a path, (axes, sums, pixels), from its mean and variance, both (axes, nodes)."""
         u, inside = self.window(self.sensor, self.sensor.kernel.variance, mean, variance, mask)
-        return np.stack([u**p * inside for p in self.orders], axis=1)
+        return np.stack([u**p * inside for p in ORDERS], axis=1)
 
     def regression(self, W, mean, spread, basis, weights, widening=0.0):
         """Regression of the weighted sums on the coefficients.

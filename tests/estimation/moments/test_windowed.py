@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 from scipy import linalg
 
-from aolink.errors import EstimatorError
 from aolink.estimation import Status, exposure_model, make_estimator, run, score
-from aolink.estimation.frames.frame_data import Flux, Profile
+from aolink.estimation.frames.frame_data import Profile
 from aolink.estimation.kalman.filter import BlurFilter
 from aolink.estimation.kalman.gaussian import Gaussian
 from aolink.estimation.model.quadrature import equal_parts, quadrature_paths
@@ -117,14 +116,13 @@ def test_slope_is_the_derivative_of_what_is_expected():
         np.testing.assert_allclose(slope[:, k], difference, atol=1e-7)
 
 
-@pytest.mark.parametrize("flux", ["known", "measured"])
-def test_expected_sums_are_those_of_a_noiseless_frame(flux):
+def test_expected_sums_are_those_of_a_noiseless_frame():
     """Window, mask, kernel and pixels are all in the expectation: there is no bias to remove."""
     path = 0.2 + 0.15 * np.sin(np.linspace(0, 4, 200))
     density = exposure_density(SENSOR.kernel, SENSOR.edges, path)[None]
     mask = np.ones((1, 40), bool)
     mask[0, 24] = False
-    observation = PlainMoments(SENSOR, flux=flux)
+    observation = PlainMoments(SENSOR)
     W = observation.window_weights(path[None], np.zeros((1, 200)), mask)
     fit = observation.regression(W, path[None], np.zeros((1, 200, 200)), np.zeros((200, 3)), np.full(200, 1 / 200))
     y, _ = weighted_sums(observation.sensor, W, density)
@@ -159,15 +157,9 @@ def test_equal_parts_of_the_steps_keep_the_mean_of_the_path():
 # In compiled code
 
 
-@pytest.mark.parametrize(
-    "how",
-    [
-        {}, {"flux": "measured"}, {"orders": (2, 1)}, {"orders": (0, 1, 2, 3, 4)},
-    ],
-)  # fmt: skip
 @pytest.mark.parametrize("photoelectrons", [0.0, 400.0])
 @pytest.mark.parametrize("offset", [0.0, 0.3])
-def test_the_update_is_that_of_the_twin(how, photoelectrons, offset):
+def test_the_update_is_that_of_the_twin(photoelectrons, offset):
     rng, axes = np.random.default_rng(4), 5
     sensor = dataclasses.replace(SENSOR, photoelectrons=photoelectrons)
     unmodelled = UnmodelledSlopes(sd=0.04, correlation_steps=30.0) if offset else None
@@ -182,7 +174,7 @@ def test_the_update_is_that_of_the_twin(how, photoelectrons, offset):
         model, model.response(rng.normal(0, 0.01, (150, axes))), prior.with_noise(model.n_coefficients),
         Profile(density=np.where(mask, density, 0.0), mask=mask, light=light),
     )  # fmt: skip
-    ours, twin = WindowedMoments(sensor, **how).update(*given), PlainMoments(sensor, **how).update(*given)
+    ours, twin = WindowedMoments(sensor).update(*given), PlainMoments(sensor).update(*given)
     for found, expected in (
         (ours.posterior.mean, twin.posterior.mean), (ours.posterior.covariance, twin.posterior.covariance),
         (ours.innovation, twin.innovation), (ours.innovation_covariance, twin.innovation_covariance),
@@ -222,31 +214,6 @@ def test_a_blur_that_has_several_readings_is_not_believed_in_one(resonance_hz):
     o1, ours = (errors(exposures, estimates[name]) for name in ("o1", "moments"))
     assert upper_bound_of_ratio(ours, o1) <= (1.02 if resonance_hz == 5 else 0.7)
     assert score(exposures, estimates["moments"], 10).end_nees.mean < 2.6
-
-
-def test_more_moments_beat_o1_too():
-    exposures = simulate(RIG, 110, seed=3)
-    o1 = score(exposures, run(RIG, exposures, ["o1"])["o1"], 10)
-    estimator = make_estimator(RIG, "moments", orders=(0, 1, 2, 3, 4))
-    assert score(exposures, [estimator.step(e) for e in exposures], 10).path_rmse < 0.5 * o1.path_rmse
-
-
-def test_another_basis_is_refused_with_what_to_do():
-    with pytest.raises(EstimatorError, match="moments are monomials: leave basis out"):
-        make_estimator(RIG, "moments:basis=fourier")
-
-
-def test_measured_flux_does_not_mind_a_lamp_that_is_half_as_bright():
-    exposures = simulate(RIG, 60, seed=4)
-    dimmed = []
-    for e in exposures:
-        noise = np.random.default_rng(e.frame_id).standard_normal((1, 40)) * np.sqrt(0.01 / 0.05)
-        density = 0.6 * exposure_density(SENSOR.kernel, SENSOR.edges, truth_of(e).path) + noise
-        dimmed.append(dataclasses.replace(e, pixels=to_counts(SENSOR, density)))
-    measured = make_estimator(RIG, "moments", flux="measured")
-    estimates = [measured.step(e) for e in dimmed]
-    assert score(exposures, estimates, 10).path_rmse < 0.03
-    assert {e.status for e in estimates} == {Status.OK}
 
 
 # Trust
@@ -318,15 +285,8 @@ def test_shot_noise_by_the_rig_file_is_allowed_for():
     assert unaware.nis.mean > 1.3 * aware.nis.mean
 
 
-def test_orders_that_make_no_sense_are_refused():
-    for orders in ((), (0,), (1, 1), (-1, 2), (1, 30)):
-        with pytest.raises(EstimatorError, match="orders"):
-            make_estimator(RIG, "moments", orders=orders)
-
-
 @pytest.mark.parametrize("axes", [1, 7])
-@pytest.mark.parametrize("flux", ["known", "measured"])
-def test_an_axis_does_not_depend_on_those_beside_it(axes, flux):
+def test_an_axis_does_not_depend_on_those_beside_it(axes):
     rng = np.random.default_rng(4)
     paths = rng.uniform(-0.3, 0.3, (5, 64, 1)) + 0.1 * np.sin(np.linspace(0, 6, 200))
     density = exposure_density(SENSOR.kernel, SENSOR.edges, paths) + 0.3 * rng.standard_normal((5, 64, 40))
@@ -334,7 +294,7 @@ def test_an_axis_does_not_depend_on_those_beside_it(axes, flux):
 
     def steps(n):
         plant = dataclasses.replace(RIG.plant, axes=n)
-        filter_ = BlurFilter(plant, WindowedMoments(SENSOR, flux=flux))
+        filter_ = BlurFilter(plant, WindowedMoments(SENSOR))
         model = exposure_model(plant, 200)
         for frame, usable in zip(density, mask, strict=True):
             response = model.response(np.full((200, n), 0.001))
@@ -363,12 +323,11 @@ def test_lost_frames_and_dead_time_are_bridged():
 
 
 def test_numbers_beyond_all_bounds_are_gated_and_stop_nothing():
-    """Light of next to nothing to divide by, and densities near the largest number."""
+    """Densities near the largest number."""
     plant = dataclasses.replace(RIG.plant, axes=2)
     model = exposure_model(plant, 200)
-    cases: list[tuple[Flux, float]] = [("measured", 1e-320), ("known", 1e200), ("measured", -1e200)]
-    for flux, density in cases:
-        filter_ = BlurFilter(plant, WindowedMoments(SENSOR, flux=flux))
+    for density in (1e200, -1e200):
+        filter_ = BlurFilter(plant, WindowedMoments(SENSOR))
         profile = Profile(density=np.full((2, 40), density), mask=np.ones((2, 40), bool))
         profile.density[1] = exposure_density(SENSOR.kernel, SENSOR.edges, np.zeros(200))
         with np.errstate(all="ignore"):
