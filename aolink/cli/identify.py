@@ -16,10 +16,8 @@ if TYPE_CHECKING:
 
 
 class Fitted(StrEnum):
-    """What can be fitted beside the disturbance: two quantities of the camera, and the kinds of plants."""
+    """The kinds of plants that can be fitted beside the disturbance."""
 
-    NOISE = "noise"
-    KERNEL = "kernel"
     FIRST_ORDER = "first-order"
     SECOND_ORDER = "second-order"
 
@@ -36,16 +34,12 @@ def identify(
         typer.Option(
             "--model",
             metavar="KIND+KIND...",
-            help="Model of the disturbance: random-walk, ornstein-uhlenbeck, second-order, resonance, ar3, ar4, or a"
-            " sum of them. Given several times, cross-validation chooses; without it, from nine.",
+            help="Model of the disturbance: random-walk, ornstein-uhlenbeck, second-order, resonance, or a sum of"
+            " them. Given several times, cross-validation chooses; without it, from seven.",
         ),
     ] = None,
     fit: Annotated[
-        list[Fitted] | None,
-        typer.Option(
-            help="Fit this too; may be repeated: the pixels' noise, the kernel's width and its changes, or a plant of"
-            " that kind, by the inputs, instead of the rig file's."
-        ),
+        Fitted | None, typer.Option(help="Fit a plant of this kind too, by the inputs, instead of the rig file's.")
     ] = None,
     highest: Annotated[
         float | None,
@@ -68,15 +62,9 @@ def identify(
 
     sources = [*files, *([Path(rig)] if rig else [])]
     check_target(output, overwrite=overwrite, sources=sources, suffix=".toml", error=IdentificationError)
-    fitted = set(fit or ())
-    if len(kinds := [each.value for each in (Fitted.FIRST_ORDER, Fitted.SECOND_ORDER) if each in fitted]) > 1:
-        raise typer.BadParameter("--fit takes one kind of plant")
-    kind = kinds[0] if kinds else None
     wanted = job.Wanted(
-        models=tuple(model) if model else () if kind else CANDIDATES, plant=kind,
-        noise=Fitted.NOISE in fitted, kernel=Fitted.KERNEL in fitted,
-        highest_hz=highest or None,
-    )  # fmt: skip
+        models=tuple(model) if model else () if fit else CANDIDATES, plant=fit and fit.value, highest_hz=highest or None
+    )
     recordings = [open_recording(file) for file in files]
     with progress("identify", None) as tell:
 

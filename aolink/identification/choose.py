@@ -22,8 +22,8 @@ from aolink.identification.search import SHORT_RUN, Space, maxima
 from aolink.numerics.arrays import FloatArray
 
 CANDIDATES = (
-    "random-walk", "ornstein-uhlenbeck", "second-order", "resonance", "ar3", "ornstein-uhlenbeck+resonance",
-    "random-walk+resonance", "ar4", "resonance+resonance",
+    "random-walk", "ornstein-uhlenbeck", "second-order", "resonance", "ornstein-uhlenbeck+resonance",
+    "random-walk+resonance", "resonance+resonance",
 )  # fmt: skip
 """The sums of kinds that are tried where the user asks for none."""
 _STRETCH = 16

@@ -7,10 +7,10 @@ measured, p(y, s) = p(y) p(s | y).
 p(y) is Gaussian, exactly, and taken over long runs of exposures. Given y in a short run of exposures the path is
 Gaussian, with mean m and covariance S, and each s_j is a quadratic form of it: its mean is that of (m - c)^2 + diag S
 over the exposure's steps, its variance that of 2 S^2 + 4 (m - c) S (m - c) over pairs of them, and its third cumulant
-is as exact. p(s | y) is taken as the product of gamma distributions of these cumulants, with the pixels' noise and the
-kernel's changes: where a spot swings several times in an exposure, its mean square is an exponential variable. So it is
-a composite likelihood: each factor is right or nearly so, but the dependence of the mean squares on each other, given
-y, is left out. The effect of this is found by simulation (`sets`), and the sets allow for it.
+is as exact. p(s | y) is taken as the product of gamma distributions of these cumulants, with the pixels' noise: where a
+spot swings several times in an exposure, its mean square is an exponential variable. So it is a composite likelihood:
+each factor is right or nearly so, but the dependence of the mean squares on each other, given y, is left out. The
+effect of this is found by simulation (`sets`), and the sets allow for it.
 
 Sums over the steps of an exposure are Gauss's quadrature.
 """
@@ -24,7 +24,7 @@ import numpy as np
 from scipy import linalg, special
 
 from aolink.estimation.model.quadrature import equal_parts, gauss
-from aolink.identification.models import AS_IN_FILE, DisturbanceProcesses, SensorFit
+from aolink.identification.models import ProcessSum
 from aolink.identification.readings import Readings
 from aolink.numerics.arrays import BoolArray, FloatArray, Indices
 from aolink.numerics.single_thread import by_one_thread
@@ -85,30 +85,28 @@ class Likelihood:
         """The same readings with another response to the inputs, (outputs, slots, N + 1)."""
         return Likelihood(replace(self.seen, response=response), self.length)
 
-    def __call__(self, model: DisturbanceProcesses, sensor: SensorFit = AS_IN_FILE, nodes: int | None = None) -> float:
+    def __call__(self, model: ProcessSum, nodes: int | None = None) -> float:
         """Log-likelihood, -inf where the model gives no valid covariance.
 
         ``nodes`` is the number in an exposure; `nodes` of the model where None.
         """
-        return float(self.of_outputs(model, sensor, nodes).sum())
+        return float(self.of_outputs(model, nodes).sum())
 
     @by_one_thread
-    def of_outputs(
-        self, model: DisturbanceProcesses, sensor: SensorFit = AS_IN_FILE, nodes: int | None = None
-    ) -> FloatArray:
+    def of_outputs(self, model: ProcessSum, nodes: int | None = None) -> FloatArray:
         """The log-likelihood of each output, (outputs,)."""
         nodes = nodes or self.nodes(model)
         out = np.zeros(len(self.seen.mean))
         try:
-            constants = self._of_means(model, nodes, sensor.noise, out)
+            constants = self._of_means(model, nodes, out)
             for each in self._in_short_runs(nodes):
-                given = self._given_means(model, nodes, each.usable, sensor.noise)
-                np.add.at(out, each.output, given.log_densities(each, constants[each.output], sensor))
+                given = self._given_means(model, nodes, each.usable)
+                np.add.at(out, each.output, given.log_densities(each, constants[each.output]))
         except linalg.LinAlgError:
             return np.full(len(out), -math.inf)
         return out if np.isfinite(out).all() else np.full(len(out), -math.inf)
 
-    def nodes(self, model: DisturbanceProcesses) -> int:
+    def nodes(self, model: ProcessSum) -> int:
         """Nodes in an exposure that the model's paths need."""
         fastest = max(float(np.abs(process.poles.imag).max()) for process in model.processes) / (2 * math.pi)
         wanted = math.ceil(_FEWEST_NODES / 2 + _NODES_PER_CYCLE * fastest * self.exposure_s)
@@ -143,22 +141,22 @@ class Likelihood:
                     patterns.setdefault(seen.usable[o, some].tobytes(), []).append((o, some))
         return list(patterns.values())
 
-    def whitened_means(self, model: DisturbanceProcesses, nodes: int | None = None) -> list[FloatArray]:
+    def whitened_means(self, model: ProcessSum, nodes: int | None = None) -> list[FloatArray]:
         """The means of each long run of exposures as innovations: what the means before do not predict, over its
         standard deviation. White noise of variance one where the model is right; (good exposures,) each."""
-        constants, runs = self._whitened(model, nodes or self.nodes(model), 1.0)
+        constants, runs = self._whitened(model, nodes or self.nodes(model))
         return [each for output, white, ones, _ in runs for each in (white - ones[:, None] * constants[output]).T]
 
-    def _of_means(self, model: DisturbanceProcesses, nodes: int, noise: float, out: FloatArray) -> FloatArray:
+    def _of_means(self, model: ProcessSum, nodes: int, out: FloatArray) -> FloatArray:
         """Add the log-density of each output's means to ``out``; the constants of the outputs that make it largest."""
-        constants, runs = self._whitened(model, nodes, noise)
+        constants, runs = self._whitened(model, nodes)
         for output, white, ones, scale in runs:
             left = white - ones[:, None] * constants[output]
             np.add.at(out, output, -0.5 * (left**2).sum(axis=0) - scale)
         return constants
 
     def _whitened(
-        self, model: DisturbanceProcesses, nodes: int, noise: float
+        self, model: ProcessSum, nodes: int
     ) -> tuple[FloatArray, list[tuple[Indices, FloatArray, FloatArray, float]]]:
         """The constants of the outputs that make the means' density largest; and of long runs that are alike the
         outputs, the whitened means (exposures, runs), whitened ones, and the logarithm of the densities' scale."""
@@ -181,7 +179,7 @@ class Likelihood:
         for usable, output, y in self._in_long_runs(nodes, run):
             n = np.flatnonzero(usable)
             root = linalg.cholesky(
-                sigma[np.ix_(n, n)] + noise * self.mean_noise * np.eye(len(n)), lower=True, check_finite=False
+                sigma[np.ix_(n, n)] + self.mean_noise * np.eye(len(n)), lower=True, check_finite=False
             )
             both = np.concatenate([y.T, np.ones((len(n), 1))], axis=1)
             both = linalg.solve_triangular(root, both, lower=True, check_finite=False)
@@ -204,7 +202,7 @@ class Likelihood:
             ]  # fmt: skip
         return self._means[nodes]
 
-    def _given_means(self, model: DisturbanceProcesses, nodes: int, usable: BoolArray, noise: float) -> _GivenMeans:
+    def _given_means(self, model: ProcessSum, nodes: int, usable: BoolArray) -> _GivenMeans:
         seen, (rows, weights) = self.seen, self._rule(nodes)
         at = np.asarray(rows @ np.arange(float(seen.n_steps))) * seen.step_s
         begin = np.arange(float(len(usable))) * (seen.period_steps * seen.step_s)
@@ -219,10 +217,10 @@ class Likelihood:
             shared = np.minimum(times[:, :, None, None], times) + _WALK_START * seen.reach**2 / walk
             with_means = with_means + walk * np.tensordot(weights, shared, axes=(0, 1))
             inside = inside + walk * np.einsum("jajb->jab", shared)
-        return _GivenMeans(with_means, inside, weights, usable, noise * self.mean_noise)
+        return _GivenMeans(with_means, inside, weights, usable, self.mean_noise)
 
 
-def _stationary(model: DisturbanceProcesses, apart: FloatArray, at: FloatArray) -> FloatArray:
+def _stationary(model: ProcessSum, apart: FloatArray, at: FloatArray) -> FloatArray:
     """Covariances of the stationary processes at places ``at`` of an exposure with those of exposures ``apart``, s.
 
     ``apart`` (m,) begins with zero; (m, nodes, nodes), the later exposure's nodes first.
@@ -235,7 +233,7 @@ def _stationary(model: DisturbanceProcesses, apart: FloatArray, at: FloatArray) 
     return out
 
 
-def _walk(model: DisturbanceProcesses) -> float:
+def _walk(model: ProcessSum) -> float:
     """Sum of the intensities of a model's random walks."""
     return sum(process.walk for process in model.processes)
 
@@ -261,7 +259,7 @@ class _GivenMeans:
         """S of each exposure, multiplied by the square roots of the nodes' weights on both sides, (good, nodes,
         nodes)."""
 
-    def log_densities(self, data: ShortRuns, constants: FloatArray, sensor: SensorFit) -> FloatArray:
+    def log_densities(self, data: ShortRuns, constants: FloatArray) -> FloatArray:
         """Log-density of each run's mean squares, (runs,); ``constants`` b of each run."""
         good, w, S = self.good, self.weights, self.S
         y = data.mean - data.response @ w + data.centre - constants[:, None]
@@ -269,15 +267,14 @@ class _GivenMeans:
         m = np.tensordot(white.T, self.gain, axes=1) + data.response[:, good]
         m = (m + (constants[:, None] - data.centre[:, good])[:, :, None]) * np.sqrt(w)
         pushed = np.matmul(S, m[..., None])[..., 0]
-        first = (m * m).sum(axis=2) + np.einsum("jaa->j", S) + sensor.wider
+        first = (m * m).sum(axis=2) + np.einsum("jaa->j", S)
         second = 4 * (m * pushed).sum(axis=2) + 2 * (S * S).sum(axis=(1, 2))
         third = 24 * (pushed**2).sum(axis=2) + 8 * ((S @ S) * S).sum(axis=(1, 2))
         out = np.empty(len(first))
         for begin in range(0, len(out), _AT_ONCE):
             some = slice(begin, begin + _AT_ONCE)
             e = data.square[some][:, good] - first[some]
-            read = sensor.noise * data.square_noise[some][:, good] + sensor.changes
-            out[some] = _shifted_gamma(e, second[some], third[some], read).sum(axis=1)
+            out[some] = _shifted_gamma(e, second[some], third[some], data.square_noise[some][:, good]).sum(axis=1)
         return out
 
 

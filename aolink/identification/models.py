@@ -2,19 +2,15 @@
 
 All are linear and Gaussian in continuous time: a(d/dt) theta = e, with e white and a(s) = prod_i (s - lambda_i). A
 random walk has the pole zero, an Ornstein-Uhlenbeck process one real pole, a resonance one pair of complex ones, a
-process of second order two real ones. "ar3" and "ar4" have a pair and a real pole, and two pairs. (Autoregressive
-processes of the orders one and two are the Ornstein-Uhlenbeck process, the process of second order and the resonance.)
-They are sampled at the fast rate exactly.
+process of second order two real ones. They are sampled at the fast rate exactly.
 """
 
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,8 +25,6 @@ PARAMETERS: Mapping[str, tuple[str, ...]] = {
     "ornstein-uhlenbeck": ("correlation_s", "intensity"),
     "second-order": ("correlation_s", "second_correlation_s", "sd"),
     "resonance": ("frequency_hz", "damping", "sd"),
-    "ar3": ("frequency_hz", "damping", "correlation_s", "sd"),
-    "ar4": ("frequency_hz", "damping", "second_frequency_hz", "second_damping", "sd"),
 }
 """The parameters of each kind of process; each is above zero.
 
@@ -38,33 +32,78 @@ PARAMETERS: Mapping[str, tuple[str, ...]] = {
 standard deviation, slope units; ``correlation_s`` minus the inverse of a real pole, s; ``frequency_hz`` and ``damping``
 the modulus of a pair of poles over 2 pi, Hz, and their damping ratio.
 """
-UNITS: Mapping[str, str] = (
-    {"intensity": "slope^2/s", "sd": "slope", "damping": "", "second_damping": ""}
-    | dict.fromkeys(("frequency_hz", "second_frequency_hz"), "Hz")
-    | dict.fromkeys(("correlation_s", "second_correlation_s"), "s")
-)
+UNITS: Mapping[str, str] = {
+    "intensity": "slope^2/s", "sd": "slope", "damping": "", "frequency_hz": "Hz", "correlation_s": "s",
+    "second_correlation_s": "s",
+}  # fmt: skip
 _FASTEST = 300.0
 _APART = 1e-4
 """Least distance of two poles, as a share of their modulus: a double pole has no partial fractions."""
 
 
-class Covariance(ABC):
-    """The covariance of a process: a sum of exponentials, one for each of its poles."""
+@dataclass(frozen=True)
+class Process:
+    """One process of a disturbance, with the values of its parameters in the order of `PARAMETERS`.
+
+    Its covariance is a sum of exponentials, one for each of its poles.
+    """
+
+    kind: str
+    values: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        if self.kind not in PARAMETERS:
+            raise IdentificationError(f"{self.kind!r} is no kind of process: use one of {', '.join(PARAMETERS)}")
+        if len(self.values) != len(self.names) or not all(0 < value < math.inf for value in self.values):
+            raise IdentificationError(f"{self.kind} has {', '.join(self.names)}, each above 0, not {self.values}")
 
     @property
-    @abstractmethod
-    def poles(self) -> ComplexArray:
-        """lambda_i, 1/s, distinct."""
+    def names(self) -> tuple[str, ...]:
+        """Names of the parameters."""
+        return PARAMETERS[self.kind]
+
+    def __getitem__(self, name: str) -> float:
+        return self.values[self.names.index(name)]
 
     @property
-    @abstractmethod
-    def residues(self) -> ComplexArray:
-        """The residue of the stationary covariance at each pole, slope units squared."""
-
-    @property
-    @abstractmethod
     def walk(self) -> float:
         """Intensity of a random walk, slope units squared per second; 0 of a stationary process."""
+        return self["intensity"] if self.kind == "random-walk" else 0.0
+
+    @cached_property
+    def poles(self) -> ComplexArray:
+        """lambda_i, 1/s, distinct."""
+        if not self.is_stationary:
+            return np.zeros(1, dtype=np.complex128)
+        found: list[complex] = []
+        for name, value in zip(self.names, self.values, strict=True):
+            if name.endswith("correlation_s"):
+                found.append(complex(-1 / value))
+            elif name == "frequency_hz":
+                omega, damping = 2 * math.pi * value, self["damping"]
+                root = omega * complex(damping**2 - 1) ** 0.5
+                found += [-omega * damping + root, -omega * damping - root]
+        poles = np.array(found)
+        for k in range(1, len(poles)):
+            while np.abs(poles[k] - poles[:k]).min() < _APART * abs(poles[k]):
+                poles[k] *= 1 + 2 * _APART
+        return poles
+
+    @property
+    def variance(self) -> float:
+        """Stationary variance, slope units squared; infinite of a random walk."""
+        if not self.is_stationary:
+            return math.inf
+        if self.kind == "ornstein-uhlenbeck":
+            return self["intensity"] * self["correlation_s"] / 2
+        return self["sd"] ** 2
+
+    @cached_property
+    def residues(self) -> ComplexArray:
+        """The residue of the stationary covariance at each pole, slope units squared."""
+        poles = self.poles  # residues are proportional to 1 / (a'(lambda) a(-lambda))
+        residues = np.array([1 / (np.prod(p - np.delete(poles, k)) * np.prod(-p - poles)) for k, p in enumerate(poles)])
+        return np.asarray(residues * (self.variance / residues.sum().real))
 
     @property
     def is_stationary(self) -> bool:
@@ -95,65 +134,6 @@ class Covariance(ABC):
 
 
 @dataclass(frozen=True)
-class Process(Covariance):
-    """One process of a disturbance, with the values of its parameters in the order of `PARAMETERS`."""
-
-    kind: str
-    values: tuple[float, ...]
-
-    def __post_init__(self) -> None:
-        if self.kind not in PARAMETERS:
-            raise IdentificationError(f"{self.kind!r} is no kind of process: use one of {', '.join(PARAMETERS)}")
-        if len(self.values) != len(self.names) or not all(0 < value < math.inf for value in self.values):
-            raise IdentificationError(f"{self.kind} has {', '.join(self.names)}, each above 0, not {self.values}")
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the parameters."""
-        return PARAMETERS[self.kind]
-
-    def __getitem__(self, name: str) -> float:
-        return self.values[self.names.index(name)]
-
-    @property
-    def walk(self) -> float:
-        return self["intensity"] if self.kind == "random-walk" else 0.0
-
-    @cached_property
-    def poles(self) -> ComplexArray:
-        if not self.is_stationary:
-            return np.zeros(1, dtype=np.complex128)
-        found: list[complex] = []
-        for name, value in zip(self.names, self.values, strict=True):
-            if name.endswith("correlation_s"):
-                found.append(complex(-1 / value))
-            elif name.endswith("frequency_hz"):
-                omega, damping = 2 * math.pi * value, self[name.replace("frequency_hz", "damping")]
-                root = omega * complex(damping**2 - 1) ** 0.5
-                found += [-omega * damping + root, -omega * damping - root]
-        poles = np.array(found)
-        for k in range(1, len(poles)):
-            while np.abs(poles[k] - poles[:k]).min() < _APART * abs(poles[k]):
-                poles[k] *= 1 + 2 * _APART
-        return poles
-
-    @property
-    def variance(self) -> float:
-        """Stationary variance, slope units squared; infinite of a random walk."""
-        if not self.is_stationary:
-            return math.inf
-        if self.kind == "ornstein-uhlenbeck":
-            return self["intensity"] * self["correlation_s"] / 2
-        return self["sd"] ** 2
-
-    @cached_property
-    def residues(self) -> ComplexArray:
-        poles = self.poles  # residues are proportional to 1 / (a'(lambda) a(-lambda))
-        residues = np.array([1 / (np.prod(p - np.delete(poles, k)) * np.prod(-p - poles)) for k, p in enumerate(poles)])
-        return np.asarray(residues * (self.variance / residues.sum().real))
-
-
-@dataclass(frozen=True)
 class StateSpace:
     """x(k+1) = A x(k) + B_w w(k), w ~ N(0, W), theta(k) = C x(k), in fast steps."""
 
@@ -167,13 +147,6 @@ class StateSpace:
     """(1, n_states)"""
     initial_covariance: FloatArray
     """Stationary covariance, (n_states, n_states); that of the first state of a random walk is ``start_variance``."""
-
-
-class DisturbanceProcesses(Protocol):
-    """The interface of a model for a likelihood: independent processes, whose sum is the disturbance."""
-
-    @property
-    def processes(self) -> Sequence[Covariance]: ...
 
 
 @dataclass(frozen=True)
@@ -230,21 +203,6 @@ PLANTS: Mapping[str, tuple[str, ...]] = {
 ``gain`` is the slope for a resting input of one, slope units; the poles are given as in `PARAMETERS`; ``sd`` is the
 standard deviation of the slope by noise at the plant's input, slope units.
 """
-
-
-class SensorFit(NamedTuple):
-    """What is fitted of the sensor beside the disturbance; the rig file's sensor by default."""
-
-    noise: float = 1.0
-    """Factor of the pixels' noise variance."""
-    wider: float = 0.0
-    """The kernel's variance less the rig file's, slope units squared."""
-    changes: float = 0.0
-    """Variance of the exposures' own kernel variances about their mean, as focus changes them, slope units to the
-    fourth; each exposure's is taken as independent of the others'."""
-
-
-AS_IN_FILE = SensorFit()
 
 
 @dataclass(frozen=True)

@@ -44,8 +44,6 @@ _LEAST_MOTION = 0.15
 _FEWEST_STEPS = 8
 """Fast steps in an exposure from which on their number does not matter: with N instants instead of an integral, a
 random walk's means gain 1/(2 N^2) of variance."""
-_NARROWEST, _WIDEST = 0.25, 4.0
-"""Limits of the variance of an output's kernel, in those of the rig file's."""
 _SEEN, _EXACT, _LEAST_LIGHT = 4.0, 0.02, 0.2
 """The light is measured where its deviations from one have their neighbours' sign more often than chance allows by this
 many standard deviations, and are larger than the second value; with less than the last there is no spot to speak of."""
@@ -132,17 +130,13 @@ class Readings:
 _OF_SLOTS = ("mean", "square", "mean_noise", "square_noise", "centre", "usable", "response")
 
 
-def readings(
-    rig: Rig, exposures: Sequence[Exposure], *, plant_known: bool = True, kernel_known: bool = True
-) -> Readings:
+def readings(rig: Rig, exposures: Sequence[Exposure], *, plant_known: bool = True) -> Readings:
     """The readings of a recording's exposures.
 
     Parameters
     ----------
     plant_known:
         Whether the inputs' response is that of the rig's plant; if not, no response is part of the expected position.
-    kernel_known:
-        Whether all kernels are as wide as the rig file says; if not, those of several copies of the plant may differ.
 
     Raises
     ------
@@ -193,13 +187,7 @@ def readings(
         follows=False, reach=(rig.sensor.field[1] - rig.sensor.field[0]) / 2,
     )  # fmt: skip
     seen = _lit(rig.sensor.profile, density, mask)
-    variances = np.full(rig.n_outputs, rig.sensor.kernel.variance)
-    made = _measured(seen, variances, blank)
-    if not kernel_known:
-        for _ in range(2):
-            variances = _variances(rig, variances, made)
-            made = _measured(seen, variances, blank)
-    return _divided(made)
+    return _divided(_measured(seen, blank))
 
 
 def _lit(sensor: Sensor, density: FloatArray, mask: BoolArray) -> _Seen:
@@ -215,17 +203,6 @@ def _lit(sensor: Sensor, density: FloatArray, mask: BoolArray) -> _Seen:
     usual = float(np.median(light[whole]))
     light = np.where(whole & (light > _LEAST_LIGHT), light, usual)
     return _Seen(sensor, density / light[:, :, None], mask, light)
-
-
-def _variances(rig: Rig, variances: FloatArray, found: Readings) -> FloatArray:
-    """Variances of the outputs' kernels: copies of the plant move alike, and where one's images are wider than the
-    others' by more than its kernel explains, its kernel is wider."""
-    count = np.maximum(found.usable.sum(axis=1), 1)
-    width = ((found.square - found.mean**2 + found.mean_noise) * found.usable).sum(axis=1) / count
-    copies = width.reshape(-1, rig.plant.n_outputs)
-    wider = (copies - np.average(copies, axis=0, weights=count.reshape(copies.shape))).ravel()
-    known = rig.sensor.kernel.variance
-    return np.asarray(np.clip(variances + wider, _NARROWEST * known, _WIDEST * known))
 
 
 def _divided(found: Readings) -> Readings:
@@ -278,13 +255,13 @@ def by_slot(path: FloatArray, slots: int, n_steps: int, period: int, offset: flo
     return np.asarray(path[:, np.arange(slots)[:, None] * period + np.arange(n_steps + 1)])
 
 
-def _measured(seen: _Seen, variances: FloatArray, blank: Readings) -> Readings:
+def _measured(seen: _Seen, blank: Readings) -> Readings:
     """Readings from densities (outputs, slots, pixels): the expected position follows the spot, if that makes the
     motion about it smaller."""
     sensor, expected = seen.sensor, blank.response[:, :, :-1].mean(axis=2)
     middle = (sensor.field[0] + sensor.field[1]) / 2
     # First the spot may be anywhere; then weights are made for the motion that was found.
-    found = _at(seen, variances, blank, np.full_like(expected, middle), blank.reach / _REACH)
+    found = _at(seen, blank, np.full_like(expected, middle), blank.reach / _REACH)
     best = found
     for _ in range(_ROUNDS):
         if not best.usable.any():
@@ -294,7 +271,7 @@ def _measured(seen: _Seen, variances: FloatArray, blank: Readings) -> Readings:
         still = expected + mean[:, None]
         follows = expected + before(place, best.usable)
         tried = [
-            _at(seen, variances, blank, centre, _motion_about(sensor, best, centre))
+            _at(seen, blank, centre, _motion_about(sensor, best, centre))
             for centre in (np.clip(each, *sensor.field) for each in (still, follows))
         ]
         last = best.motion
@@ -327,20 +304,20 @@ def _motion_about(sensor: Sensor, found: Readings, centre: FloatArray) -> float:
     return math.sqrt(max(float((np.maximum(each, 0.0) + sd).max()), least))
 
 
-def _at(seen: _Seen, variances: FloatArray, blank: Readings, centre: FloatArray, motion: float) -> Readings:
-    """The readings about these positions, for paths of this standard deviation and kernels of these variances."""
+def _at(seen: _Seen, blank: Readings, centre: FloatArray, motion: float) -> Readings:
+    """The readings about these positions, for paths of this standard deviation."""
     sensor, shape = seen.sensor, centre.shape
     D = sensor.pixel_width
     mean, square, mean_noise, square_noise = (np.zeros(shape) for _ in range(4))
     usable = np.zeros(shape, dtype=bool)
-    made: dict[tuple[int, float], FloatArray] = {}
+    made: dict[int, FloatArray] = {}
     for o in range(shape[0]):
         for k in np.flatnonzero(blank.usable[o]):
             # Places are a hundredth of a pixel apart, so that weights are made once for many exposures.
             place = round((centre[o, k] - sensor.field[0]) / (0.01 * D))
-            if (place, variances[o]) not in made:
-                made[place, variances[o]] = _weights(sensor, variances[o], sensor.field[0] + 0.01 * D * place, motion)
-            W = made[place, variances[o]]
+            if place not in made:
+                made[place] = _weights(sensor, sensor.field[0] + 0.01 * D * place, motion)
+            W = made[place]
             off = centre[o, k] - (sensor.field[0] + 0.01 * D * place)
             here = seen.mask[o, k]
             noise = (W**2).sum(axis=1)
@@ -356,14 +333,13 @@ def _at(seen: _Seen, variances: FloatArray, blank: Readings, centre: FloatArray,
     return replace(found, motion=_motion_about(sensor, found, centre)) if usable.any() else found
 
 
-def _weights(sensor: Sensor, variance: float, centre: float, motion: float) -> FloatArray:
-    """Weights of the pixels for theta - c and (theta - c)^2, (2, pixels), with the least noise, for a kernel of this
-    variance.
+def _weights(sensor: Sensor, centre: float, motion: float) -> FloatArray:
+    """Weights of the pixels for theta - c and (theta - c)^2, (2, pixels), with the least noise.
 
     They are a ridge regression for spots at points of the range, with the largest ridge for which g is still accurate
     enough.
     """
-    edges, D = sensor.edges, sensor.pixel_width
+    edges, D, variance = sensor.edges, sensor.pixel_width, float(sensor.kernel.variance)
     read = math.sqrt(effective_noise_density(sensor) * D)
     margin = math.sqrt(variance)
     low, high = sensor.field[0] + margin - centre, sensor.field[1] - margin - centre

@@ -17,10 +17,7 @@ _COMMENT = "by `aolink identify`"
 _MOVED = "by `aolink identify`: the models of the disturbance move the plant"
 
 
-def identified_text(
-    text: str, rig: Rig, models: Sequence[ProcessSum], *, plant: IdentifiedPlant | None = None, noise: float = 1.0,
-    wider: float = 0.0,
-) -> str:  # fmt: skip
+def identified_text(text: str, rig: Rig, models: Sequence[ProcessSum], *, plant: IdentifiedPlant | None = None) -> str:
     """The text of a rig file with the identified models as the whole disturbance: the plant's own noise is zero then.
 
     Parameters
@@ -31,8 +28,6 @@ def identified_text(
         The disturbance of each output of a copy of the plant, or one for all.
     plant:
         The plant, where it was identified; its own noise then stays in ``[plant]``.
-    noise, wider:
-        Factor of the pixels' noise variance, and the kernel's variance less the file's, slope units squared.
 
     Raises
     ------
@@ -51,11 +46,6 @@ def identified_text(
         text = with_value(
             text, "plant.process_noise", np.zeros_like(written, dtype=np.float64).tolist(), comment=_MOVED
         )
-    if noise != 1:
-        text = with_value(text, "sensor.noise_density", _written(rig.sensor.noise_density * noise), comment=_COMMENT)
-    if wider:
-        sigma = math.sqrt(rig.sensor.kernel.sigma**2 + 2 * wider)
-        text = with_value(text, "sensor.kernel.sigma", _written(sigma), comment=_COMMENT)
     tables = for_outputs([[as_table(process, step) for process in model.processes] for model in models])
     text = with_tables(text, "disturbance.model", tables, _COMMENT) if tables else text
     parse_rig(text)

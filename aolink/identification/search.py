@@ -17,7 +17,7 @@ from scipy import optimize
 
 from aolink.errors import IdentificationError
 from aolink.identification.likelihood import Likelihood
-from aolink.identification.models import PARAMETERS, PLANTS, IdentifiedPlant, Process, ProcessSum, SensorFit
+from aolink.identification.models import PARAMETERS, PLANTS, IdentifiedPlant, Process, ProcessSum
 from aolink.identification.readings import Readings, by_slot
 from aolink.numerics.arrays import FloatArray
 
@@ -44,8 +44,6 @@ KEPT = 30.0
 that is lower by less (`pixels`)."""
 _RIDGE = 0.5
 _STEP = 1e-3
-_KERNEL_CHANGE = 0.05
-"""Start of ``kernel_change``, the sd of the exposures' kernel variances about their mean over the rig file's."""
 _NEVER = 1e12
 
 
@@ -54,11 +52,6 @@ class Space:
     """The parameters of a sum of processes as a vector of logarithms, and their limits."""
 
     kinds: tuple[str, ...]
-    with_noise: bool
-    """Whether a factor of the pixels' noise variance is one more parameter."""
-    with_kernel: bool
-    """Whether a factor of the kernel's variance, and its changes from exposure to exposure, are two more."""
-    kernel_variance: float
     bounds: tuple[tuple[float, float], ...]
     plant: str | None = None
     """The kind of plant that is fitted as well; its parameters come first. None: the plant is known."""
@@ -73,7 +66,7 @@ class Space:
         for k, kind in enumerate(self.kinds):
             number = "" if self.kinds.count(kind) == 1 else self.kinds[: k + 1].count(kind)
             names += [f"{kind}{number}.{name}" if several else name for name in PARAMETERS[kind]]
-        return (*names, *["noise"] * self.with_noise, *["kernel", "kernel_change"] * self.with_kernel)
+        return tuple(names)
 
     @property
     def _of_plant(self) -> tuple[str, ...]:
@@ -105,20 +98,12 @@ class Space:
             values = values[n:]
         return ProcessSum(tuple(processes))
 
-    def sensor(self, x: FloatArray) -> SensorFit:
-        """What a vector says of the sensor."""
-        own = len(self._of_plant) + sum(len(PARAMETERS[kind]) for kind in self.kinds)
-        rest = np.exp(x[own:]).tolist()
-        noise = rest.pop(0) if self.with_noise else 1.0
-        factor, change = rest if self.with_kernel else (1.0, 0.0)
-        return SensorFit(noise, (factor - 1) * self.kernel_variance, (change * self.kernel_variance) ** 2)
-
     def log_likelihood(self, x: FloatArray, of: Sequence[Likelihood], nodes: int | None = None) -> float:
         """The sum over recordings, -inf outside of the limits."""
         if any(not low <= value <= high for value, (low, high) in zip(x, self.bounds, strict=True)):
             return -math.inf
-        model, sensor = self.model(x), self.sensor(x)
-        return sum(self.driven(x, each)(model, sensor, nodes) for each in of)
+        model = self.model(x)
+        return sum(self.driven(x, each)(model, nodes) for each in of)
 
     def driven(self, x: FloatArray, of: Likelihood, draws: int = 1) -> Likelihood:
         """A recording's likelihood with the fitted plant's response to its inputs, where a plant is fitted.
@@ -140,8 +125,8 @@ class Space:
 
 
 def space_of(
-    kinds: Sequence[str], seen: Sequence[Readings], kernel_variance: float, *, with_noise: bool, with_kernel: bool,
-    lowest_hz: float | None = None, highest_hz: float | None = None, plant: str | None = None,
+    kinds: Sequence[str], seen: Sequence[Readings], *, lowest_hz: float | None = None, highest_hz: float | None = None,
+    plant: str | None = None,
 ) -> Space:  # fmt: skip
     """The parameters of a sum of processes, and of a plant, within limits that the recordings set.
 
@@ -178,11 +163,8 @@ def space_of(
         own = limits | {"gain": (1e-3 * one.reach / span, 1e3 * one.reach / span), "damping": (1e-4, 30.0)}
         bounds = [own[name] for name in PLANTS[plant]]
     bounds += [limits[name.removeprefix("second_")] for kind in kinds for name in PARAMETERS[kind]]
-    bounds += [(0.01, 100.0)] * with_noise + [(0.25, 4.0), (1e-3, 1.0)] * with_kernel
-    return Space(
-        tuple(kinds), with_noise, with_kernel, kernel_variance,
-        tuple((math.log(low), math.log(high)) for low, high in bounds), plant, _sign(seen) if plant else 1.0,
-    )  # fmt: skip
+    limited = tuple((math.log(low), math.log(high)) for low, high in bounds)
+    return Space(tuple(kinds), limited, plant, _sign(seen) if plant else 1.0)
 
 
 def _sign(seen: Sequence[Readings]) -> float:
@@ -251,8 +233,7 @@ def _distinct(space: Space, found: Sequence[Maximum], of: Sequence[Likelihood]) 
 
 def starting_points(space: Space, seen: Sequence[Readings], of: Sequence[Likelihood]) -> list[Maximum]:
     """The best points of a coarse grid, whose vibrations hardly move, for scans to begin with."""
-    of_sensor = [0.0] * space.with_noise + [0.0, math.log(_KERNEL_CHANGE)] * space.with_kernel
-    points = [np.clip([*point, *of_sensor], *np.array(space.bounds).T) for point in _grid(space, seen)]
+    points = [np.clip(point, *np.array(space.bounds).T) for point in _grid(space, seen)]
     tried = [Maximum(x, space.log_likelihood(x, of), 0) for x in points]
     best = sorted((each for each in tried if math.isfinite(each.log_likelihood)), key=lambda each: -each.log_likelihood)
     return best[: _BESIDE if space.vibrations else _STARTS]
@@ -330,8 +311,6 @@ def _grid(space: Space, seen: Sequence[Readings]) -> list[tuple[float, ...]]:
         "ornstein-uhlenbeck": [(c * exposure, 2 * variance / (c * exposure)) for c in (0.3, 3.0, 30.0)],
         "second-order": [(c * exposure, c * exposure * d, sd) for c in (0.3, 3.0, 30.0) for d in (0.1, 0.5)],
         "resonance": [(top, 0.5, sd / 10)],
-        "ar3": [(top, 0.9, c * exposure, sd) for c in (0.1, 2.0)],
-        "ar4": [(top, 0.9, top, 0.8, sd)],
     }
     parts = [points[kind] for kind in space.kinds]
     if space.plant is not None:

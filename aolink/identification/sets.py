@@ -144,12 +144,12 @@ def _allowed(space: Space, top: Maximum, other: Maximum, seen: Sequence[Readings
 def _drawn(space: Space, x: FloatArray, seen: Readings, seed: int) -> Likelihood:
     """The likelihood of `_DRAWS` recordings like ``seen`` that a model makes."""
     own = replace(seen, response=space.response(x, seen))
-    return Likelihood(simulated(own, space.model(x), _DRAWS, seed, space.sensor(x)), SHORT_RUN)
+    return Likelihood(simulated(own, space.model(x), _DRAWS, seed), SHORT_RUN)
 
 
 def _of_draws(space: Space, x: FloatArray, drawn: Likelihood, nodes: int) -> FloatArray:
     """Log-likelihood of a model in each of these recordings, (draws,)."""
-    values = space.driven(x, drawn, _DRAWS).of_outputs(space.model(x), space.sensor(x), nodes)
+    values = space.driven(x, drawn, _DRAWS).of_outputs(space.model(x), nodes)
     return np.asarray(values.reshape(_DRAWS, -1).sum(axis=1))
 
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from aolink.identification.models import AS_IN_FILE, ProcessSum, SensorFit
+from aolink.identification.models import ProcessSum
 from aolink.identification.readings import Readings, before
 from aolink.numerics.arrays import FloatArray
 from aolink.numerics.covariance import psd_root
@@ -16,11 +16,8 @@ _POINTS_PER_CYCLE = 12
 _FEWEST_POINTS = 24
 
 
-def simulated(seen: Readings, model: ProcessSum, count: int, seed: int, sensor: SensorFit = AS_IN_FILE) -> Readings:
-    """Readings like ``seen`` with other disturbances and noise: ``count`` draws of each output, draw by draw.
-
-    They are of the fitted sensor, and state the noise and the kernel of the rig file as ``seen`` does.
-    """
+def simulated(seen: Readings, model: ProcessSum, count: int, seed: int) -> Readings:
+    """Readings like ``seen`` with other disturbances and noise: ``count`` draws of each output, draw by draw."""
     random = np.random.default_rng(seed)
     outputs = len(seen.mean)
     points = _points(seen, model)
@@ -29,15 +26,14 @@ def simulated(seen: Readings, model: ProcessSum, count: int, seed: int, sensor: 
     paths = _paths(seen, model, count * outputs, points, random) + np.tile(response, (count, 1, 1))
     mean_noise, square_noise = (np.tile(each, (count, 1)) for each in (seen.mean_noise, seen.square_noise))
     usable = np.tile(seen.usable, (count, 1))
-    mean = paths.mean(axis=2) + np.sqrt(sensor.noise * mean_noise) * random.standard_normal(mean_noise.shape)
+    mean = paths.mean(axis=2) + np.sqrt(mean_noise) * random.standard_normal(mean_noise.shape)
     expected = np.tile(response.mean(axis=2), (count, 1))
     if seen.follows:
         centre = expected + before(mean - expected, usable)
     else:
         centre = expected + np.tile((seen.centre - response.mean(axis=2)).mean(axis=1), count)[:, None]
     square = ((paths - centre[:, :, None]) ** 2).mean(axis=2)
-    read = sensor.noise * square_noise + sensor.changes
-    square += sensor.wider + np.sqrt(read) * random.standard_normal(square.shape)
+    square += np.sqrt(square_noise) * random.standard_normal(square.shape)
     return replace(
         seen, mean=mean - centre, square=square, mean_noise=mean_noise, square_noise=square_noise, centre=centre,
         usable=usable, response=np.tile(seen.response, (count, 1, 1)), inputs=np.tile(seen.inputs, (count, 1, 1)),

@@ -35,10 +35,6 @@ class Wanted:
     """Sums of kinds to choose from; a single one is taken without a choice."""
     plant: str | None = None
     """Kind of the plant, where it is fitted as well."""
-    noise: bool = False
-    """Whether the pixels' noise is fitted as well."""
-    kernel: bool = False
-    """Whether the kernel's width, and its changes from exposure to exposure, are fitted as well."""
     lowest_hz: float | None = None
     highest_hz: float | None = None
     pixels: bool = True
@@ -53,8 +49,6 @@ class IdentifiedModel:
     model: ProcessSum
     """The disturbance, without the noise of a plant that was fitted."""
     plant: identification.IdentifiedPlant | None
-    noise: float
-    wider: float
     parameters: tuple[identification.Identified, ...]
     tried: tuple[Tried, ...]
     """The models that were tried; empty where one model was asked for."""
@@ -100,7 +94,7 @@ def identify(recordings: Sequence[Recording], rig: Rig | None, wanted: Wanted, t
                 f"{recording.path} is of another rig than {recordings[0].path}: timing and outputs must be the same"
             )
         exposures = list(recording.exposures())
-        seen.append(readings(own, exposures, plant_known=plant_known, kernel_known=not wanted.kernel))
+        seen.append(readings(own, exposures, plant_known=plant_known))
         longest = max(longest, exposures, key=len)
         if tell:
             tell("recordings", number + 1, len(recordings))
@@ -118,19 +112,15 @@ def from_readings(
     """
     _check_plant(rig, wanted)
     found = [_of_output(rig, label, each, exposures, wanted, tell, maxima) for label, each in _by_output(rig, seen)]
-    one = found[0]
-    text = identification.identified_text(
-        rig.toml, rig, [each.model for each in found], plant=one.plant, noise=one.noise, wider=one.wider
-    )
+    text = identification.identified_text(rig.toml, rig, [each.model for each in found], plant=found[0].plant)
     return Result(found=tuple(found), text=text)
 
 
-def space_wanted(rig: Rig, kinds: Sequence[str], seen: Sequence[Readings], wanted: Wanted) -> Space:
+def space_wanted(kinds: Sequence[str], seen: Sequence[Readings], wanted: Wanted) -> Space:
     """The parameters of a sum of kinds, and of all else that is wanted."""
     return identification.space_of(
-        kinds, seen, rig.sensor.kernel.variance, with_noise=wanted.noise, with_kernel=wanted.kernel,
-        lowest_hz=wanted.lowest_hz, highest_hz=wanted.highest_hz, plant=wanted.plant,
-    )  # fmt: skip
+        kinds, seen, lowest_hz=wanted.lowest_hz, highest_hz=wanted.highest_hz, plant=wanted.plant
+    )
 
 
 def _check_plant(rig: Rig, wanted: Wanted) -> None:
@@ -166,7 +156,7 @@ def _of_output(
     known: Sequence[Maximum],
 ) -> IdentifiedModel:  # fmt: skip
     def space(kinds: Sequence[str]) -> Space:
-        return space_wanted(rig, kinds, seen, wanted)
+        return space_wanted(kinds, seen, wanted)
 
     scored: list[Tried] = []
     if len(wanted.models) > 1:
@@ -208,12 +198,7 @@ def _of_output(
         for k, (each, value) in enumerate(zip(sets, np.exp(x).tolist(), strict=True))
     )
     plant = of.fitted_plant(x)
-    sensor = of.sensor(x)
     notes = _ruled_out(of, everything, tops)
-    if of.with_kernel and not sets[-1].pieces[0].open_low:
-        notes.append(
-            "kernel_change is not in the rig file: estimators take one kernel for all exposures, so less noise"
-        )
     notes += [each.contradiction for each in sets if not each.pieces]
     for each in sets:
         if each.name.endswith("frequency_hz") and len(each.pieces) > 1:
@@ -222,7 +207,7 @@ def _of_output(
                 f"{each.name}: {rest} Hz explains the exposures nearly as well: the frames are too slow to tell"
             )
     return IdentifiedModel(
-        output=output, model=_without_plant(of, x), plant=plant, noise=sensor.noise, wider=sensor.wider,
+        output=output, model=_without_plant(of, x), plant=plant,
         parameters=sets, tried=tuple(scored), log_likelihood=tops[0].log_likelihood,
         exposures=sum(int(each.usable.any(axis=0).sum()) for each in seen), notes=tuple(notes),
     )  # fmt: skip
@@ -236,10 +221,8 @@ def _without_plant(of: Space, x: FloatArray) -> ProcessSum:
 
 def _with_model(rig: Rig, of: Space, x: FloatArray) -> Rig:
     """The rig with the model of a vector of parameters, for a plant of one output."""
-    sensor = of.sensor(x)
     models, plant = [_without_plant(of, x)], of.fitted_plant(x)
-    text = identification.identified_text(rig.toml, rig, models, plant=plant, noise=sensor.noise, wider=sensor.wider)
-    return parse_rig(text)
+    return parse_rig(identification.identified_text(rig.toml, rig, models, plant=plant))
 
 
 def _ruled_out(of: Space, found: Sequence[Maximum], left: Sequence[Maximum]) -> list[str]:

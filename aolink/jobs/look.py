@@ -413,7 +413,7 @@ def _best_model(
     count = 2 * sum(int(each.usable.sum()) for each in seen)
     for number, name in enumerate(names):
         tell("models", number, len(names))
-        space = space_wanted(rig, kinds_of(name), seen, wanted)
+        space = space_wanted(kinds_of(name), seen, wanted)
         try:
             found = maxima(space, seen)
         except IdentificationError:

@@ -7,7 +7,6 @@ from scipy import stats
 import aolink
 from aolink.identification import Process, ProcessSum, readings
 from aolink.identification.likelihood import Likelihood
-from aolink.identification.models import SensorFit
 from aolink.identification.simulate import simulated
 
 MODEL = ProcessSum((Process("resonance", (12.0, 0.02, 0.2)), Process("ornstein-uhlenbeck", (0.5, 0.02))))
@@ -57,19 +56,6 @@ def test_no_other_model_is_likelier_on_average_than_the_one_that_drew_the_readin
         gain = drawn.of_outputs(truth) - drawn.of_outputs(ProcessSum((Process("resonance", values),)))
         assert gain.mean() > -0.3
         assert np.exp(np.minimum(-gain, 20)).mean() < 3
-
-
-def test_no_other_sensor_is_likelier_on_average_than_the_one_that_drew_the_readings(seen):
-    """Three times the noise, a wider kernel, and one whose width changes from exposure to exposure."""
-    square_sd = float(np.sqrt(seen.square_noise.mean()))
-    true = SensorFit(3.0, 2 * square_sd, (4 * square_sd) ** 2)
-    quiet = ProcessSum((Process("resonance", (12.0, 0.02, 0.03)),))
-    drawn = Likelihood(simulated(seen, quiet, 60, 1, true), 8)
-    assert drawn.seen.square_noise.mean() == pytest.approx(square_sd**2)
-    for other in ({"noise": 1.0}, {"noise": 9.0}, {"wider": 0.0}, {"changes": 0.0}, {"changes": 4 * true.changes}):
-        gain = drawn.of_outputs(quiet, true) - drawn.of_outputs(quiet, true._replace(**other))
-        assert gain.mean() > 1, other
-        assert np.exp(np.minimum(-gain, 20)).mean() < 2, other
 
 
 def test_an_exposure_that_is_missing_says_nothing(seen):

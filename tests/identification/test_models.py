@@ -14,8 +14,6 @@ STATIONARY = [
     Process("second-order", (0.05, 0.008, 0.3)),
     Process("second-order", (0.02, 0.02, 0.3)),
     Process("resonance", (12.0, 0.005, 0.2)),
-    Process("ar3", (12.0, 0.1, 0.02, 0.2)),
-    Process("ar4", (5.0, 0.05, 17.0, 0.02, 0.2)),
 ]
 
 

@@ -46,7 +46,7 @@ def frames(cycles, count):
 def space(exposures):
     rig = load_rig("loop")
     seen = [readings(rig, exposures)]
-    return space_of(KINDS, seen, rig.sensor.kernel.variance, with_noise=False, with_kernel=False), seen
+    return space_of(KINDS, seen), seen
 
 
 def candidate(cycles, log_likelihood, damping=0.002):
@@ -119,8 +119,7 @@ def test_nothing_is_scanned_where_one_vibration_is_alone_or_there_are_no_pixels(
     of, seen = space(exposures)
     assert nothing(scanned(of, [highest], seen, unasked, []))
     assert nothing(scanned(of, [highest], seen, refused, exposures))
-    variance = load_rig("loop").sensor.kernel.variance
-    alone = space_of(("resonance",), seen, variance, with_noise=False, with_kernel=False)
+    alone = space_of(("resonance",), seen)
     assert nothing(scanned(alone, [Maximum(highest.x[2:], 0.0, 12)], seen, unasked, exposures))
 
 

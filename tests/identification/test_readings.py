@@ -14,39 +14,6 @@ from aolink.identification.likelihood import Likelihood
 from tests.kinds import truth_of
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
-from paper_report.spot_films import random_walk, spot_film
-
-TWO_SPOTS = """
-name = "two spots that walk, in pixels"
-[plant]
-axes = 4
-A = [[1.0]]
-B = [[0.0]]
-B_w = [[1.0]]
-C = [[1.0]]
-process_noise = [[0.16]]
-initial_covariance = [[4.0]]
-[timing]
-fast_step_s = 0.01
-exposure_steps = 1
-[sensor]
-kind = "spots"
-grid = [1, 2]
-window = [48, 48]
-field = [-24.0, 24.0]
-noise_density = 1e-6
-black_level = 1000
-counts_per_density = 20000
-[sensor.kernel]
-shape = "gaussian"
-sd = 1.8
-[mirror]
-input_min = -1.0
-input_max = 1.0
-dac_bits = 0
-block_steps = 1
-queue_steps = 16
-"""
 
 
 @pytest.mark.parametrize("name", ["jitter", "section-vi-lively", "tip-tilt"])
@@ -130,24 +97,3 @@ def test_an_exposure_of_one_step_is_an_integral():
     tried = np.array([0.55, 0.67, 0.8, 1.0, 1.2])
     models = [ProcessSum((Process("random-walk", (each / rig.timing.fast_step_s,)),)) for each in tried]
     assert tried[np.argmax([likelihood(model) for model in models])] == 1.0
-
-
-@pytest.mark.rare
-def test_copies_of_a_plant_may_have_kernels_of_their_own():
-    """One of two spots is narrower and one wider than the rig file's kernel: both are read alike only where the kernel
-    is not taken as known."""
-    random, middle = np.random.default_rng(1), np.array([[23.5, 23.5]])
-    motion = random_walk(random, 40, 1, 0.4)
-    motion -= motion.mean(axis=(0, 1))
-    films = [spot_film(random, motion, middle, (48, 48), sd=sd).frames for sd in (1.6, 2.0)]
-    rig = aolink.rig.parse_rig(TWO_SPOTS)
-    exposures = list(aolink.exposures(np.concatenate(films, axis=2), rig))
-
-    def wider(kernel_known):
-        seen = readings(rig, exposures, kernel_known=kernel_known)
-        width = (seen.square - seen.mean**2).mean(axis=1) / rig.sensor.pixel_width**2
-        return width[2:].mean() - width[:2].mean()
-
-    apart = 2.0**2 - 1.6**2
-    assert wider(True) > 0.5 * apart
-    assert abs(wider(False)) < 0.2 * apart

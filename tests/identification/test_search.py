@@ -31,7 +31,7 @@ def test_a_sharp_vibration_beside_a_drift_is_found_although_only_an_alias_is_fou
     disturbed = played(rig, np.concatenate([before, after]), tmp_path / "rig.toml")
     seen = [readings(rig, list(aolink.simulate(disturbed, 180, seed=30_001))[84:])]
     kinds = ("ornstein-uhlenbeck", "resonance")
-    space = space_of(kinds, seen, rig.sensor.kernel.variance, with_noise=False, with_kernel=False)
+    space = space_of(kinds, seen)
     found = maxima(space, seen)
     highest = dict(zip(space.names, np.exp(found[0].x), strict=True))
     assert highest["resonance.frequency_hz"] == pytest.approx(14.4, rel=0.01)
@@ -53,7 +53,7 @@ def test_a_sharp_vibration_in_turbulence_is_among_the_maxima(cycles, seed, tmp_p
     rig = load_rig(tmp_path / "rig.toml")
     seen = [readings(rig, [each.exposure for each in closed_loop(rig, "", "", past, seed=10_000 + seed)])]
     kinds = ("ornstein-uhlenbeck", "resonance")
-    space = space_of(kinds, seen, rig.sensor.kernel.variance, with_noise=False, with_kernel=False)
+    space = space_of(kinds, seen)
     lines = [np.exp(each.x[space.names.index("resonance.frequency_hz")]) * 0.05 for each in maxima(space, seen)]
     assert min(abs(each - cycles) for each in lines) < 0.03
 
@@ -61,8 +61,7 @@ def test_a_sharp_vibration_in_turbulence_is_among_the_maxima(cycles, seed, tmp_p
 def test_a_climb_with_fixed_parameters_moves_the_others_to_their_maximum():
     exposures = aolink.simulate("jitter", 32, seed=2)
     seen = [readings(exposures.rig, list(exposures))]
-    variance = exposures.rig.sensor.kernel.variance
-    space = space_of(("resonance",), seen, variance, with_noise=False, with_kernel=False)
+    space = space_of(("resonance",), seen)
     of = [Likelihood(each, 16) for each in seen]
     start = np.log([8.0, 0.01, 0.05])
     free, top = climb(space, start, of), climb(space, start, of, fixed=(0, 1))

@@ -1,7 +1,5 @@
 """Sets of a recording that shows an alias; the choice of a model; what a recording without input says."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -13,8 +11,6 @@ from aolink.errors import IdentificationError
 from aolink.identification import (
     Identified,
     Piece,
-    Process,
-    ProcessSum,
     chosen,
     identified,
     maxima,
@@ -22,29 +18,22 @@ from aolink.identification import (
     space_of,
     tried,
 )
-from aolink.identification.models import SensorFit
-from aolink.identification.simulate import simulated
 from aolink.recording.reader import Recording
 from aolink.session import record
 from aolink.session.excitation import excitation
 from tests.commands import simulated_rig
 
 
-def space(kinds, seen, rig, **more):
-    return space_of(kinds, seen, rig.sensor.kernel.variance, with_noise=False, with_kernel=False, **more)
-
-
 @pytest.fixture(scope="module")
-def shaken():
+def seen():
     exposures = aolink.simulate("jitter", 48, seed=2)
-    return exposures.rig, [readings(exposures.rig, list(exposures))]
+    return [readings(exposures.rig, list(exposures))]
 
 
 @pytest.mark.rare
-def test_the_sets_hold_the_truth_and_the_aliases_that_remain(shaken):
+def test_the_sets_hold_the_truth_and_the_aliases_that_remain(seen):
     """The spot swings at 12 Hz; to centroids at 5 Hz, 2, 3, 7, 8 and 13 Hz look the same."""
-    rig, seen = shaken
-    of = space(["resonance"], seen, rig)
+    of = space_of(["resonance"], seen)
     sets = dict(zip(of.names, identified(of, maxima(of, seen), seen), strict=True))
     assert sets["frequency_hz"].holds(12.0)
     assert not any(sets["frequency_hz"].holds(alias) for alias in (2.0, 3.0, 7.0, 8.0))
@@ -53,35 +42,14 @@ def test_the_sets_hold_the_truth_and_the_aliases_that_remain(shaken):
 
 
 @pytest.mark.rare
-def test_a_resonance_is_chosen_where_there_is_one(shaken):
-    rig, seen = shaken
+def test_a_resonance_is_chosen_where_there_is_one(seen):
     names = ("random-walk", "ornstein-uhlenbeck", "resonance")
-    assert chosen([tried(name, lambda kinds: space(kinds, seen, rig), seen) for name in names]).name == "resonance"
+    assert chosen([tried(name, lambda kinds: space_of(kinds, seen), seen) for name in names]).name == "resonance"
 
 
-@pytest.mark.rare
-def test_the_sets_hold_a_noise_and_a_kernel_that_differ_from_the_rig_files(shaken):
-    """The kernel is wider, and changes from exposure to exposure: noise of the blur's extent, not of the centroid."""
-    _, (like,) = shaken
-    intensity, change = 0.04, 0.5
-    motion = intensity * like.n_steps * like.step_s
-    variance = motion / 2
-    seen = replace(like, square_noise=np.full_like(like.square, (0.1 * motion) ** 2))
-    sensor = SensorFit(2.0, 0.3 * variance, (change * variance) ** 2)
-    held = []
-    for seed in range(3):
-        drawn = [simulated(seen, ProcessSum((Process("random-walk", (intensity,)),)), 4, seed, sensor)]
-        of = space_of(["random-walk"], drawn, variance, with_noise=True, with_kernel=True)
-        sets = identified(of, maxima(of, drawn), drawn)
-        assert [each.name for each in sets] == ["intensity", "noise", "kernel", "kernel_change"]
-        held += [each.holds(true) for each, true in zip(sets, (intensity, 2.0, 1.3, change), strict=True)]
-    assert sum(held) >= 10
-
-
-def test_without_input_there_is_no_plant_to_identify(shaken):
-    rig, seen = shaken
+def test_without_input_there_is_no_plant_to_identify(seen):
     with pytest.raises(IdentificationError, match="no input to identify a plant from"):
-        space([], seen, rig, plant="second-order")
+        space_of([], seen, plant="second-order")
 
 
 SLOW = """
@@ -117,7 +85,7 @@ period_s = 1.5
 def test_a_plant_that_is_driven_is_identified():
     rig = aolink.rig.parse_rig(SLOW)
     seen = [readings(rig, list(aolink.simulate(rig, 48, seed=2)), plant_known=False)]
-    of = space([], seen, rig, plant="first-order")
+    of = space_of([], seen, plant="first-order")
     best = of.fitted_plant(maxima(of, seen)[0].x)
     assert best["gain"] == pytest.approx(0.8, rel=0.05)
     assert best["correlation_s"] == pytest.approx(-1e-3 / np.log(0.995), rel=0.05)
@@ -131,7 +99,7 @@ def test_a_plant_is_identified_from_a_session_that_plays_a_pseudo_random_sequenc
     with simulated_rig(tmp_path / "slow.toml") as ports:
         record(rig, *ports, path, exposures=48, inputs=excitation(["prbs:amplitude=0.5,to=2,seed=3"], rig))
     seen = [readings(rig, list(Recording(path).exposures()), plant_known=False)]
-    of = space([], seen, rig, plant="first-order")
+    of = space_of([], seen, plant="first-order")
     best = of.fitted_plant(maxima(of, seen)[0].x)
     assert best["gain"] == pytest.approx(0.8, rel=0.05)
     assert best["correlation_s"] == pytest.approx(-1e-3 / np.log(0.995), rel=0.05)

@@ -43,21 +43,6 @@ def test_the_pixels_do_not_rule_out_a_vibration_whose_amplitude_goes_with_its_da
     assert sd.best == pytest.approx(0.2, rel=0.25)
 
 
-@pytest.mark.slow
-def test_changes_of_the_kernel_are_fitted_but_have_no_place_in_the_rig_file():
-    rig = load_rig("jitter")
-    exposures = list(aolink.simulate(rig, 24, seed=1))
-    wanted = Wanted(models=("random-walk",), noise=True, kernel=True)
-    result = from_readings(rig, [readings(rig, exposures, kernel_known=False)], exposures, wanted)
-    (found,) = result.found
-    assert [each.name for each in found.parameters] == ["intensity", "noise", "kernel", "kernel_change"]
-    spread = found.parameters[-1]
-    assert any("kernel_change" in note for note in found.notes) is not spread.pieces[0].open_low
-    written = parse_rig(result.text).sensor
-    assert written.noise_density == pytest.approx(rig.sensor.noise_density * found.noise, rel=1e-4)
-    assert written.kernel.variance == pytest.approx(rig.sensor.kernel.variance + found.wider, rel=1e-4)
-
-
 def test_a_plant_that_cannot_be_identified_is_refused_before_any_work():
     recording = Recording(Path(__file__).parents[2] / "recordings" / "tip-tilt.mcap")
     with pytest.raises(IdentificationError, match="this rig's has 2 inputs and 2 outputs"):

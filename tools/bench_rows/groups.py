@@ -30,7 +30,7 @@ ROWS = {
     "loop_worth": (
         "worth_headline", "worth_past", "worth_vibrations", "worth_resonance", "worth_air", "worth_factors",
     ),
-    "identification": ("coverage", "coverage_with_pixels", "spheres"),
+    "identification": ("coverage", "coverage_with_pixels"),
 }  # fmt: skip
 """Functions that measure, by the module of bench_rows that they are in, in the order of the table."""
 

@@ -256,7 +256,7 @@ def _of_seed(cell: Cell, seed: int, size: Size) -> tuple[dict[str, float], Proce
 def _identified(cell: Cell, rig: Rig, exposures: list[Exposure]) -> ProcessSum:
     """The model that `aolink identify --model` finds from blurred frames alone, without its intervals."""
     seen = [readings(rig, exposures)]
-    space = identification.space_of(cell.kinds, seen, rig.sensor.kernel.variance, with_noise=False, with_kernel=False)
+    space = identification.space_of(cell.kinds, seen)
 
     def rig_of(x: FloatArray) -> Rig:
         return cell.rig(space.model(x))
