@@ -51,7 +51,7 @@ class GaussianMixture(NamedTuple):
     @property
     def likeliest(self) -> FloatArray:
         """Mean of the heaviest component, (axes, n)."""
-        return self.mean[np.arange(len(self.mean)), np.argmax(self.log_weight, axis=1)]
+        return np.asarray(self.mean[np.arange(len(self.mean)), np.argmax(self.log_weight, axis=1)])
 
     def mapped(self, rows: FloatArray, remainder: FloatArray) -> GaussianMixture:
         """The mixture of M t + e: M is ``rows`` (m, n), e independent of t with covariance ``remainder`` (m, m)."""

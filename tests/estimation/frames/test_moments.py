@@ -66,7 +66,7 @@ def test_raw_moments_are_sums_over_pixels_on_any_field():
 
 
 def test_noise_covariance_is_the_papers():
-    R = measure_moments(SENSOR, frames(SENSOR, np.zeros((1, 200)), seed=1)).covariance[0]
+    R = measure_moments(SENSOR, frames(SENSOR, np.zeros((1, 200)), seed=1), (1, 2)).covariance[0]
     V = effective_noise_density(SENSOR)
     np.testing.assert_allclose(R, [[2 / 3 * V, 0], [0, 2 / 5 * V]], atol=1e-12 * V)
 

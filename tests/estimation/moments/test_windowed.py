@@ -70,7 +70,7 @@ def spread_prior(axes=2):
 @pytest.mark.slow
 def test_regression_is_that_of_samples():
     model, prior = spread_prior()
-    observation = PlainMoments(SENSOR, (0, 1, 2, 3))
+    observation = PlainMoments(SENSOR)
     nodes = quadrature_paths(
         model, model.response(np.zeros((model.n_steps, model.plant.axes))), equal_parts(model.n_steps, 100)
     )
