@@ -1,8 +1,6 @@
 """The readings of simulated frames against the paths that made them."""
 
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,8 +10,6 @@ from aolink.errors import IdentificationError
 from aolink.identification import Process, ProcessSum, readings
 from aolink.identification.likelihood import Likelihood
 from tests.kinds import truth_of
-
-sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
 
 
 @pytest.mark.parametrize("name", ["jitter", "section-vi-lively", "tip-tilt"])

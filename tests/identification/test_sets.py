@@ -10,6 +10,7 @@ from aolink.cli.tables.identification import set_text
 from aolink.errors import IdentificationError
 from aolink.identification import (
     Identified,
+    IdentifiedPlant,
     Piece,
     chosen,
     identified,
@@ -22,6 +23,7 @@ from aolink.recording.reader import Recording
 from aolink.session import record
 from aolink.session.excitation import excitation
 from tests.commands import simulated_rig
+from tests.kinds import must_be
 
 
 @pytest.fixture(scope="module")
@@ -86,7 +88,7 @@ def test_a_plant_that_is_driven_is_identified():
     rig = aolink.rig.parse_rig(SLOW)
     seen = [readings(rig, list(aolink.simulate(rig, 48, seed=2)), plant_known=False)]
     of = space_of([], seen, plant="first-order")
-    best = of.fitted_plant(maxima(of, seen)[0].x)
+    best = must_be(IdentifiedPlant, of.fitted_plant(maxima(of, seen)[0].x))
     assert best["gain"] == pytest.approx(0.8, rel=0.05)
     assert best["correlation_s"] == pytest.approx(-1e-3 / np.log(0.995), rel=0.05)
     assert best["sd"] == pytest.approx(np.sqrt(1e-6 / (1 - 0.995**2)), rel=0.5)
@@ -100,7 +102,7 @@ def test_a_plant_is_identified_from_a_session_that_plays_a_pseudo_random_sequenc
         record(rig, *ports, path, exposures=48, inputs=excitation(["prbs:amplitude=0.5,to=2,seed=3"], rig))
     seen = [readings(rig, list(Recording(path).exposures()), plant_known=False)]
     of = space_of([], seen, plant="first-order")
-    best = of.fitted_plant(maxima(of, seen)[0].x)
+    best = must_be(IdentifiedPlant, of.fitted_plant(maxima(of, seen)[0].x))
     assert best["gain"] == pytest.approx(0.8, rel=0.05)
     assert best["correlation_s"] == pytest.approx(-1e-3 / np.log(0.995), rel=0.05)
 
