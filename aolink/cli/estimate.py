@@ -138,12 +138,11 @@ def _estimate_one(
 ) -> None:  # fmt: skip
     from aolink.cli.tables import scores as tables
     from aolink.estimation.registry import DEFAULT_ESTIMATOR
-    from aolink.recording import topics
     from aolink.recording.reader import Recording
     from aolink.recording.reestimate import (
         check_has_exposures,
         kept_estimators,
-        scored_and_compared,
+        scored_anew,
         write_reestimated,
     )
 
@@ -154,24 +153,17 @@ def _estimate_one(
         common.get_ready(recording.rig, names)
         with progress("estimate", recording.n_frames) as tell:
             if output is not None:
-                scores, differences = write_reestimated(
-                    recording, names, output, overwrite=overwrite, progress=tell,
-                )  # fmt: skip
+                scores = write_reestimated(recording, names, output, overwrite=overwrite, progress=tell)
             else:
-                scores, differences = scored_and_compared(recording, names, tell)
+                scores = scored_anew(recording, names, tell)
     except (ArithmeticError, ValueError) as error:
         if recording.rig_is_recorded:
             raise
         raise EstimatorError(f"{file} cannot be estimated with this rig: {error!r}; check its numbers") from None
     if as_json:
-        print(json.dumps({**tables.scores_as_json(scores), "differs_from_recorded": differences}, allow_nan=False))
+        print(json.dumps(tables.scores_as_json(scores), allow_nan=False))
     else:
         stdout.print(tables.scores(scores))
-        begun_late = "cut" in recording.metadata or recording.metadata.get(topics.PART, "1") != "1"
-        why = " (the recording begins in the middle of its session, where estimators begin anew)" if begun_late else ""
-        for name, difference in differences.items():
-            text = difference + why if difference else "the same as recorded, bit for bit"
-            stdout.print(f"{name}: {text}", markup=False)
         if output is not None:
             there = ", ".join(kept_estimators(recording, names))
             beside = f", beside the estimates of {there} that were there" if there else ""

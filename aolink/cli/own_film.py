@@ -97,7 +97,7 @@ def look(
         import_film(looked.cut, rig, looked.settings, imported, sources=[source])
         with progress("estimate", len(looked.spots.light)) as tell:
             if looked.moves:
-                scores, _ = write_reestimated(
+                scores = write_reestimated(
                     Recording(imported), [ESTIMATOR], recording, overwrite=overwrite, progress=tell
                 )  # fmt: skip
                 looked = heeding(looked, scores[ESTIMATOR])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from importlib.metadata import version
 from itertools import tee
 from pathlib import Path
@@ -109,62 +109,19 @@ def scored(recording: Recording, names: Sequence[str]) -> dict[str, Score]:
     return {name: scorer.result() for name, scorer in scorers.items()}
 
 
-class Outcome:
-    """Scores of new estimates of a recording by name, and where they first differ from those in it.
-
-    With another rig than the recording's own there are no estimates to compare with.
-    """
-
-    def __init__(self, recording: Recording, names: Sequence[str]) -> None:
-        made_before = recording.estimators if recording.rig_is_recorded else []
-        self.recorded = [name for name in names if name in made_before]
-        """The estimators whose recorded estimates are needed."""
-        self._scorers = {name: Scorer() for name in names}
-        self._skipped = dict.fromkeys(names, 0)
-        self._differences: dict[str, str | None] = dict.fromkeys(self.recorded)
-
-    def add(self, step: Step, made: Iterable[Estimate]) -> None:
-        """Take an exposure with its recorded estimates, and its new ones."""
+def scored_anew(recording: Recording, names: Sequence[str], progress: Progress = no_progress) -> dict[str, Score]:
+    """Run estimators over a recording, in one pass; gives their scores against its truth, by name."""
+    scorers = {name: Scorer() for name in names}
+    for number, (step, made) in enumerate(steps_estimated(recording, names), 1):
         for estimate in made:
-            name = estimate.estimator
-            self._scorers[name].add(step.exposure, estimate)
-            self._skipped[name] += name in step.skipped
-            if name in self._differences and self._differences[name] is None and name not in step.skipped:
-                theirs = step.estimates.get(name)
-                self._differences[name] = (
-                    first_difference([theirs], [estimate])
-                    if theirs
-                    else f"frame {estimate.frame_id}: was not estimated"
-                )
-
-    def result(self) -> tuple[dict[str, Score], dict[str, str | None]]:
-        """The scores, and in words the differences of the names that the recording has, None where there is none."""
-        for name, skipped in self._skipped.items():
-            if skipped and name in self._differences:
-                self._differences[name] = (
-                    f"the session had no time for {skipped} exposures, all are estimated here;"
-                    " `aolink compare` makes the others again as they were"
-                )
-        return {name: scorer.result() for name, scorer in self._scorers.items()}, self._differences
-
-
-def scored_and_compared(
-    recording: Recording, names: Sequence[str], progress: Progress = no_progress
-) -> tuple[dict[str, Score], dict[str, str | None]]:
-    """Run estimators over a recording, in one pass: the result of `Outcome`."""
-    outcome = Outcome(recording, names)
-    for number, (step, made) in enumerate(steps_estimated(recording, names, outcome.recorded), 1):
-        outcome.add(step, made)
+            scorers[estimate.estimator].add(step.exposure, estimate)
         progress(number)
-    return outcome.result()
+    return {name: scorer.result() for name, scorer in scorers.items()}
 
 
-def steps_estimated(
-    recording: Recording, names: Sequence[str], recorded: Sequence[str] = ()
-) -> Iterator[tuple[Step, list[Estimate]]]:
-    """The steps of a recording, with the estimates by ``recorded`` that it has, each with new estimates by ``names``; a
-    batch of exposures at a time is in memory."""
-    steps, ahead = tee(recording.steps(recorded))
+def steps_estimated(recording: Recording, names: Sequence[str]) -> Iterator[tuple[Step, list[Estimate]]]:
+    """The steps of a recording, each with new estimates by ``names``; a batch of exposures at a time is in memory."""
+    steps, ahead = tee(recording.steps())
     made = Driver(recording.rig, names).steps(step.exposure for step in ahead)
     yield from zip(steps, (estimates for _, estimates in made), strict=True)
 
@@ -182,8 +139,8 @@ def check_has_exposures(recording: Recording) -> None:
 def write_reestimated(
     recording: Recording, names: Sequence[str], path: str | Path, *, overwrite: bool = False,
     progress: Progress = no_progress,
-) -> tuple[dict[str, Score], dict[str, str | None]]:  # fmt: skip
-    """Copy a recording with new estimates; gives what `scored_and_compared` gives, from the same pass.
+) -> dict[str, Score]:  # fmt: skip
+    """Copy a recording with new estimates; gives what `scored_anew` gives, from the same pass.
 
     Estimates by other names, and pictures restored with them, stay in the copy; those that were made with another rig
     than ``recording.rig`` could not be read in it and are left out. Messages of other software are
@@ -202,13 +159,13 @@ def write_reestimated(
             "estimated_from": recording.path.name,
             "recorded_with": recording.metadata.get("aolink_version", "unknown"),
         }
-        outcome = Outcome(recording, names)
+        scorers = {name: Scorer() for name in names}
         with RecordingCopy(recording, partial, notes) as copy:
-            for some in _with_estimates(recording, Driver(recording.rig, names), kept, outcome):
+            for some in _with_estimates(recording, Driver(recording.rig, names), kept, scorers):
                 copy.add(some)
                 progress(copy.exposures)
             copy.finish(recording.losses)
-        return outcome.result()
+        return {name: scorer.result() for name, scorer in scorers.items()}
 
 
 def kept_estimators(recording: Recording, names: Sequence[str]) -> list[str]:
@@ -219,11 +176,11 @@ def kept_estimators(recording: Recording, names: Sequence[str]) -> list[str]:
 
 
 def _with_estimates(
-    recording: Recording, driver: Driver, kept: Sequence[str], outcome: Outcome
+    recording: Recording, driver: Driver, kept: Sequence[str], scorers: Mapping[str, Scorer]
 ) -> Iterator[RawMessage]:
     """The messages of a recording with new estimates after their exposures, and the old estimates, skipped exposures
     and restored pictures of the estimators ``kept``."""
-    walk = Walk(recording.rig, outcome.recorded, recording.counts, lambda: recording.model)
+    walk = Walk(recording.rig, (), recording.counts, lambda: recording.model)
     waiting: list[tuple[RawMessage | None, list[Exposure]]] = []
     steps, estimates = deque[Step](), deque[list[Estimate]]()
     exposures = size = now = 0
@@ -241,7 +198,9 @@ def _with_estimates(
 
     def score() -> None:
         while steps and estimates:
-            outcome.add(steps.popleft(), estimates.popleft())
+            exposure = steps.popleft().exposure
+            for estimate in estimates.popleft():
+                scorers[estimate.estimator].add(exposure, estimate)
 
     for raw in recording.raw_messages():
         message = recording.decoded_run(raw) or recording.decoded(raw)

@@ -16,7 +16,7 @@ import pytest
 from aolink.batch import COLUMNS, Model, estimate_file
 from aolink.errors import AolinkError, EstimatorError, RecordingError, RigError
 from aolink.recording.reader import Recording
-from aolink.recording.reestimate import scored_and_compared
+from aolink.recording.reestimate import scored_anew
 from tests.recording.small import write_small
 
 
@@ -25,7 +25,7 @@ def test_the_row_has_the_scores_that_estimate_prints(tmp_path: Path) -> None:
     row = estimate_file(source, tmp_path / "out.mcap")
     assert tuple(row) == COLUMNS
     recording = Recording(source)
-    scores, _ = scored_and_compared(recording, ["moments"])
+    scores = scored_anew(recording, ["moments"])
     assert (row["path_rmse"], row["nis"]) == (scores["moments"].path_rmse, scores["moments"].nis.mean)
     assert (row["recording"], row["output"], row["error"]) == (str(source), "out.mcap", None)
 

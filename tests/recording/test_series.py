@@ -18,7 +18,7 @@ from aolink.exporting.files import export
 from aolink.plotting.report import write_report
 from aolink.recording import scan
 from aolink.recording.reader import Recording
-from aolink.recording.reestimate import scored_and_compared, write_reestimated
+from aolink.recording.reestimate import scored_anew, write_reestimated
 from aolink.viewing import save_rrd
 from tests.needs import needed
 
@@ -147,7 +147,7 @@ def test_a_recording_is_read_once(what: str, most: int, tmp_path: Path, monkeypa
     work: dict[str, Callable[[], object]] = {
         "loop": lambda: list(recording),
         "walk": lambda: list(recording.walk()),
-        "estimate": lambda: scored_and_compared(recording, names),
+        "estimate": lambda: scored_anew(recording, names),
         "copy": lambda: write_reestimated(recording, names, tmp_path / "a.mcap"),
         "table": lambda: recording.to_pandas(),
         "csv": lambda: export(recording, tmp_path / "a.csv"),

@@ -236,7 +236,7 @@ def chunks_read(effort: Effort) -> list[Row]:
     from aolink.exporting.files import export
     from aolink.plotting.report import write_report
     from aolink.recording import messages, scan
-    from aolink.recording.reestimate import scored_and_compared
+    from aolink.recording.reestimate import scored_anew
     from aolink.viewing import save_rrd
 
     real: Any = scan.chunk_at
@@ -258,7 +258,7 @@ def chunks_read(effort: Effort) -> list[Row]:
         chunks = len(recording.chunk_index or ())
         work: dict[str, Callable[[], object]] = {
             "walk": lambda: deque(recording.walk(), maxlen=0),
-            "estimate -e o3": lambda: scored_and_compared(recording, ["o3"]),
+            "estimate -e o3": lambda: scored_anew(recording, ["o3"]),
             "export x.csv": lambda: export(recording, folder / "x.csv"),
             "report": lambda: write_report(recording, folder / "x.html"),
             "view -o": lambda: save_rrd(recording, folder / "x.rrd"),
