@@ -87,5 +87,5 @@ def test_a_side_file_alone_is_refused(aolink: Run, tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     done = aolink("export", "a.o1.mcap", "-o", "side.npz")
     assert done.returncode == RecordingError.exit_code
-    assert "is a side file with the estimates of a.mcap alone" in done.stderr
+    assert "is a side file" in done.stderr
     assert not (tmp_path / "side.npz").exists()

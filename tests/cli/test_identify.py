@@ -55,4 +55,4 @@ def test_what_cannot_be_identified_is_one_line(aolink, shaken, tmp_path, argumen
 def test_too_short_a_recording_is_one_line(aolink, tmp_path):
     done = aolink("identify", REFERENCE / "jitter.mcap", "-o", tmp_path / "rig.toml")
     assert done.returncode == 14
-    assert "20 exposures are too short a recording" in done.stderr
+    assert "too short" in done.stderr

@@ -56,15 +56,11 @@ def test_one_number_is_found_with_its_frame_and_field(recorded: Session, tmp_pat
     found = compare(one, two)
     differing = found["/estimate/o3"]
     assert (differing.differ, differing.frame_id) == (1, 5)
-    was, now = (each.coefficients[1] for each in estimates_of_frame_5(one, two))
+    was, now = (messages_of(pb.Estimate, each, "/estimate/o3")[4].coefficients[1] for each in (one, two))
     assert differing.first == f"frame 5: coefficients[1]: {was} against {now}"
     assert all(each.same for topic, each in found.items() if topic != "/estimate/o3")
     assert all(each.same for each in compare(one, two, absolute=2e-6).values())
     assert not compare(one, two, only=["/camera/"]).keys() - {topics.IMAGE, topics.EXPOSURE}
-
-
-def estimates_of_frame_5(*recordings: Recording) -> list[pb.Estimate]:
-    return [messages_of(pb.Estimate, each, "/estimate/o3")[4] for each in recordings]
 
 
 def test_one_pixel_is_found(recorded: Session, tmp_path: Path) -> None:
@@ -114,6 +110,7 @@ def differ(pairs: list[tuple[list[float], list[float]]], relative: float, absolu
 @settings(max_examples=20)
 @given(st.lists(st.tuples(numbers, numbers), min_size=1, max_size=20))
 @example([([1e308], [-1e308])])  # further apart than a double holds
+@example([([np.nan, 1.0], [np.nan, 1.0]), ([np.nan], [1.0])])
 def test_numbers_differ_as_numpy_says(pairs: list[tuple[list[float], list[float]]]) -> None:
     pairs = [(x[: len(y)], y[: len(x)]) for x, y in pairs]
     expected = []
@@ -123,11 +120,6 @@ def test_numbers_differ_as_numpy_says(pairs: list[tuple[list[float], list[float]
         same = (a == b) | (np.isnan(a) & np.isnan(b)) | (np.isfinite(a) & np.isfinite(b) & close)
         expected.append(not same.all())
     assert differ(pairs, 1e-9, 1e-12) == expected
-
-
-def test_nan_is_equal_to_nan_and_to_nothing_else() -> None:
-    assert differ([([np.nan, 1.0], [np.nan, 1.0])], 0, 0) == [False]
-    assert differ([([np.nan], [1.0])], 1, 1) == [True]
 
 
 @pytest.mark.slow
@@ -152,7 +144,7 @@ def test_a_recording_is_compared_with_itself_without_a_copy(aolink: Run, recorde
     assert "frame 1: nis" in differs.stdout
     refused = aolink("compare", "wrong.mcap", "-t", "/camera/")
     assert refused.returncode == 5
-    assert "holds no such estimates to make again" in refused.stderr
+    assert "no such estimates" in refused.stderr
     assert path.read_bytes() == before
 
 
@@ -250,11 +242,7 @@ def test_what_has_no_counterpart_is_counted(recorded: Session, tmp_path: Path) -
     one, two = Recording(recorded.path), rewritten(recorded.path, tmp_path / "b.mcap", change)
     found = compare(one, two, only=["/camera/"])
     of = found[topics.EXPOSURE]
-    odd = sum(message.frame_id % 2 for message in exposure_infos(one))
+    odd = sum(message.frame_id % 2 for message in messages_of(pb.ExposureInfo, one, topics.EXPOSURE))
     alone = odd + (EXPOSURES + odd)
     assert (of.compared, of.differ) == (EXPOSURES - odd, alone), "the first of each name is compared with the first"
     assert of.first == "frame 1: only in the first"
-
-
-def exposure_infos(recording: Recording) -> list[pb.ExposureInfo]:
-    return messages_of(pb.ExposureInfo, recording, topics.EXPOSURE)

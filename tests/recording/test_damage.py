@@ -394,7 +394,7 @@ def test_lists_of_missing_pixels_that_do_not_fit_are_a_loss(tmp_path: Path) -> N
     image = RawImage(width=40, height=1, encoding="mono16", data=bytes(80))
     recording = write_messages(tmp_path / "a.mcap", (topics.EXPOSURE, info, 0), (topics.IMAGE, image, 1))
     assert list(recording.exposures()) == []
-    assert "missing_offset and missing_length are not of one length" in recording.damage
+    assert "missing_length" in recording.damage
 
 
 PICTURE: dict[str, Any] = {"width": 40, "height": 1, "step": 80, "encoding": "mono16", "data": bytes(80)}

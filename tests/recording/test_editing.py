@@ -105,7 +105,7 @@ def test_a_cut_without_an_exposure_is_refused(
 
 def test_the_source_is_never_the_target(recorded: Session) -> None:
     before = recorded.path.read_bytes()
-    with pytest.raises(RecordingError, match="is what the new file is made from"):
+    with pytest.raises(RecordingError, match="made from"):
         recover(recorded.path, recorded.path, overwrite=True)
     assert recorded.path.read_bytes() == before
 
@@ -122,7 +122,7 @@ def test_the_editing_commands_say_what_they_did_and_lost(aolink: Run, recorded: 
     assert aolink("copy", recorded.path, "-o", "copy.mcap").returncode == 0
     again = aolink("copy", recorded.path, "-o", "copy.mcap")
     assert again.returncode == 5
-    assert "exists and is not overwritten" in again.stderr
+    assert "overwritten" in again.stderr
     assert aolink("compare", recorded.path, "copy.mcap").returncode == 0
     assert aolink("copy", "copy.mcap", "--start", "1", "--end", "2", "-o", "c1.mcap").returncode == 0
     assert aolink("copy", "copy.mcap", "--start", "1.5", "-o", "c2.mcap").returncode == 0
@@ -144,7 +144,7 @@ def test_no_command_writes_over_what_it_reads(aolink: Run, recorded: Session, tm
         ("deblur", "a.mcap", "-e", "o1", "-o", "a.mcap"),
     ):
         result = aolink(*arguments, "--overwrite")
-        assert "is what the new file is made from" in result.stderr, arguments
+        assert "made from" in result.stderr, arguments
         assert result.returncode == 5
     assert {(tmp_path / name).read_bytes() for name in ("a.mcap", "b.mcap", "link.mcap")} == {data}
 
@@ -163,8 +163,8 @@ def test_a_command_that_fails_leaves_the_target_as_it_was(aolink: Run, recorded:
     for command in (("copy",), ("copy", "--end", "99"), ("estimate", "-e", "o1")):
         full = aolink(command[0], recorded.path, *command[1:], "-o", "kept.mcap", "--overwrite", preexec_fn=small_files)
         assert full.returncode == 5
-        why = "it would be larger than the disk or a limit (ulimit -f) lets a file be"
-        assert full.stderr == f"aolink: cannot write kept.mcap: {why}\n"
+        assert "(ulimit -f)" in full.stderr
+        assert full.stderr.count("\n") == 1
     assert [each.name for each in tmp_path.iterdir()] == ["kept.mcap"]
     assert (tmp_path / "kept.mcap").read_bytes() == b"something of mine"
 
@@ -195,4 +195,4 @@ def test_nothing_is_recovered_from_nothing(recorded: Session, tmp_path: Path) ->
 def test_a_start_after_the_end_of_a_recording_is_said(aolink: Run, recorded: Session) -> None:
     refused = aolink("copy", recorded.path, "-o", "c.mcap", "--start", "100")
     assert refused.returncode == 5
-    assert "has no exposure between 100 s and the end" in refused.stderr
+    assert "no exposure between" in refused.stderr

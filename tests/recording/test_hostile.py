@@ -131,7 +131,7 @@ def test_chunks_that_grow_without_end_are_refused(tmp_path: Path) -> None:
     chunk = struct.pack("<QQQII", 1, 1, len(data), 0, 4) + b"zstd" + struct.pack("<Q", len(packed)) + packed
     whole, end = in_place_of_the_end(rig_only(path := tmp_path / "a.mcap"))
     path.write_bytes(whole[:end] + 20 * (struct.pack("<BQ", Opcode.CHUNK, len(chunk)) + chunk))
-    with pytest.raises(RecordingError, match="become very many more without compression"):
+    with pytest.raises(RecordingError, match="without compression"):
         Recording(path)
 
 
@@ -147,7 +147,7 @@ def test_attachments_that_are_holes_are_refused(tmp_path: Path) -> None:
             file.write(struct.pack("<BQ", Opcode.ATTACHMENT, len(head) + (200 << 20) + 4) + head)
             file.truncate(file.tell() + (200 << 20) + 4)
     assert path.stat().st_size > 12e9
-    with pytest.raises(RecordingError, match=r"attachments of .* bytes, which is above the limit of 268435456"):
+    with pytest.raises(RecordingError, match="attachments of"):
         Recording(path)
 
 
@@ -161,7 +161,7 @@ def test_metadata_that_are_holes_are_refused(tmp_path: Path) -> None:
             file.seek(0, os.SEEK_END)
             file.write(struct.pack("<BQ", Opcode.METADATA, len(head) + (20 << 20)) + head)
             file.truncate(file.tell() + (20 << 20))
-    with pytest.raises(RecordingError, match="very long metadata, channels or schemas"):
+    with pytest.raises(RecordingError, match="very long metadata"):
         Recording(path)
 
 
@@ -198,7 +198,7 @@ def test_a_true_scene_that_is_none_is_one_error(tmp_path: Path, data: bytes) -> 
     "text", ["a = " + "[" * 10_000 + "]" * 10_000, ".".join("a" * 10_000) + " = 1", " . ".join("a" * 10_000) + " = 1"]
 )
 def test_a_rig_file_of_ten_thousand_levels_is_one_error(tmp_path: Path, text: str) -> None:
-    with pytest.raises(RecordingError, match=r"aolink does not take: (not valid TOML|it is longer)"):
+    with pytest.raises(RecordingError, match=r"not valid TOML|it is longer"):
         Recording(rig_only(tmp_path / "a.mcap", text))
 
 
@@ -209,7 +209,7 @@ def test_a_rig_file_out_of_a_recording_names_no_file(tmp_path: Path, monkeypatch
     for name in ("moving-scene.npy", str(tmp_path / "moving-scene.npy"), "../rigs/moving-scene.png"):
         text = load_rig("moving-scene").toml.replace("moving-scene.png", name)
         recording = Recording(rig_only(tmp_path / "a.mcap", text))
-        with pytest.raises(RigError, match=r"scene\.picture: the rig file comes out of a recording"):
+        with pytest.raises(RigError, match="out of a recording"):
             SceneCamera(recording.rig, random)
     SceneCamera(parse_rig(load_rig("moving-scene").toml), random)  # the picture that comes with aolink
 

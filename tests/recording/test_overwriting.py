@@ -80,7 +80,7 @@ def test_the_old_recording_stays_until_the_first_exposure(recorded: Session, old
     writing.write(topics.EXPOSURE)
     assert old.read_bytes() == b"precious"
     assert writing.writer.paths == []
-    with pytest.raises(RecordingError, match="is being written by another command"):
+    with pytest.raises(RecordingError, match="being written"):
         create(old, overwrite=True, error=RecordingError)
     writing.write(topics.IMAGE, lambda: old.read_bytes() != b"precious")
     # The exposure is in the file already: whatever happens now, there is something in the place of the old one.
@@ -104,7 +104,7 @@ def test_without_an_exposure_the_old_recording_is_as_it_was(
     try:
         if how == "full":
             resource.setrlimit(resource.RLIMIT_FSIZE, (100, before[1]))
-            with pytest.raises(RecordingError, match=r"cannot write .*a\.mcap: it would be larger[^;]*$"):
+            with pytest.raises(RecordingError, match=r"would be larger[^;]*$"):
                 writing.writer.close({"ended": "x" * 1000})
         else:
             writing.writer.close()
@@ -137,7 +137,7 @@ def test_what_another_program_has_put_there_meanwhile_is_not_replaced(
     else:
         exchanged(old if what == "old" else aside, b"theirs")
     writing.write(topics.IMAGE)
-    with pytest.raises(RecordingError, match=r"another program has put a file|is a symbolic link|a folder"):
+    with pytest.raises(RecordingError, match=r"another program|symbolic link|a folder"):
         writing.write_on()
     there = old if what != "new" else aside
     assert there.is_symlink() or there.is_dir() or there.read_bytes() == b"theirs"
@@ -171,7 +171,7 @@ def test_only_parts_of_the_session_of_that_name_are_removed(recorded: Session, t
     (tmp_path / "s-009.mcap").write_bytes(b"no recording")
     os.mkfifo(tmp_path / "s-010.mcap")
     was = {name: (tmp_path / name).read_bytes() for name in kept}
-    with pytest.raises(RecordingError, match=r"s-001\.mcap exists .* or --overwrite to remove all 5 parts"):
+    with pytest.raises(RecordingError, match="all 5 parts"):
         RecordingWriter(tmp_path / "s.mcap", Recording(parts[0]).rig, {}, 0, options=PARTS)
     writing = Writing(recorded.path, tmp_path / "s.mcap", WriteOptions(split_s=1e6))
     assert [each for each in parts if each.exists()] == parts
@@ -198,7 +198,7 @@ def test_parts_go_round_what_is_in_their_way(recorded: Session, tmp_path: Path) 
 
 def test_a_first_part_that_is_another_file_is_refused(recorded: Session, tmp_path: Path) -> None:
     shutil.copy(recorded.path, tmp_path / "s-001.mcap")
-    with pytest.raises(RecordingError, match=r"s-001\.mcap exists and is no part of an older session s\.mcap, so it"):
+    with pytest.raises(RecordingError, match="no part of"):
         Writing(recorded.path, tmp_path / "s.mcap", PARTS)
     assert (tmp_path / "s-001.mcap").read_bytes() == recorded.path.read_bytes()
 
@@ -244,13 +244,13 @@ def test_a_file_whose_name_is_no_longer_its_own_ends_the_session_and_is_kept(
     what(folder / "a.mcap")
     seconds.append(0.0 if at_the_end else 2.0)
     if not at_the_end:
-        with pytest.raises(RecordingError, match=r"a\.mcap was removed, renamed or replaced by another program"):
+        with pytest.raises(RecordingError, match="removed, renamed or replaced"):
             writing.write_on()
     with pytest.raises(RecordingError) as caught:
         writing.writer.close({"ended": "complete"})
     said = str(caught.value)
     if what is folder_removed:
-        assert "what was recorded is lost, because a copy cannot be written: no such file or directory" in said
+        assert "is lost" in said
         return
     place = Path(
         said.partition("saved as " if what in (removed, replaced) else "the recording is ")[2].split(" now")[0]

@@ -166,21 +166,10 @@ masks = st.lists(st.booleans(), min_size=40, max_size=40)
 def test_frames_survive_the_recording(mask: list[bool], counts: list[int]) -> None:
     pixels = np.where(mask, np.array(counts), 0).astype(np.uint16).reshape(4, 10)
     frame = Frame(
-        frame_id=2**40,
-        first_step=2**33,
-        last_step=2**33 + 199,
-        pixels=pixels,
-        mask=np.array(mask).reshape(4, 10),
-        chunks_lost=3,
-        frames_lost_before=1,
-        device_start_ns=-5,
-        device_end_ns=5,
-        host_first_byte_ns=10**18,
-        host_receive_ns=10**18 + 1,
-        host_start_ns=10**18 - 1,
-        clock_sigma_ns=1.5,
-        exposure_offset_ns=999_999,
-    )
+        frame_id=2**40, first_step=2**33, last_step=2**33 + 199, pixels=pixels, mask=np.array(mask).reshape(4, 10),
+        chunks_lost=3, frames_lost_before=1, device_start_ns=-5, device_end_ns=5, host_first_byte_ns=10**18,
+        host_receive_ns=10**18 + 1, host_start_ns=10**18 - 1, clock_sigma_ns=1.5, exposure_offset_ns=999_999,
+    )  # fmt: skip
     info, image = convert.frame_messages(frame)
     again = convert.frame_from_messages(info, image)
     for name, value in vars(frame).items():
@@ -210,10 +199,7 @@ def test_the_generated_classes_are_those_of_the_proto_files(schema: str, tmp_pat
     generated = descriptor_pb2.FileDescriptorProto()
     importlib.import_module(f"aolink.{schema.replace('/', '.')}_pb2").DESCRIPTOR.CopyToProto(generated)
     compiled.ClearField("source_code_info")
-    for message in compiled.message_type:
-        for field in message.field:
-            field.ClearField("json_name")
-    for message in generated.message_type:
+    for message in (*compiled.message_type, *generated.message_type):
         for field in message.field:
             field.ClearField("json_name")
     assert generated == compiled, "run tools/protocol"
@@ -268,14 +254,14 @@ def test_a_file_without_text_where_the_rig_should_be(tmp_path: Path) -> None:
         writer.start()
         writer.add_attachment(0, 0, "rig.toml", "application/toml", b"\xff\xfe")
         writer.finish()
-    with pytest.raises(RecordingError, match="holds a rig file that this aolink does not take: not valid TOML"):
+    with pytest.raises(RecordingError, match="not valid TOML"):
         Recording(path)
 
 
 def test_whatever_goes_wrong_in_the_writers_thread_reaches_the_session(tmp_path: Path) -> None:
     writer = RecordingWriter(tmp_path / "a.mcap", load_rig("section-vi"), {}, 0)
     writer.write(topics.LOG, Log(message="before the epoch"), -1)  # not a time that the format knows
-    with pytest.raises(RecordingError, match=r"cannot write .*a.mcap: error\("):
+    with pytest.raises(RecordingError, match="cannot write"):
         writer.close({"ended": "complete"})
     assert Recording(tmp_path / "a.mcap").metadata.get("ended") is None
 

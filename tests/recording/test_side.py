@@ -57,9 +57,9 @@ def test_two_side_files_of_one_recording_stand_side_by_side(tmp_path: Path) -> N
         estimate_file(source, side, side.stem)
     assert Recording(source, side=sides).estimators == ["o1", "o3"]
     estimate_file(source, other := tmp_path / "other.mcap", model=OTHER)
-    with pytest.raises(RecordingError, match="were made with different rig files"):
+    with pytest.raises(RecordingError, match="different rig files"):
         Recording(source, side=[sides[0], other])
-    with pytest.raises(RecordingError, match="with another than is asked for"):
+    with pytest.raises(RecordingError, match="asked for"):
         Recording(source, side=[other], rig=Recording(source).rig)
 
 
@@ -89,14 +89,11 @@ def test_what_does_not_belong_together_is_one_clear_error(aolink: Run, tmp_path:
         source = write_small(tmp_path / f"{name}.mcap", exposures)
         estimate_file(source, tmp_path / f"{name}.o3.mcap")
     for arguments, expected in (
-        (
-            ("view", "a.mcap", "b.o3.mcap", "-o", "x.rrd"),
-            "b.o3.mcap does not belong to a.mcap: its estimates are",
-        ),
-        (("view", "a.mcap", "b.mcap", "-o", "x.rrd"), "b.mcap is a recording of its own and no side file"),
-        (("view", "a.o3.mcap", "-o", "x.rrd"), "a.o3.mcap is a side file with the estimates of a.mcap alone"),
-        (("estimate", "a.o3.mcap"), "a.o3.mcap is a side file with the estimates of a.mcap alone"),
-        (("compare", "a.mcap", "b.o3.mcap"), "b.o3.mcap does not belong to a.mcap"),
+        (("view", "a.mcap", "b.o3.mcap", "-o", "x.rrd"), "does not belong to a.mcap"),
+        (("view", "a.mcap", "b.mcap", "-o", "x.rrd"), "no side file"),
+        (("view", "a.o3.mcap", "-o", "x.rrd"), "is a side file"),
+        (("estimate", "a.o3.mcap"), "is a side file"),
+        (("compare", "a.mcap", "b.o3.mcap"), "does not belong to a.mcap"),
     ):
         result = aolink(*arguments)
         assert result.returncode in (2, 5), arguments

@@ -130,7 +130,7 @@ def test_an_exposure_that_is_damaged_is_an_error_of_its_own(recorded: Session, t
     data[at - 6000 : at + 6000] = bytes(12000)
     damaged.write_bytes(data)
     recording = aolink.read(damaged)
-    with pytest.raises(RecordingError, match=r"exposure 11 of .* cannot be read"):
+    with pytest.raises(RecordingError, match="exposure 11"):
         recording[11]
 
 

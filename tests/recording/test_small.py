@@ -56,7 +56,7 @@ def test_a_small_recording_is_viewed_and_estimated(name: str, tmp_path: Path) ->
         else:
             assert isinstance(error, EstimatorError)
             number = SMALL[name]["exposures"]
-            assert f"s.mcap: o3 only predicted: none of {number} exposures gave a measurement: " in str(error)
+            assert f"none of {number} exposures" in str(error)
             assert f"o3: {number} of {number} exposures input invalid: " in output
     assert ran("estimate", path, "-e", "open-loop")[1] is None, "it does not look, so there is nothing to complain of"
 
@@ -84,7 +84,7 @@ def test_the_reason_is_in_the_table_in_info_and_in_json(aolink: Run, tmp_path: P
     assert "(frame 1, the first)" in result.stdout
     assert result.stderr.startswith("aolink: dark.mcap: o3 only predicted: none of 3 exposures gave")
     printed = " ".join(aolink("info", "out.mcap").stdout.split())
-    assert "o3: 3 of 3 exposures input invalid: no spot: the brightest stretch is" in printed
+    assert "o3: 3 of 3 exposures input invalid: no spot" in printed
     (unused,) = json.loads(aolink("info", "out.mcap", "--json").stdout)["estimates"]["o3"]["unused"]
     assert (unused["exposures"], unused["status"], unused["first_frame"]) == (3, "INPUT_INVALID", 1)
     again = json.loads(aolink("estimate", "out.mcap", "--json").stdout)["o3"]
@@ -118,10 +118,8 @@ def test_without_truth_there_is_a_nis_all_the_same(tmp_path: Path) -> None:
 @pytest.mark.parametrize("command", ["estimate", "replay", "deblur", "view"])
 def test_no_exposure_is_one_clear_error_and_leaves_nothing(command: str, tmp_path: Path) -> None:
     path = write_small(tmp_path / "none.mcap", 0)
-    target = {"estimate": ["-o"], "deblur": ["-o"], "view": ["-o"]}.get(command, [])
-    _, error = ran(
-        command, path, *target, *([tmp_path / ("out.rrd" if command == "view" else "out.mcap")] if target else [])
-    )
+    target = ["-o", tmp_path / ("out.rrd" if command == "view" else "out.mcap")] if command != "replay" else []
+    _, error = ran(command, path, *target)
     assert isinstance(error, RecordingError | ViewerError)
     assert " no exposure" in str(error)
     assert list(tmp_path.iterdir()) == [path]
@@ -132,7 +130,7 @@ def test_frames_of_another_camera_are_one_clear_error(tmp_path: Path) -> None:
     said, error = ran("view", path, "-o", tmp_path / "s.rrd")
     assert isinstance(error, ViewerError)
     assert "there is no exposure in" in str(error)
-    assert "its size is not that of the rig's sensor, 1 x 40 pixels" in said
+    assert "1 x 40 pixels" in said
 
 
 def test_info_has_date_and_units_and_json_has_numbers(aolink: Run, tmp_path: Path) -> None:

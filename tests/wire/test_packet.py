@@ -203,5 +203,5 @@ def test_a_part_of_a_message_too_long_takes_no_memory_for_the_rest() -> None:
 
 
 def test_a_message_too_long_is_refused() -> None:
-    with pytest.raises(ValueError, match="a CommandBlock of 320004 bytes is too long, at most 262144"):
+    with pytest.raises(ValueError, match="too long"):
         encode_packets(pb.CommandBlock(block_id=0, u=[1.0] * 40_000), 0)
