@@ -118,8 +118,8 @@ def test_without_truth_there_is_a_nis_all_the_same(tmp_path: Path) -> None:
 @pytest.mark.parametrize("command", ["estimate", "replay", "deblur", "view"])
 def test_no_exposure_is_one_clear_error_and_leaves_nothing(command: str, tmp_path: Path) -> None:
     path = write_small(tmp_path / "none.mcap", 0)
-    target = ["-o", tmp_path / ("out.rrd" if command == "view" else "out.mcap")] if command != "replay" else []
-    _, error = ran(command, path, *target)
+    out = tmp_path / ("out.rrd" if command == "view" else "out.mcap")
+    _, error = ran(command, path) if command == "replay" else ran(command, path, "-o", out)
     assert isinstance(error, RecordingError | ViewerError)
     assert " no exposure" in str(error)
     assert list(tmp_path.iterdir()) == [path]
