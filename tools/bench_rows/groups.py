@@ -39,7 +39,7 @@ LONG = frozenset(
         "soak", "closed_loop_soak", "bit_errors", "large_frames", "time_to_park", "restoration_quality", "shaken",
         "moving_scene", "residual_slopes", "fall_back", "worth_headline", "worth_past", "worth_vibrations",
         "worth_resonance", "worth_air", "worth_factors", "drawn_scenes", "coverage", "coverage_with_pixels",
-        "spheres", "first_profile",
+        "first_profile",
     }
 )  # fmt: skip
 """Functions that take two minutes or more each, `soak` forty, `closed_loop_soak` sixty.
