@@ -1,6 +1,6 @@
 """The assumptions of the estimators about a rig: the ranges of the family of scenes that they are judged on.
 
-`tools/family` draws its scenes from these ranges. A rig outside may work as well, but how well has not been measured.
+`tools/judge` draws its scenes from these ranges. A rig outside may work as well, but how well has not been measured.
 """
 
 from __future__ import annotations

@@ -37,7 +37,7 @@ _AT_ONCE = 4
 """Most axes that are compared in one exposure."""
 PIXELS_OFF, MOTION_OFF = 4.5, 4.0
 """Statistics from which on the model does not fit; below `FITS` of them it does. They were
-chosen on some 40 right recordings of `moments`, and judged on others (`tools/verdict`)."""
+chosen on some 40 right recordings of `moments`, and judged on others (`tools/judge verdict`)."""
 FITS = 0.7
 _NIS_SPREAD, _NIS_SPREAD_OF_MIXTURES = 1.5, 3.2
 """Standard deviation of the summed NIS where the model is right: of `moments`, and of `profile`."""

@@ -15,7 +15,7 @@ from aolink.importing.frames import FilmSettings
 from aolink.optics.kernel import pixel_masses
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
-from paper_report.strangers import draw
+from judging.films import draw
 
 FRAMES, SHAPE = 60, (48, 64)
 
@@ -91,7 +91,7 @@ def test_a_hot_pixel_is_no_spot() -> None:
 
 
 def test_the_kernel_is_found_beside_shot_noise() -> None:
-    film = draw(5002)
+    film = draw(26, motion="sinusoid")
     found = find_spots(film.film, film.settings, FRAMES)
     assert found.electrons > 0
     assert found.sd == pytest.approx(film.sd, rel=0.1)

@@ -21,7 +21,7 @@ from aolink.rig import load_rig
 from aolink.simulation.model import simulate
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
-from paper_report.spot_films import SpotFilm, random_walk, resonance, spot_film
+from judging.films import SpotFilm, random_walk, resonance, spot_film
 
 MIDDLES = np.array([[24.0, 32.0], [70.0, 30.0]])
 FRAMES = 96

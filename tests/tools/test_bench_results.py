@@ -11,8 +11,6 @@ from typing import Any
 
 import pytest
 
-from tests.needs import needed
-
 TOOLS = Path(__file__).parents[2] / "tools"
 
 
@@ -85,7 +83,7 @@ def test_rows_that_are_new_or_fail_now_or_failed_before_are_named(results: Any, 
 def test_a_file_of_something_else_is_one_line(tmp_path: Path, text: str) -> None:
     other = tmp_path / "other.json"
     other.write_text(text)
-    done = bench("turbulence", "--against", other)
+    done = bench("command_start", "--against", other)
     assert done.returncode == 2
     assert done.stderr == f"tools/bench: {other} is not a file that tools/bench --json has written\n"
 
@@ -94,33 +92,3 @@ def test_rows_that_take_minutes_are_rows(monkeypatch: pytest.MonkeyPatch) -> Non
     monkeypatch.syspath_prepend(str(TOOLS))
     groups = importlib.import_module("bench_rows.groups")
     assert {name for names in groups.ROWS.values() for name in names} >= groups.LONG
-
-
-@pytest.mark.slow
-def test_a_curve_knows_its_power_and_is_drawn(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.syspath_prepend(str(TOOLS))
-    plots = importlib.import_module("bench_rows.plots")
-    sizes = [1.0, 3.0, 10.0, 30.0, 100.0, 300.0]
-    curve = plots.Curve("spots", "an exposure (ms)", sizes, [max(7.0, 0.5 * size**1.5) for size in sizes])
-    assert curve.slope == pytest.approx(1.5)
-    assert str(curve).endswith("grows with the power 1.50 in the larger half")
-    needed("matplotlib")
-    drawn = plots.draw([curve] * 4, tmp_path / "page")
-    assert drawn.read_bytes().count(b'id="axes_') == 4
-
-
-@pytest.mark.rare
-def test_costs_are_measured_and_drawn(tmp_path: Path) -> None:
-    done = bench("--plots", tmp_path, "--short")
-    assert done.returncode == 0, done.stderr
-    lines = done.stdout.splitlines()
-    assert lines[-1] == f"written: {tmp_path / 'cost.svg'}"
-    assert all("grows with the power" in line for line in lines[:-1])
-    for what in (
-        "lenslets, 1 to 2500",
-        "fast steps, 50 to 1000",
-        "pixels",
-        "exposures of a recording",
-        "exposures a second",
-    ):
-        assert any(what in line for line in lines)

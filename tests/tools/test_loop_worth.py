@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -13,14 +14,12 @@ from numpy.typing import NDArray
 
 from aolink.control import ControllerRow
 from aolink.exposure import Exposure, residual_rms
-from aolink.identification import Process, ProcessSum
 from aolink.jobs.closed_loop import closed_loop
 from aolink.rig import Rig, load_rig
 from tests.needs import needed
 
 if TYPE_CHECKING:
-    from bench_rows.disturbances import DisturbanceRun
-    from bench_rows.loop_worth import Cell
+    from bench_rows.loop import Cell, DisturbanceRun
 
 needed("pyrtc")
 TOOLS = Path(__file__).parents[2] / "tools"
@@ -36,7 +35,8 @@ def played(cell: Cell, known: DisturbanceRun, folder: Path) -> Rig:
     """The cell's rig, which hardly any noise is in, with these slopes."""
     np.save(folder / "slopes.npy", known.slopes[:, None])
     table = '[disturbance]\nplant_noise = false\nrecorded = "slopes.npy"\n\n[simulation]'
-    text = replace(cell, noise=1e-4).rig(known.model).toml.replace("[simulation]", table, 1)
+    text = re.sub("noise_density = .*", "noise_density = 1e-10", cell.rig(known.model).toml)
+    text = text.replace("[simulation]", table, 1)
     (folder / "rig.toml").write_text(text)
     return load_rig(folder / "rig.toml")
 
@@ -46,7 +46,7 @@ def series(rig: Rig, controller: str | ControllerRow, exposures: int = 30) -> li
 
 
 def test_a_vibration_has_the_sd_and_the_frequency_that_it_is_asked_for() -> None:
-    from bench_rows.disturbances import vibration
+    from bench_rows.loop import vibration
 
     slopes = np.array([vibration(48.0, 0.1, 4000, seed).slopes for seed in range(40)])
     # Its energy is exponentially distributed from seed to seed, as it remembers it for longer than the run.
@@ -56,15 +56,12 @@ def test_a_vibration_has_the_sd_and_the_frequency_that_it_is_asked_for() -> None
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["own", "hcipy"])
-def test_turbulence_is_foretold_by_what_is_known_of_it(kind: str) -> None:
+def test_turbulence_is_foretold_by_what_is_known_of_it() -> None:
     """The state holds the slopes, and its model foretells those that it was not fitted to better than the last one."""
-    if kind == "hcipy":
-        needed("hcipy")
-    from bench_rows.disturbances import together, turbulence, vibration
+    from bench_rows.loop import together, turbulence, vibration
 
     steps, past, ahead = 3000, 2000, 8
-    known = together([turbulence(kind, 0.1, steps, past, 5), vibration(24.0, 0.1, steps, 5)])
+    known = together([turbulence(0.1, steps, past, 5), vibration(24.0, 0.1, steps, 5)])
     np.testing.assert_allclose(known.states @ known.C[0], known.slopes, atol=1e-12)
     foretold = (known.states @ (known.C @ np.linalg.matrix_power(known.A, ahead))[0])[past:-ahead]
     truth = known.slopes[past + ahead :]
@@ -75,29 +72,12 @@ def residual(values: NDArray[np.float64]) -> float:
     return float(np.sqrt(np.mean(values**2)))
 
 
-def test_the_likeliest_model_of_a_process_of_second_order_has_its_spectrum() -> None:
-    from bench_rows.disturbances import STEP_S, likeliest
-
-    true = ProcessSum((Process("second-order", (0.05, 0.02, 0.1)),))
-    space, random = true.state_space(STEP_S), np.random.default_rng(2)
-    state, slopes = np.zeros(2), np.empty(40_000)
-    root = np.linalg.cholesky(space.W)
-    for k in range(len(slopes)):
-        slopes[k] = space.C[0] @ state
-        state = space.A @ state + space.B_w @ (root @ random.standard_normal(2))
-    lags = np.array([0.0, 0.01, 0.03, 0.06])
-    found = sum(process.covariance(lags) for process in likeliest(slopes).processes)
-    np.testing.assert_allclose(found, true.processes[0].covariance(lags), atol=0.15 * 0.1**2)
-
-
 def test_a_predictor_is_shown_the_disturbance_as_if_the_mirror_had_been_at_rest(tmp_path: Path) -> None:
     """What pyRTC's `persistence` was told last is the mean of the true slopes, while the mirror moves all the time."""
-    from bench_rows.disturbances import vibration
-    from bench_rows.loop_worth import Cell
-    from bench_rows.rivals import Predicted
+    from bench_rows.loop import Cell, Predicted, vibration
     from pyrtc.predictive import PersistencePredictor
 
-    cell, known = Cell("", 0.24), vibration(4.8, 0.1, 31 * N, 7)
+    cell, known = Cell(False, 0.24), vibration(4.8, 0.1, 31 * N, 7)
     rig, made = played(cell, known, tmp_path), []
 
     def build(of: Rig) -> Predicted:
@@ -111,11 +91,9 @@ def test_a_predictor_is_shown_the_disturbance_as_if_the_mirror_had_been_at_rest(
 
 
 def test_pyrtcs_predictors_cancel_a_slow_vibration_better_than_the_integrator(tmp_path: Path) -> None:
-    from bench_rows.disturbances import vibration
-    from bench_rows.loop_worth import Cell
-    from bench_rows.rivals import PREDICTORS, predicted
+    from bench_rows.loop import PREDICTORS, Cell, predicted, vibration
 
-    cell, known = Cell("", 0.24), vibration(4.8, 0.1, 331 * N, 7)
+    cell, known = Cell(False, 0.24), vibration(4.8, 0.1, 331 * N, 7)
     past = known.slopes[: 300 * N].reshape(-1, N).mean(axis=1)[:, None]
     rig = played(cell, replace(known, slopes=known.slopes[300 * N :]), tmp_path)
     integrator = residual_rms(series(rig, "integrator")[5:])
@@ -125,11 +103,9 @@ def test_pyrtcs_predictors_cancel_a_slow_vibration_better_than_the_integrator(tm
 
 def test_with_the_true_state_hardly_anything_is_left_of_a_vibration_that_does_not_change(tmp_path: Path) -> None:
     """What is left is what the vibration's own noise adds after each exposure's end: at most some per cent."""
-    from bench_rows.disturbances import vibration
-    from bench_rows.loop_worth import Cell
-    from bench_rows.rivals import with_true_state
+    from bench_rows.loop import Cell, vibration, with_true_state
 
-    cell, known = Cell("", 2.4), vibration(48.0, 0.1, 31 * N, 7)
+    cell, known = Cell(False, 2.4), vibration(48.0, 0.1, 31 * N, 7)
     rig = played(cell, known, tmp_path)
     left = residual_rms(series(rig, with_true_state(known))[5:])
     A, C = known.A, known.C
@@ -140,29 +116,3 @@ def test_with_the_true_state_hardly_anything_is_left_of_a_vibration_that_does_no
                  for i in range(k)) for k in range(5, 5 + N)]  # fmt: skip
     assert left == pytest.approx(math.sqrt(np.mean(ahead)), rel=0.25)
     assert left < 0.4 * residual_rms(series(rig, "")[5:])
-
-
-def test_a_ratio_and_its_bound_are_students() -> None:
-    from bench_rows.loop_worth import Cell, Goal, Measured
-
-    rms = {"integrator 0.1": np.array([2.0, 2.0, 2.0]), "integrator 0.5": np.array([1.0, 1.0, 1.0]),
-           "o1": np.array([0.8, 0.9, 1.0])}  # fmt: skip
-    each = Measured(Cell("own", 2.4), rms, ())
-    assert each.best == "integrator 0.5"
-    # t(0.95, 2) = 2.920 and the standard error is 0.1 / sqrt(3).
-    assert each.ratio("o1").mean == pytest.approx(0.9)
-    assert each.ratio("o1").bound == pytest.approx(0.9 + 2.920 * 0.1 / math.sqrt(3), abs=1e-4)
-    assert each.reaches(Goal("o1", "", 1.1))
-    assert not each.reaches(Goal("o1", "", 1.0))
-    assert each.ratio("o1", over="o1").bound == pytest.approx(1.0)
-
-
-def test_the_goals_are_those_of_the_headline_and_of_turbulence_alone() -> None:
-    from bench_rows.loop_worth import HEADLINE, TURBULENCE, Measured
-
-    for cell in HEADLINE:
-        goals = {(goal.name, goal.over): goal.limit for goal in Measured(cell, {}, ()).goals}
-        assert goals[("identified profile", "")] == 0.95
-        assert goals[("identified o1", "o1")] == 1.05
-    for cell in TURBULENCE:
-        assert {goal.limit for goal in Measured(cell, {}, ()).goals} == {1.02}

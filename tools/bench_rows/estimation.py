@@ -1,17 +1,18 @@
-"""Figures of the estimators, beside filterpy and plain products."""
+"""Figures of the estimators and of synthesis, beside filterpy and plain products."""
 
 from __future__ import annotations
 
-import statistics
+import tempfile
 import tracemalloc
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import lz4.frame
 import numpy as np
 from filterpy.kalman import ExtendedKalmanFilter
-from paper_report.ensemble import side_by_side
+from judging.scenes import side_by_side
 
 from aolink.assembly import Assembler, FrameReassembly
 from aolink.estimation import Driver, make_estimator, run, score
@@ -23,13 +24,19 @@ from aolink.estimation.kalman.update import blocked_update, joseph_update
 from aolink.estimation.model.dense import DenseModel
 from aolink.estimation.model.exposure_model import exposure_model
 from aolink.numerics import batched
+from aolink.optics.frame import spots_density
+from aolink.optics.kernel import pixel_mass
+from aolink.optics.sensor import Kernel
 from aolink.plant.alike import alike_systems
 from aolink.recording.convert import estimate_message
+from aolink.recording.reader import Recording
+from aolink.recording.reestimate import reestimate
 from aolink.rig import Rig, load_rig, parse_rig
 from aolink.simulation.devices import SimulatedDevices
 from aolink.simulation.model import simulate
 from aolink.wire import messages_pb2 as pb
 from aolink.wire.packet import MessageDecoder, PacketDecoder, encode_message
+from bench_rows.recording import record_long
 from bench_rows.row import Effort, Row, median_s, timed
 
 
@@ -91,9 +98,10 @@ def update_forms(effort: Effort) -> list[Row]:
     return [row(1, 48, 192, 60), row(1, 288, 400, 15)]
 
 
-def many_lenslets(side: int = 30) -> Rig:
+def many_lenslets(side: int = 30, steps: int = 200) -> Rig:
     """A sensor of 30 x 30 lenslets, or more, with windows of 16 x 16 pixels."""
     text = load_rig("sh-4x4").toml.replace("axes = 32", f"axes = {2 * side**2}").replace("[4, 4]", f"[{side}, {side}]")
+    text = text.replace("exposure_steps = 200", f"exposure_steps = {steps}")
     return parse_rig(text.replace("[24, 24]", "[16, 16]").replace("block_steps", "#"))
 
 
@@ -183,6 +191,18 @@ def profile_of_many_axes(effort: Effort) -> Row:
     return _of_many_axes("profile", 100, effort)
 
 
+def _step_s(rig: Rig, name: str, count: int, distinct: int | None = None) -> tuple[float, float]:
+    """Median and 99th percentile of an exposure's time in an estimator, without the first, which make its model, s;
+    of so many distinct exposures, by default all."""
+    count = max(count, 4)
+    exposures, estimator = simulate(rig, distinct or count, seed=1), make_estimator(rig, name)
+    first = range(0, count * rig.timing.frame_period_steps, rig.timing.frame_period_steps)
+    following = (replace(exposures[k % len(exposures)], first_step=step) for k, step in enumerate(first))
+    times = [timed(lambda: estimator.step(next(following))) for _ in first][min(5, count - 1) :]
+    p50, p99 = np.percentile(times, [50, 99])
+    return float(p50), float(p99)
+
+
 def largest_sensor(effort: Effort) -> list[Row]:
     """2500 spots of 16 x 16 pixels, the largest sensor that Mishra and Wen name, at 50 Hz: an assembled frame to o3's
     estimate, where each slope has its own plant and where one plant of six states moves all; windowed moments and modes
@@ -195,34 +215,61 @@ def largest_sensor(effort: Effort) -> list[Row]:
     )  # fmt: skip
     rows = []
     for what, rig, limit_ms in (("of its own", independent, 10), ("in common", coupled, 40)):
-        exposures = simulate(rig, 3, seed=1)
-        steps, turns = rig.timing.frame_period_steps, effort.of(100, 4)
-        following = [replace(exposures[k % 3], first_step=steps * k) for k in range(turns)]
-        o3 = make_estimator(rig, "o3")
-        for _ in range(3):
-            o3.step(following.pop(0))
-        p50, p99 = 1e3 * np.percentile([timed(lambda each=each, o3=o3: o3.step(each)) for each in following], [50, 99])  # type: ignore[misc]
+        p50, p99 = (1e3 * each for each in _step_s(rig, "o3", effort.of(100), distinct=3))
         figure = f"o3 of {side**2} spots, a plant {what}"
         rows.append(Row(figure, f"{p50:.1f} ms, p99 {p99:.1f}", f"p99 {limit_ms} ms", limit_ms / p99, 1))
     return [*rows, _of_many_axes("moments", 60, effort, 5000), _of_many_axes("profile", 100, effort, 5000)]
 
 
+def growth(effort: Effort) -> list[Row]:
+    """Cost of an exposure with o3 against lenslets, fast steps and exposures: a whole over so many parts of a tenth."""
+
+    def cost(side: int, steps: int) -> float:
+        rig = many_lenslets(side, steps)
+        simulated = median_s(lambda: simulate(rig, 1), effort.of(3))[0]
+        return simulated + _step_s(rig, "o3", effort.of(12), distinct=3)[0]
+
+    def again(exposures: int) -> float:
+        with tempfile.TemporaryDirectory() as folder:
+            record_long(path := Path(folder) / "a.mcap", exposures)
+            return timed(lambda: reestimate(Recording(path), ["o3"]))
+
+    again(2)  # compiles
+    cases = (
+        ("lenslets, 256 to 2500", cost(effort.of(50, 4), 200) / 2500 * 256, cost(effort.of(16, 2), 200)),
+        ("fast steps, 100 to 1000", cost(10, 1000) / 10, cost(10, 100)),
+        ("exposures of a recording", again(effort.of(5000, 20)) / 10, again(effort.of(500, 2))),
+    )
+    return [
+        Row(f"cost against {what}", f"{1e3 * most:.1f} ms a tenth", f"{1e3 * few:.1f} ms", few / most, 0.7)
+        for what, most, few in cases
+    ]
+
+
+def frame_synthesis(effort: Effort) -> Row:
+    """Exposures of 30 x 30 spots on 16 x 16 pixels over 200 fast steps, against error functions at every step."""
+    kernel, edges = Kernel(shape="gaussian", sigma=0.1), np.linspace(-1, 1, 17)
+    path = np.cumsum(0.01 * np.random.default_rng(1).standard_normal((900, 2, 200)), axis=2)
+
+    def plain() -> None:
+        x, y = (pixel_mass(kernel, edges, path[:, direction]) for direction in (0, 1))
+        np.matmul(y.swapaxes(1, 2), x)
+
+    ours, theirs = (1 / each for each in median_s(lambda: spots_density(kernel, edges, path), effort.of(15), plain))
+    return Row("frames of 900 spots, 200 fast steps", f"{ours:.0f}/s", f"20/s; erf {theirs:.0f}/s", ours / 20, 1)
+
+
 def profile_of_tip_tilt(effort: Effort) -> Row:
     """An exposure of one spot on a plane, whose two slopes one mirror moves."""
-    rig = load_rig("tip-tilt")
-    exposures = simulate(rig, effort.of(40, 8), seed=1)
-    profile = make_estimator(rig, "profile")
-    took = statistics.median([timed(lambda exposure=exposure: profile.step(exposure)) for exposure in exposures][5:])  # type: ignore[misc]
-    return Row("profile of tip-tilt", f"{1e3 * took:.0f} ms", "limit 200 ms", 0.2 / took, 1)
+    took, _ = _step_s(load_rig("tip-tilt"), "profile", effort.of(40, 8))
+    return Row("profile of tip-tilt", f"{1e3 * took:.0f} ms", "limit 20 ms", 0.02 / took, 1)
 
 
 def spots_under_turbulence(effort: Effort) -> list[Row]:
     """An exposure of sh-8x8, 48 spots whose slopes the membrane cannot all make, and `moments` beside o1 there."""
     rig = load_rig("sh-8x8")
     exposures = simulate(rig, effort.of(40, 8), seed=1)
-    moments = make_estimator(rig, "moments")
-    times = [timed(lambda exposure=exposure: moments.step(exposure)) for exposure in exposures]  # type: ignore[misc]
-    took = statistics.median(times[5:])  # the first ones make the model
+    took, _ = _step_s(rig, "moments", len(exposures))
     found = {name: score(exposures, each) for name, each in run(rig, exposures, ["o1", "moments"]).items()}
     ours, theirs = found["moments"], found["o1"]
     return [
@@ -237,38 +284,25 @@ def spots_under_turbulence(effort: Effort) -> list[Row]:
 def membrane_in_real_time(effort: Effort) -> list[Row]:
     """An exposure of membrane-12x12, 288 states seen by 100 lenslets, at 5 Hz; and the memory that it takes."""
     rig = load_rig("membrane-12x12")
-    first = effort.of(5)  # they make the model, and are wider
-    exposures = simulate(rig, first + 1 + effort.of(18))
-    estimators = {name: make_estimator(rig, name) for name in ("o3", "moments", "profile")}
-    times: dict[str, list[float]] = {name: [] for name in estimators}
-    for number, exposure in enumerate(exposures[:-1]):
-        for name, estimator in estimators.items():
-            took = timed(lambda estimator=estimator, exposure=exposure: estimator.step(exposure))  # type: ignore[misc]
-            if number >= first:
-                times[name].append(took)
-    rows = [
-        Row(
-            f"{name} of 288 states, 100 lenslets",
-            f"{1e3 * statistics.median(each):.0f} ms, slowest {1e3 * max(each):.0f}", "5 Hz: 200 ms",
-            0.2 / statistics.median(each), 1,
-        )
-        for name, each in times.items()
-    ]  # fmt: skip
-    together = statistics.median(sum(each) for each in zip(*times.values(), strict=True))
-    rows.append(Row("the three of them together", f"{1e3 * together:.0f} ms", "5 Hz: 200 ms", 0.2 / together, 1))
+    names, rows, total = ("o3", "moments", "profile"), [], 0.0
+    for name in names:
+        took, slowest = _step_s(rig, name, effort.of(24))
+        total += took
+        ours = f"{1e3 * took:.0f} ms, slowest {1e3 * slowest:.0f}"
+        rows.append(Row(f"{name} of 288 states, 100 lenslets", ours, "5 Hz: 200 ms", 0.2 / took, 1))
+    rows.append(Row("the three of them together", f"{1e3 * total:.0f} ms", "5 Hz: 200 ms", 0.2 / total, 1))
+    estimators, exposures = [make_estimator(rig, name) for name in names], simulate(rig, 2)
+    for estimator in estimators:
+        estimator.step(exposures[0])
     tracemalloc.start()
-    newest = {name: estimator.step(exposures[-1]) for name, estimator in estimators.items()}
+    newest = [estimator.step(exposures[1]) for estimator in estimators]
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
-    for name, estimate in newest.items():
-        recorded = len(lz4.frame.compress(estimate_message(estimate).SerializeToString())) / 1e6  # as in a chunk
-        doubles = (estimate.end_covariance.nbytes + estimate.coefficient_covariance.nbytes) / 1e6
-        what = f"an estimate of {name}, recorded"
-        rows.append(Row(what, f"{recorded:.2f} MB", f"limit 0.3 MB; as doubles {doubles:.1f}", 0.3 / recorded, 1))
+    recorded = max(len(lz4.frame.compress(estimate_message(each).SerializeToString())) for each in newest) / 1e6
+    rows.append(Row("the largest estimate, recorded", f"{recorded:.2f} MB", "limit 0.3 MB", 0.3 / recorded, 1))
     systems, steps = alike_systems(rig.plant), rig.timing.exposure_steps
     assert systems is not None
-    coefficients = rig.n_inputs * DenseModel(systems.one, steps).n_coefficients
-    dense = 8 * rig.n_outputs * steps * coefficients
+    dense = 8 * rig.n_outputs * steps * rig.n_inputs * DenseModel(systems.one, steps).n_coefficients
     figure = "their memory, beside a dense basis"
     rows.append(Row(figure, f"{peak / 1e6:.0f} MB", f"{dense / 1e6:.0f} MB", dense / peak, 5))
     return rows

@@ -1,16 +1,18 @@
-"""Figures of recordings: their pace, what a crash and damage cost, how long the loop waits for the recorder."""
+"""Figures of recordings: their pace, how long the loop waits for the recorder, what is made of one and of many."""
 
 from __future__ import annotations
 
 import atexit
+import json
 import os
 import shutil
-import signal
-import statistics
+import subprocess
+import sys
 import tempfile
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from functools import cache
 from pathlib import Path
 from typing import Any, cast
@@ -18,27 +20,23 @@ from typing import Any, cast
 import numpy as np
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from google.protobuf.message import Message
-from mcap.reader import make_reader
 from mcap.writer import CompressionType
 from mcap_protobuf.writer import Writer
 
 import aolink
 from aolink.assembly import Frame
 from aolink.estimation import Driver
-from aolink.jobs import batch
 from aolink.recording import convert, schemas_pb2, topics
-from aolink.recording.editing import recover
-from aolink.recording.mcap_file import McapFile, WriteOptions, schema_of
 from aolink.recording.reader import Recording
 from aolink.recording.reestimate import reestimate, write_reestimated
-from aolink.recording.writer import RecordingWriter, begin_recording
+from aolink.recording.writer import RecordingWriter
 from aolink.rig import load_rig
 from aolink.wire import messages_pb2 as wire
-from bench_rows.row import Effort, Row, median_s, resident_mb, timed
+from bench_rows.row import Effort, Row, median_s, peak_mb, timed
 
-KILLS = 100
 _ROWS = 50_000
 _LOOP_S = 20.0
+_ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
 
 
 def _session(path: Path, seconds: float) -> list[float]:
@@ -64,88 +62,6 @@ def _loop(seconds: float, write: Callable[[str, Message, int], object]) -> list[
         k += 1
         time.sleep(max(0.0, begin + k * 1e-3 - time.monotonic()))
     return spent
-
-
-def kill_at_any_moment(effort: Effort) -> Row:
-    """SIGKILL at random moments of a session that records in real time: the age of the oldest message lost."""
-    rng = np.random.default_rng(1)
-    ages, unreadable = [], 0
-    with tempfile.TemporaryDirectory() as folder:
-        for k in range(effort.of(KILLS, 3)):
-            path = Path(folder) / f"{k}.mcap"
-            child = os.fork()
-            if not child:
-                _session(path, 60.0)
-                os._exit(0)
-            time.sleep(0.3 + 0.4 * rng.random())
-            killed = time.time_ns()
-            os.kill(child, signal.SIGKILL)
-            os.waitpid(child, 0)
-            try:
-                result = recover(path, Path(folder) / "whole.mcap", overwrite=True)
-                recording = Recording(result.path)
-                sequences = [each.sequence for each in recording.messages()]
-                assert sequences == list(range(1, len(sequences) + 1))
-                ages.append((killed - recording.end_ns) / 1e6)
-            except Exception as error:
-                print(f"kill {k}: {error!r}")
-                unreadable += 1
-    worst = max(ages) if not unreadable else float("inf")
-    ours = f"{worst:.0f} ms lost at worst, median {statistics.median(ages):.0f}"
-    figure = f"kill -9 at a random moment, {effort.of(KILLS, 3)} times, all recovered"
-    return Row(figure, ours, "limit 200 ms", 200 / worst, 1.0)
-
-
-def _many_chunks(folder: Path) -> tuple[bytes, list[tuple[int, int, int]]]:
-    """A recording of several MB, and for each chunk its first byte, the byte after its last, and its messages."""
-    path = folder / "long.mcap"
-    file = McapFile(path, WriteOptions())
-    begin_recording(file, load_rig("section-vi"), {}, 0, {})
-    rng = np.random.default_rng(2)
-    for k in range(3000):
-        data = RawImage(width=32, height=32, encoding="mono16", step=64, data=rng.bytes(2048)).SerializeToString()
-        file.add(topics.IMAGE, schema_of(RawImage), data, k * 5_000_000, k + 1)
-    file.finish()
-    with path.open("rb") as opened:
-        reader = make_reader(opened)
-        summary = reader.get_summary()
-        assert summary is not None
-        counts = [
-            sum(1 for _ in reader.iter_messages(starting_at=each.message_start_time, ending_at=each.message_end_time))
-            for each in summary.chunk_indexes
-        ]
-    spans = [(each.chunk_start_offset, each.chunk_start_offset + each.chunk_length) for each in summary.chunk_indexes]
-    return path.read_bytes(), [(*span, count) for span, count in zip(spans, counts, strict=True)]
-
-
-def truncation(effort: Effort) -> Row:
-    """Cut off at 500 sampled bytes of the last megabyte: messages that come back of those in whole chunks."""
-    with tempfile.TemporaryDirectory() as name:
-        data, chunks = _many_chunks(Path(name))
-        due = found = 0
-        for size in np.random.default_rng(3).integers(len(data) - (1 << 20), len(data), effort.of(500)):
-            (path := Path(name) / "cut.mcap").write_bytes(data[:size])
-            due += sum(count for _, end, count in chunks if end <= size)
-            found += sum(Recording(path).counts.values())
-    figure = f"cut off at {effort.of(500)} bytes of the last MB"
-    return Row(figure, f"{found} messages back", f"{due} in whole chunks", found / due, 1.0)
-
-
-def flipped_bits(effort: Effort) -> Row:
-    """20 random bits flipped, 200 times: messages that come back of those in chunks that were not hit."""
-    rng = np.random.default_rng(4)
-    with tempfile.TemporaryDirectory() as name:
-        data, chunks = _many_chunks(Path(name))
-        due = found = 0
-        for _ in range(effort.of(200)):
-            damaged, hits = bytearray(data), rng.integers(16, len(data), 20)
-            for byte in hits:
-                damaged[byte] ^= 1 << int(rng.integers(8))
-            (path := Path(name) / "flipped.mcap").write_bytes(damaged)
-            due += sum(count for start, end, count in chunks if not ((start <= hits) & (hits < end)).any())
-            found += sum(Recording(path, check=True).counts.values())
-    figure = f"20 bits flipped, {effort.of(200)} times"
-    return Row(figure, f"{found} messages back", f"{due} in whole chunks", found / due, 1.0)
 
 
 def loop_stall(effort: Effort) -> Row:
@@ -200,7 +116,7 @@ def record_long(path: Path, exposures: int, name: str = "section-vi-lively") -> 
                 writer.write(topic, message, now)
 
 
-def reestimation_rate(effort: Effort) -> list[Row]:
+def reestimation(effort: Effort) -> list[Row]:
     """o3 over recordings of one axis, of 32, and of 200 outputs of one plant, against reading the same file and
     decoding its frames, no more."""
     return [
@@ -230,17 +146,16 @@ def _reestimated(what: str, name: str, count: int, effort: Effort, target: float
     return Row(f"re-estimation with o3{what}", ours, theirs, reading / estimating, target)
 
 
-def chunks_read(effort: Effort) -> list[Row]:
-    """How often each chunk of a session of 1500 exposures with four estimators is read, and how long that takes beside
-    a walk over its exposures and estimates."""
+def walks(effort: Effort) -> list[Row]:
+    """What is made of an hour's recording: how often each chunk is read, the time beside one walk with the same
+    estimator, and the memory that it takes."""
     from aolink.exporting.files import export
     from aolink.plotting.report import write_report
     from aolink.recording import messages, scan
-    from aolink.recording.reestimate import scored_anew
     from aolink.viewing import save_rrd
 
     real: Any = scan.chunk_at
-    read = 0
+    read, rows, recording = 0, list[Row](), Recording(hour(effort))
 
     def counting(*arguments: Any) -> Any:
         nonlocal read
@@ -249,68 +164,112 @@ def chunks_read(effort: Effort) -> list[Row]:
 
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        with RecordingWriter(folder / "a.mcap", load_rig("section-vi-lively"), {}, 0, deterministic=True) as writer:
-            record_long(folder / "bare.mcap", effort.of(1500, 10))
-            write_reestimated(Recording(folder / "bare.mcap"), ["open-loop", "o1", "o3", "moments"], folder / "b.mcap")
-            for each in Recording(folder / "b.mcap").messages():  # in the chunks of a session
-                writer.write(each.topic, each.message, each.log_time_ns)
-        recording = Recording(folder / "a.mcap")
-        chunks = len(recording.chunk_index or ())
         work: dict[str, Callable[[], object]] = {
-            "walk": lambda: deque(recording.walk(), maxlen=0),
-            "estimate -e o3": lambda: scored_anew(recording, ["o3"]),
+            "one walk with o3": lambda: deque(Driver(recording.rig, ["o3"]).steps(recording.exposures()), maxlen=0),
+            "estimate -e o3": lambda: write_reestimated(recording, ["o3"], folder / "x.mcap"),
             "export x.csv": lambda: export(recording, folder / "x.csv"),
             "report": lambda: write_report(recording, folder / "x.html"),
             "view -o": lambda: save_rrd(recording, folder / "x.rrd"),
         }
-        rows = []
+        chunks, walk_s = len(recording.chunk_index or ()), 0.0
         setattr(messages, "chunk_at", counting)  # noqa: B010
         try:
-            for what, run in work.items():
-                read = 0
-                took = f"{timed(run):.1f} s"
-                times = read / chunks
-                rows.append(Row(f"{chunks} chunks read by {what}", f"{times:.2f} times", took, 1 / times, 0.95))
+            for what, make in work.items():
+                read, before = 0, peak_mb()
+                took = timed(make)
+                walk_s = walk_s or took
+                figure = f"{what} of {len(recording)} exposures: {read / chunks:.2f} times each chunk"
+                ours = f"{took:.1f} s, +{peak_mb() - before:.0f} MB"
+                ratio = min(1.5 * walk_s / took, 1.05 * chunks / read)
+                rows.append(Row(figure, ours, f"limit 1.5 walks: {1.5 * walk_s:.1f} s", ratio, 1))
         finally:
             setattr(messages, "chunk_at", real)  # noqa: B010
     return rows
 
 
-def memory_of_an_hour(effort: Effort) -> Row:
-    """Growth while an hour at 5 Hz is estimated with o3, against the file's size."""
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "a.mcap"
-        record_long(path, effort.of(18_000))
-        size, recording = path.stat().st_size / 1e6, Recording(path)
-        driver, marks = Driver(recording.rig, ["o3"]), []
-        for number, exposure in enumerate(recording.exposures()):
-            driver.step(exposure)
-            if number % effort.of(4000) == effort.of(1000):
-                marks.append(resident_mb())
-    growth = max(marks) - marks[0]
-    figure = "memory over an hour's recording, o3"
-    return Row(figure, f"+{growth:.1f} MB", f"file {size:.0f} MB", size / max(growth, 0.1), 10)
+def tiny_recordings(effort: Effort) -> list[Row]:
+    """Ten thousand recordings of three exposures estimated with o3 by one command: the processor time of each, and the
+    memory that the command takes beyond that for a tenth of them."""
+    count = effort.of(10_000, 20)
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        record_long(folder / "3.mcap", 3)
+        for k in range(count):
+            os.link(folder / "3.mcap", folder / f"t{k}.mcap")
+
+        def command(number: int) -> tuple[float, float]:
+            """Processor time, s, and the largest memory, MB."""
+            sources = [folder / f"t{k}.mcap" for k in range(number)]
+            process = _estimate(sources, folder / f"out-{number}", "o3")
+            _, status, used = os.wait4(process.pid, 0)
+            assert status == 0
+            return used.ru_utime + used.ru_stime, used.ru_maxrss / 1e3
+
+        (few_s, few_mb), (many_s, many_mb) = command(count // 10), command(count)
+    each_ms, grown_mb = max(1e3 * (many_s - few_s) / (count - count // 10), 0.1), many_mb - few_mb
+    return [
+        Row(f"{count} tiny recordings, each", f"{each_ms:.1f} ms", "limit 20 ms", 20 / each_ms, 1.0),
+        Row(f"memory over {count} recordings", f"{grown_mb:+.1f} MB", "limit 10 MB", 10 / max(grown_mb, 0.1), 1.0),
+    ]
 
 
-def batch_workers(effort: Effort) -> Row:
-    """Two dozen recordings estimated again with moments on two processes, whose start counts, against one."""
+def _estimate(sources: Sequence[Path], target: Path, name: str, *options: str) -> subprocess.Popen[bytes]:
+    """The command that estimates recordings into a folder."""
+    command = [sys.executable, "-m", "aolink", "estimate", *map(str, sources), "-e", name, "-o", f"{target}/"]
+    return subprocess.Popen([*command, *options], stdout=subprocess.DEVNULL, env=os.environ | _ONE_THREAD)
+
+
+def batch_workers(effort: Effort) -> list[Row]:
+    """Two dozen recordings estimated with moments on two processes, and on two Dask workers, whose start counts,
+    against one."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         sources = [folder / f"{k}.mcap" for k in range(effort.of(24, 2))]
         for source in sources:
-            record_long(source, effort.of(600))
+            record_long(source, effort.of(600, 5))
 
-        def work(jobs: int) -> float:
-            target = folder / f"on-{jobs}-{time.monotonic_ns()}"
-            target.mkdir()
-            todo = batch.jobs([*map(str, sources)], batch.models(None, []), ["moments"], target)
-            start = time.perf_counter()
-            assert not any(row["error"] for _, row in batch.run(todo, lambda: batch.here(jobs), jobs))
-            return time.perf_counter() - start
+        def work(*options: str) -> float:
+            target = folder / f"out-{time.monotonic_ns()}"
+            return timed(lambda: _done(_estimate(sources, target, "moments", *options)))
 
-        one, two = work(1), work(2)
+        def on_dask(workers: int) -> float:
+            file = folder / f"scheduler-{workers}.json"
+            scheduler = ("scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard", "--scheduler-file", file)
+            worker = ("worker", "--scheduler-file", file, "--no-nanny", "--nthreads", "1", "--no-dashboard")
+            with _dask(*scheduler), ExitStack() as stack:
+                while not (file.exists() and file.read_text().endswith("}")):
+                    time.sleep(0.05)
+                for _ in range(workers):
+                    stack.enter_context(_dask(*worker, "--death-timeout", "30"))
+                time.sleep(5)  # until they have started
+                return work("--scheduler", json.loads(file.read_text())["address"])
+
+        one, two = work(), work("--jobs", "2")
+        dask_one, dask_two = on_dask(1), on_dask(2)
     count = f"{len(sources)} recordings"
-    return Row(f"{count} estimated again on 2 processes", f"{two:.1f} s", f"on one {one:.1f} s", one / two, 1.8)
+    return [
+        Row(f"{count} estimated on 2 processes", f"{two:.1f} s", f"on one {one:.1f} s", one / two, 1.8),
+        Row(
+            f"{count} on 2 Dask workers", f"{dask_two:.1f} s", f"on one {dask_one:.1f} s", dask_one / dask_two, 1.8
+        ),
+    ]  # fmt: skip
+
+
+def _done(process: subprocess.Popen[bytes]) -> None:
+    assert process.wait() == 0
+
+
+@contextmanager
+def _dask(*arguments: str | Path) -> Iterator[None]:
+    """A process of a cluster."""
+    environment = os.environ | _ONE_THREAD | {"PYTHONPATH": str(Path(__file__).resolve().parents[2])}
+    quiet = subprocess.DEVNULL
+    process = subprocess.Popen([sys.executable, "-m", "dask", *arguments], env=environment, stdout=quiet, stderr=quiet)
+    try:
+        yield
+    finally:
+        process.kill()
+        process.wait()
 
 
 def rrd_of_ten_minutes(effort: Effort) -> Row:
@@ -355,36 +314,11 @@ def hour(effort: Effort) -> Path:
 
 
 def rrd_size(effort: Effort) -> Row:
-    """The size of the .rrd of an hour over that of the recording; and the memory that writing it takes."""
+    """The size of the .rrd of an hour over that of the recording."""
     from aolink.viewing import save_rrd
 
-    recording, grown = Recording(hour(effort)), list[float]()
+    recording = Recording(hour(effort))
     with tempfile.TemporaryDirectory() as name:
-        saved = save_rrd(recording, Path(name) / "a.rrd", progress=lambda done: grown.append(resident_mb()))
-        ratio = saved.stat().st_size / recording.size
-        more = max(grown) - grown[0]
-    ours = f"{ratio:.2f} times the recording, {more:.0f} MB more memory after the first part"
-    return Row(f".rrd of {len(recording)} exposures", ours, "limit 4 times", 4 / ratio, 1.0)
-
-
-def view_first(effort: Effort) -> Row:
-    """Time from opening a recording of an hour until its first part is with the viewer, which has no window."""
-    import rerun as rr
-
-    from aolink.viewing import Look
-    from aolink.viewing.process import running_rerun
-    from aolink.viewing.save import sent_parts
-
-    times, path = [], hour(effort)
-    for _ in range(effort.of(5)):
-        start = time.perf_counter()
-        with running_rerun(["--serve-grpc"]) as server:
-            server.listen()
-            stream = rr.RecordingStream("aolink")
-            stream.connect_grpc(server.data_address)
-            next(sent_parts(stream, Recording(path), Look(), at_once=True))
-            stream.flush()
-            times.append(time.perf_counter() - start)
-            stream.disconnect()
-    ours = statistics.median(times)
-    return Row("first picture's data of an hour in the viewer", f"{ours:.2f} s", "limit 2 s", 2 / ours, 1.0)
+        ratio = save_rrd(recording, Path(name) / "a.rrd").stat().st_size / recording.size
+    figure = f".rrd of {len(recording)} exposures"
+    return Row(figure, f"{ratio:.2f} times the recording", "limit 4 times", 4 / ratio, 1.0)

@@ -112,7 +112,7 @@ def moved(before: Sequence[Result], now: Sequence[Result]) -> list[tuple[str, st
             lines.append((each.figure, "", _shown(each), "is new"))
         elif bool(old.error) != bool(each.error):
             lines.append((each.figure, old.ours, each.ours, "fails now" if each.error else "failed before"))
-        elif not each.error and (what := _change(old, each)):
+        elif old.values and each.values and (what := _change(old, each)):
             lines.append((each.figure, _shown(old), _shown(each), what))
     return lines
 

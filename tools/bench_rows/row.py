@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import os
+import resource
 import statistics
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 
@@ -25,10 +24,6 @@ class Effort:
 FULL = Effort(1.0)
 SHORT = Effort(0.02)
 """Every line of a row is run, but its figure means nothing."""
-
-
-class PeerMissing(Exception):
-    """A row compares with a package that is not installed here."""
 
 
 @dataclass(frozen=True)
@@ -63,6 +58,6 @@ def timed(work: Callable[[], Any]) -> float:
     return time.perf_counter() - start
 
 
-def resident_mb() -> float:
-    """Memory of this process, MB."""
-    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
+def peak_mb() -> float:
+    """The largest memory that this process has had, MB."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3

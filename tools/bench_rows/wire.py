@@ -1,8 +1,7 @@
-"""Figures of the link."""
+"""Figures of the link, its clock and its faults."""
 
 from __future__ import annotations
 
-import contextlib
 import itertools
 import multiprocessing
 import os
@@ -15,14 +14,24 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+from scipy import stats
 
 from aolink.assembly import Assembler, FrameReassembly
+from aolink.devices.clock import (
+    QUERY_PERIOD_S,
+    SUSPICION_PERIOD_S,
+    WARM_UP_QUERIES,
+    ClockExchange,
+    ClockRegression,
+    StepClock,
+)
 from aolink.estimation import Driver
 from aolink.jobs.demo import simulated_rig
 from aolink.numerics.workers import end_with_parent
 from aolink.polling import wait_readable
-from aolink.rig import load_rig, parse_rig
-from aolink.session import record
+from aolink.recording.reader import Recording
+from aolink.rig import load_rig
+from aolink.session import Report, record
 from aolink.simulation.devices import SimulatedDevices
 from aolink.wire import messages_pb2 as pb
 from aolink.wire.link import Link
@@ -30,9 +39,23 @@ from aolink.wire.packet import encode_message
 from aolink.wire.port import SerialPort
 from bench_rows.row import Effort, Row
 
+_SEEDS = 100
+_SESSION_S = 60.0
+_DRIFT = 200e-6
+_WALK = 1e-6 / 60**0.5
+"""Random walk of the frequency, 1/sqrt(s)."""
+_JITTER_NS = 2e6
+"""Mean of the exponential time that a packet takes beyond the shortest, each way."""
+_ROUND_TRIP_NS = 4e6
+"""The shortest round trip; the share of it in the first direction is drawn by seed, from none to all."""
+_STEP_NS = 50_000_000
+_READOUT_S = 0.05
+_START_NS = 1_800_000_000_000_000_000
 _MINUTE_EXPOSURES = 300
 _LENSLET_FRAMES = 500
 _SLOW_EXPOSURES = 400
+_RATES = {1e-6: 0.98, 1e-5: 0.98, 1e-4: 0.0}
+"""Bit error rates, and the share of frames that is to come whole."""
 
 
 def link_throughput(effort: Effort) -> Row:
@@ -116,47 +139,6 @@ def slow_estimator(effort: Effort) -> Row:
     )  # fmt: skip
 
 
-def live_membrane(effort: Effort) -> Row:
-    """A session in real time of 288 states with three estimators, the simulator on the same cores: how far estimates
-    are behind, and whose processor time it is."""
-    # A machine that is held up for a second or two does not end the session.
-    text = load_rig("membrane-12x12").toml.replace("queue_steps = 300", "queue_steps = 300\nwatchdog_s = 10.0")
-    rig, names = parse_rig(text), ("o3", "moments", "profile") if effort.share == 1 else ("o3",)
-    period_ms = 1e3 * rig.timing.frame_period_steps * rig.timing.fast_step_s
-    with tempfile.TemporaryDirectory() as folder:
-        (source := Path(folder) / "rig.toml").write_text(text)
-        with simulated_rig(source, "--real-time") as ports:
-            before, begun_s = _processor_s(), time.monotonic()
-            report = record(rig, *ports, Path(folder) / "a.mcap", estimators=names, exposures=effort.of(100, 4))
-            lasted_s, after = time.monotonic() - begun_s, _processor_s()
-    behind = [(each.estimated_ns - each.complete_ns) / 1e6 for each in report.latencies if each.estimated_ns]
-    late_ms = statistics.median((each.first_byte_ns - each.exposure_end_ns) / 1e6 for each in report.latencies)
-    skipped = sum(report.exposures_skipped.values())
-    shares = ", ".join(f"{name} {(after[name] - before[name]) / lasted_s:.0%}" for name in after)
-    each_took = ", ".join(f"{name} {statistics.median(each.took_ms):.0f}" for name, each in report.estimation.items())
-    median_ms, worst_ms = statistics.median(behind), max(behind)
-    return Row(
-        f"live session of 288 states, {report.exposures} exposures, {report.frames_lost} lost, frames {late_ms:.0f} ms"
-        f" after their exposures: first estimate after the frame; of a core: {shares}; an estimate: {each_took} ms;"
-        f" {skipped} skipped",
-        f"{median_ms:.0f} ms, worst {worst_ms:.0f}", f"a frame period, {period_ms:.0f} ms", period_ms / worst_ms, 1.0,
-    )  # fmt: skip
-
-
-def _processor_s() -> dict[str, float]:
-    """Processor time so far, s: of this process; of its children that have ended, which are a session's estimators; and
-    of those that run, which is the simulated rig."""
-    used, tick = os.times(), os.sysconf("SC_CLK_TCK")
-    running = 0.0
-    for path in Path("/proc").glob("[0-9]*/stat"):
-        with contextlib.suppress(OSError):  # a process that has ended meanwhile
-            fields = path.read_text().rpartition(")")[2].split()
-            if int(fields[1]) == os.getpid():
-                running += (int(fields[11]) + int(fields[12])) / tick
-    ended = used.children_user + used.children_system
-    return {"loop": used.user + used.system, "estimators": ended, "simulator": running}
-
-
 def frame_to_command(effort: Effort) -> Row:
     """One lenslet: from the last byte of a frame on one pseudo terminal to the command that follows on another."""
     rig = load_rig("single-lenslet")
@@ -200,3 +182,126 @@ def frame_to_command(effort: Effort) -> Row:
         f"one lenslet, frame complete to command sent, {len(times)} frames",
         f"{p50:.2f} ms, p99 {p99:.2f}, p99.9 {p999:.2f}", "p99 1 ms", 1 / p99, 1.0,
     )  # fmt: skip
+
+
+def _clock_session(seed: int, duration_s: float, *, stamps_show_it: bool) -> tuple[np.ndarray, int, int]:
+    """Error over sigma of the host time of each frame, 10 a second; and how many of the frames off by the step are
+    flagged and not flagged.
+
+    Where no stamp shows the step (a device that counts its fast steps from its clock), those frames are flagged that
+    began after the last query which agreed with the old clock, once the step is found.
+    """
+    rng = np.random.default_rng(seed)
+    there_ns = _ROUND_TRIP_NS * rng.uniform()
+    step_at_s = duration_s * rng.uniform(0.3, 0.7)
+    step_ns = _STEP_NS * int(rng.choice([-1, 1]))
+    grid_s = np.arange(0.0, duration_s + 2.0, 0.1)
+    drift = _DRIFT * rng.choice([-1, 1]) + np.cumsum(_WALK * 0.1**0.5 * rng.standard_normal(grid_s.size))
+    phase_ns = np.r_[0.0, np.cumsum(drift)[:-1]] * 1e8
+
+    def device_ns(second: float, *, stepped: bool = True) -> int:
+        set_ns = step_ns if stepped and second >= step_at_s else 0
+        return round(second * 1e9 + float(np.interp(second, grid_s, phase_ns))) + set_ns
+
+    def exchange(second: float) -> ClockExchange:
+        there_s = (there_ns + rng.exponential(_JITTER_NS)) * 1e-9
+        back_s = (_ROUND_TRIP_NS - there_ns + rng.exponential(_JITTER_NS)) * 1e-9
+        left_s = second + there_s + 5e-6
+        return ClockExchange(
+            _START_NS + round(second * 1e9), device_ns(second + there_s), device_ns(left_s),
+            _START_NS + round((left_s + back_s) * 1e9),
+        )  # fmt: skip
+
+    clock, frames = ClockRegression(), list[tuple[int, int, float]]()
+    for k in range(WARM_UP_QUERIES):
+        clock.add(exchange(0.05 * k))
+    steps, due_s = StepClock(clock, device_ns(0.0), 1_000_000), 0.5
+    for second in np.arange(0.5, duration_s, 0.1).tolist():
+        while due_s <= second:
+            clock.add(exchange(due_s))
+            due_s += SUSPICION_PERIOD_S if clock.suspected else QUERY_PERIOD_S
+        began_s = second - _READOUT_S
+        stamp, true_ns = device_ns(began_s), _START_NS + round(began_s * 1e9)
+        counted_ns = device_ns(began_s, stepped=not stamps_show_it) - device_ns(0.0)
+        found_ns, sigma_ns = steps.host_ns(stamp, counted_ns, _START_NS + round(second * 1e9))
+        if clock.suspected:
+            due_s = min(due_s, second + SUSPICION_PERIOD_S)
+        frames.append((true_ns, found_ns - true_ns, sigma_ns))
+    true, error, sigma = (np.array(each, dtype=float) for each in zip(*frames, strict=True))
+    wrong = np.abs(error) > 5 * sigma
+    flagged = np.zeros_like(wrong)
+    if clock.step is not None:
+        flagged = (true >= clock.step.after_ns) & (true <= clock.step.before_ns)
+    return error / sigma, int((wrong & flagged).sum()), int((wrong & ~flagged).sum())
+
+
+def clock_nees(effort: Effort) -> list[Row]:
+    """Drift of 200 ppm and its walk, jitter of 2 ms each way, delay asymmetric by up to 4 ms, a step of 50 ms.
+
+    The share of the first direction in the round trip is the same in a whole session, so a session counts as one sample
+    of the NEES.
+    """
+    seeds, duration_s = effort.of(_SEEDS, 3), float(effort.of(round(_SESSION_S), 8))
+    sessions = [_clock_session(seed, duration_s, stamps_show_it=True)[0] for seed in range(1, seeds + 1)]
+    nees = float(np.mean([np.mean(each**2) for each in sessions]))
+    low, high = (float(stats.chi2.ppf(share, seeds)) / seeds for share in (0.025, 0.975))
+    ratios = np.abs(np.concatenate(sessions))
+    covered = [float((ratios < stats.norm.ppf(0.5 + level / 2)).mean()) for level in (0.68, 0.95)]
+    hidden = [_clock_session(seed, duration_s, stamps_show_it=False)[1:] for seed in range(1001, 1001 + seeds)]
+    flagged, unflagged = (sum(each) for each in zip(*hidden, strict=True))
+    what = f"{seeds} sessions of {duration_s:.0f} s: 200 ppm, jitter 2 ms, asymmetry to 4 ms, a step of 50 ms"
+    return [
+        Row(
+            f"NEES of frames' host times, {what}", f"{nees:.2f}", f"{low:.2f} to {high:.2f}",
+            min(high / nees, nees / low), 1.0,
+        ),
+        Row(
+            f"coverage of their 68 and 95 % intervals; worst error {ratios.max():.1f} sigma",
+            f"{100 * covered[0]:.1f}, {100 * covered[1]:.1f} %", "68, 95 %", covered[1] / 0.95, 1.0,
+        ),
+        Row(
+            "frames off by a step that no stamp shows: outside the period that the session warns of",
+            f"{unflagged} of {flagged + unflagged}", "limit 0", float(not unflagged), 1.0,
+        ),
+    ]  # fmt: skip
+
+
+class WrongError(Exception):
+    """False data was recorded, or a false command was executed, which no rate of errors excuses."""
+
+
+def bit_errors(effort: Effort) -> list[Row]:
+    """Ten minutes of section-vi on virtual time at each rate, against the same session without faults.
+
+    The same seed and the same commands make the same path, so the rig's true path shows at each fast step whether every
+    command was taken once and in its place; truths that were lost on the line are not checked.
+    """
+    rig, exposures, rows = load_rig("section-vi"), effort.of(3000, 20), []
+
+    def session(rate: float) -> tuple[Report, Recording]:
+        with simulated_rig(rig.name, "--fault", f"bitflip={rate}") as ports:
+            report = record(rig, *ports, path := Path(folder) / f"{rate:g}.mcap", exposures=exposures)
+        return report, Recording(path)
+
+    with tempfile.TemporaryDirectory() as folder:
+        good = {each.frame_id: each for each in session(0.0)[1].exposures()}
+        for rate, share in _RATES.items():
+            report, recording = session(rate)
+            for each in recording.exposures():
+                sound = good[each.frame_id]
+                wrong = bool((each.pixels != sound.pixels)[each.mask].any())
+                if each.truth is not None and sound.truth is not None:
+                    wrong |= not np.array_equal(each.truth.path, sound.truth.path)
+                if wrong or not (each.inputs_assumed or np.array_equal(each.inputs, sound.inputs)):
+                    raise WrongError(f"exposure {each.frame_id} has wrong pixels, steps or inputs")
+            if report.steps_commanded != report.steps_applied + report.steps_late + report.steps_not_reported:
+                raise WrongError("steps were lost, taken twice or refused")
+            whole = (report.frames_received - report.frames_incomplete) / exposures
+            late = report.steps_late / report.steps_commanded
+            rows.append(Row(
+                f"section-vi, {exposures / 5:.0f} s at a bit error rate of {rate:g}: frames whole; none wrong,"
+                f" {report.steps_late} of {report.steps_commanded} steps late",
+                f"{100 * whole:.2f} %", f"goal {100 * share:g} %",
+                min(whole / share if share else 1.0, 1e-3 / late if late else 1.0), 1.0,
+            ))  # fmt: skip
+    return rows

@@ -1,19 +1,16 @@
-"""Recordings whose rig file is right, or wrong in one thing: what the verdict on the model is judged on.
+"""The verdict on the model, on recordings whose rig file is right, or wrong in one thing.
 
-A recording is one run of a scene of the family (`paper_report.family`): the rig file that the estimators get, and
-exposures of a rig that may differ from it. Its frames are made here, so that kernels and light may be other than the
-simulated rig's.
+A recording is one run of a scene: the rig file that the estimators get, and exposures of a rig that may differ from it.
+Its frames are made here, so that kernels and light may be other than the simulated rig's.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import json
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from pathlib import Path
 from typing import Literal, get_args
 
 import numpy as np
@@ -25,9 +22,10 @@ from aolink.exposure import Exposure
 from aolink.numerics.arrays import FloatArray
 from aolink.optics.camera import pixel_noise_sd, to_counts
 from aolink.optics.sensor import SpotSensor
-from aolink.rig import Plant, Rig
+from aolink.rig import Rig
 from aolink.simulation.model import simulate
-from paper_report.family import Scene, commands_of, draw, plant_of, rig_of, with_flaws
+from judging.rows import BEYOND_95, Given, Judge, Line, Row, grouped, mean
+from judging.scenes import commands_of, draw, plant_of, rig_of, with_flaws
 
 Fault = Literal[
     "none", "fading light", "unmodelled line", "late exposure", "zero off", "process noise", "frequency", "airy",
@@ -42,7 +40,8 @@ HARMFUL = 0.85
 """Coverage below which a fault does harm."""
 EXPOSURES = 100
 _SETTLING = 4
-_BEYOND_95 = 1.959964
+_RIGHT = 20
+"""Recordings with a right file for every one of a fault."""
 _SIZES = {
     "fading light": (0.3, 0.9), "unmodelled line": (0.3, 3.0), "late exposure": (0.03, 0.1), "zero off": (0.1, 2.0),
     "process noise": (1.5, 4.0), "frequency": (0.02, 0.1), "airy": (1.0, 1.0), "coma": (0.5, 1.5),
@@ -61,13 +60,12 @@ class Recording:
     exposures: list[Exposure]
     fault: Fault
     size: float
-    scene: Scene
 
 
 def recording(seed: int, fault: Fault, exposures: int = EXPOSURES) -> Recording:
     """The recording of a seed with that fault; the scene is the seed's, with commands where the fault needs them."""
     rng = np.random.default_rng([55, seed, FAULTS.index(fault) + 1 if fault != "none" else 0])
-    scene = draw(seed)
+    scene = dataclasses.replace(draw(seed), exposures=exposures)
     low, high = _SIZES.get(fault, (0.0, 0.0))
     size = float(np.exp(rng.uniform(math.log(low), math.log(high)))) if low else 0.0
     if fault == "late exposure":
@@ -75,26 +73,20 @@ def recording(seed: int, fault: Fault, exposures: int = EXPOSURES) -> Recording:
             scene, command="sine", command_sd=float(rng.uniform(0.5, 1.5)),
             command_period=float(np.exp(rng.uniform(math.log(0.3), math.log(3.0)))),
         )  # fmt: skip
-    rig = rig_of(scene, 1, exposures)
-    true = dataclasses.replace(rig, plant=_true_plant(scene, rig, exposures, fault, size))
-    late = max(1, round(size * scene.steps)) if fault == "late exposure" else 0
-    inputs = commands_of(scene, rig.plant, exposures * scene.period + late)
-    made = simulate(true, exposures, seed, inputs=inputs[late:])
-    seen = with_flaws(scene, rig, list(_frames(rig, made, inputs, rng, fault, size)))
-    return Recording(rig=rig, exposures=list(seen), fault=fault, size=size, scene=scene)
-
-
-def _true_plant(scene: Scene, rig: Rig, exposures: int, fault: Fault, size: float) -> Plant:
-    plant = rig.plant
+    rig, true = rig_of(scene, 1), scene
     if fault == "frequency":
         modes = tuple(dataclasses.replace(each, swings=each.swings * (1 + size)) for each in scene.modes)
-        moved = plant_of(dataclasses.replace(scene, modes=modes), plant.axes, exposures)
-        return dataclasses.replace(moved, B=plant.B)
+        true = dataclasses.replace(scene, modes=modes)
+    plant = dataclasses.replace(plant_of(true, rig.plant.axes), B=rig.plant.B)
     if fault == "process noise":
-        return dataclasses.replace(
+        plant = dataclasses.replace(
             plant, process_noise=plant.process_noise * size, initial_covariance=plant.initial_covariance * size
         )
-    return plant
+    late = max(1, round(size * scene.steps)) if fault == "late exposure" else 0
+    inputs = commands_of(scene, rig.plant, exposures * scene.period + late)
+    made = simulate(dataclasses.replace(rig, plant=plant), exposures, seed, inputs=inputs[late:])
+    seen = with_flaws(scene, rig, list(_frames(rig, made, inputs, rng, fault, size)))
+    return Recording(rig=rig, exposures=list(seen), fault=fault, size=size)
 
 
 def _frames(
@@ -178,96 +170,63 @@ def _table(fault: Fault, size: float) -> tuple[FloatArray, FloatArray] | None:
     return u, below / below[-1]
 
 
-@dataclass(frozen=True, kw_only=True)
-class FaultRow:
-    """The verdict on one recording."""
-
-    seed: int
-    fault: Fault
-    size: float
-    estimator: str
-    inside: float
-    """Share of the path in the filter's own 95 % intervals, over the recording without its start."""
-    called: int
-    """Exposure with which the model was first said not to fit; -1 for none."""
-    kind: str
-    """That of the last such verdict."""
-    where: str
-    inside_after: float
-    """Share of the path in the intervals from that exposure on; NaN where there was none."""
-    width: float
-    """Median half width of these, over the rms error there."""
-    pixels: float
-    motion: float
-    """The last verdict's evidence."""
+def rows(seed: int, given: Given) -> Iterator[Row]:
+    """The verdict of each estimator on the recordings of a seed: one with each fault, and as many with a right file as
+    there are to one fault."""
+    for name in given.estimators:
+        for fault in FAULTS:
+            yield verdict_on(recording(seed, fault), name)
+        for k in range(_RIGHT):
+            yield verdict_on(recording(seed + 1000 * (k + 1), "none"), name)
 
 
-def judge_recording(seed: int, fault: Fault, name: str) -> FaultRow:
-    """The row of one recording by an estimator."""
-    made = recording(seed, fault)
+def verdict_on(made: Recording, name: str) -> Row:
+    """The row of one recording by an estimator: the share of the path in the filter's own 95 % intervals; whether the
+    model was said not to fit, the evidence of the last such verdict, and the share in the intervals from the first one
+    on, -1 where there was none."""
     estimator = make_estimator(made.rig, name)
-    own, after, errors, widths = [], [], [], []
-    called, last = -1, Verdict(fit=Fit.UNKNOWN)
+    own, after, called, last = [], [], False, Verdict(fit=Fit.UNKNOWN)
     for k, exposure in enumerate(made.exposures):
-        estimate = estimator.step(exposure)
-        truth = exposure.truth
+        estimate, truth = estimator.step(exposure), exposure.truth
         assert truth is not None
         verdict = estimate.verdict or last
-        error, reach = np.abs(estimate.path - truth.path), _BEYOND_95 * estimate.path_sd
+        error, reach = np.abs(estimate.path - truth.path), BEYOND_95 * estimate.path_sd
         if k >= _SETTLING:
             own.append(np.mean(error < reach / verdict.widening))
         if verdict.fit is Fit.DOES_NOT_FIT:
-            called, last = (k if called < 0 else called), verdict
+            called, last = True, verdict
             after.append(np.mean(error < reach))
-            errors.append(np.mean(error**2))
-            widths.append(np.median(reach))
-        elif called < 0:
+        elif not called:
             last = verdict
-    return FaultRow(
-        seed=seed, fault=fault, size=made.size, estimator=name, inside=float(np.mean(own)), called=called,
-        kind=last.kind, where=last.where, inside_after=float(np.mean(after)) if after else math.nan,
-        width=float(np.median(widths) / math.sqrt(np.mean(errors))) if after else math.nan,
-        pixels=last.pixels, motion=last.motion,
-    )  # fmt: skip
+    return {
+        "what": name, "fault": made.fault, "size": made.size, "inside": float(np.mean(own)), "called": called,
+        "kind": last.kind, "after": float(np.mean(after)) if after else -1.0,
+    }  # fmt: skip
 
 
-def judge_faults(path: Path, first: int, right: int, each: int, name: str) -> list[FaultRow]:
-    """Judge recordings one after the other; rows that the file has already are not made again. Seeds are ``first`` and
-    those after it."""
-    lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
-    rows = [FaultRow(**json.loads(line)) for line in lines]
-    there = {(row.seed, row.fault) for row in rows if row.estimator == name}
-    wanted: list[tuple[int, Fault]] = [(first + k, "none") for k in range(right)]
-    faults = [(first + right + k, FAULTS[k % len(FAULTS)]) for k in range(each * len(FAULTS))]
-    with path.open("a", encoding="utf-8") as file:
-        for seed, fault in [*faults, *wanted]:
-            if (seed, fault) not in there:
-                rows.append(judge_recording(seed, fault, name))
-                file.write(f"{json.dumps(dataclasses.asdict(rows[-1]))}\n")
-                file.flush()
-    return [row for row in rows if row.estimator == name]
+def table(rows: Sequence[Row]) -> tuple[Line, Iterable[Line]]:
+    """A line for each fault: how many recordings are called wrong, and the same of those whose intervals hold less than
+    .85 of the path; how often the kind of evidence is right, and the coverage afterwards."""
+    heads = ("estimator", "fault", "recordings", "called", "of harmful", "kind right", "inside", "afterwards")
+    lines = []
+    for name, each in grouped(rows).items():
+        by_fault = grouped(each, "fault")
+        by_fault["all faults"] = [row for row in each if row["fault"] != "none"]
+        lines += [_line(name, fault, of_one) for fault, of_one in by_fault.items()]
+    return heads, lines
 
 
-def table_of_faults(rows: Sequence[FaultRow]) -> str:
-    """Lines of text by kinds of faults: how many there are, how many are called wrong, and the same of those whose
-    intervals hold less than .85 of the path; how often the kind of evidence is right, and the coverage afterwards."""
-    heads = ("fault", "n", "called", "harmful", "called", "kind right", "inside before", "after", "width")
-    lines = [heads, *(_line(fault, [row for row in rows if row.fault == fault]) for fault in ("none", *FAULTS))]
-    lines.append(_line("all faults", [row for row in rows if row.fault != "none"]))
-    return "\n".join("".join(f"{cell:>{18 if k == 0 else 14}}" for k, cell in enumerate(line)) for line in lines)
-
-
-def _line(fault: str, rows: Sequence[FaultRow]) -> tuple[str, ...]:
-    harmful = [row for row in rows if row.inside < HARMFUL]
-    found = [row for row in harmful if row.called >= 0]
-    called = [row for row in rows if row.called >= 0]
-    right = [row.fault in EITHER or (row.kind == "pixels") == (row.fault in PIXELS) for row in called]
-
-    def mean(values: Sequence[float], digits: int = 2) -> str:
-        return f"{np.mean(values):.{digits}f}" if len(values) else "-"
-
+def _line(name: str, fault: str, rows: Sequence[Row]) -> Line:
+    harmful = [row for row in rows if row["inside"] < HARMFUL]
+    found, called = [row for row in harmful if row["called"]], [row for row in rows if row["called"]]
+    right = [row["fault"] in EITHER or (row["kind"] == "pixels") == (row["fault"] in PIXELS) for row in called]
     return (
-        fault, str(len(rows)), str(len(called)), str(len(harmful)), str(len(found)),
-        f"{sum(right)} of {len(right)}", mean([row.inside for row in found]),
-        mean([row.inside_after for row in found]), mean([row.width for row in found]),
+        name, fault, str(len(rows)), str(len(called)), f"{len(found)} of {len(harmful)}",
+        f"{sum(right)} of {len(right)}", mean([row["inside"] for row in found]), mean([row["after"] for row in found]),
     )  # fmt: skip
+
+
+VERDICT = Judge(
+    summary="the verdict on the model: false and true calls by fault, a recording of each, and 20 right ones, a seed",
+    rows=rows, table=table, scenes=20,
+)  # fmt: skip

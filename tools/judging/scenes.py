@@ -1,7 +1,7 @@
-"""A family of scenes, drawn by seed: plants on which no estimator was tuned.
+"""Scenes, drawn by seed: plants on which no estimator was tuned.
 
-A scene is a rig and a simulation of it: several independent runs side by side, as axes of one rig. Seeds for tuning and
-seeds for reporting are separate (`SEEDS`): figures are those of the second, which are not used before.
+A scene is a rig and a simulation of it: several independent runs side by side, as axes of one rig. Seeds for building
+and seeds for judging are apart (`SEEDS`): figures are those of the second, which are not used before.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ from aolink.optics.sensor import Kernel, Sensor, SpotSensor
 from aolink.plant.lifting import input_response
 from aolink.rig import Drive, Plant, Rig, Timing, load_rig
 from aolink.simulation.model import simulate
-from paper_report.ensemble import SensorRows
 
-SEEDS = {"tuning": range(100_000), "reporting": range(160_000, 200_000)}
-"""Ranges of seeds by name; each judgement takes the first ones of its range."""
+SEEDS = {"building": range(100_000), "judging": range(160_000, 200_000)}
+"""Ranges of seeds by name."""
+Draw = Literal["random", "exact"]
 
 MODES = (1, MOST_MODES)
 SWINGS = (0.05, assumptions.MOST_SWINGS)
@@ -48,10 +48,14 @@ _REACH = 4.5
 """Sds of the path to either side that the field has room for."""
 _FAST_STEP_S = 0.001
 _KERNEL_SD = 0.05
+EXACT_SWINGS = (0.25, 0.5, 1.0, 2.0, 4.0)
+MAINS_HZ = (50.0, 100.0)
+AMPLITUDES = (0.5, 2.5)
+"""Amplitude of the motion when a run begins, over that of the rig file."""
 
 Geometry = Literal["line", "plane", "plane, one plant"]
 Command = Literal["none", "sine", "steps"]
-Kind = Literal["resonance", "Ornstein-Uhlenbeck", "random walk"]
+Kind = Literal["resonance", "Ornstein-Uhlenbeck", "random walk", "constant"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,14 +64,16 @@ class PlantProcess:
 
     kind: Kind
     swings: float
-    """Swings of a resonance in an exposure; for an Ornstein-Uhlenbeck process, 1/(2 pi memory in exposures); for a
-    random walk 0."""
-    damping: float
+    """Swings of a resonance in an exposure; for an Ornstein-Uhlenbeck process, 1/(2 pi memory in exposures); otherwise
+    0."""
+    damping: float = 0.0
     sd: float
     """Standard deviation of its part of the path, slope units; for a random walk, the standard deviation gained in the
     whole run."""
     direction: float
     """Direction in which it moves a spot on a plane, if one plant moves it along both axes, rad."""
+    quadrature: bool = False
+    """Whether a resonance moves such a spot on a circle instead."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -95,6 +101,11 @@ class Scene:
     masked: float
     """Share of a line sensor's pixels that are dead; the same share is missing in a frame now and then. On a plane a
     pixel that is masked costs the whole spot, so none is dead, and three in ten frames are of no use."""
+    fast_step_s: float = _FAST_STEP_S
+    amplitude: float = 1.0
+    """The motion's when a run begins, over that of the rig file."""
+    exposures: int = 24
+    """Exposures of a run; a random walk gains its sd over these."""
 
     @property
     def swings(self) -> float:
@@ -116,17 +127,20 @@ class Scene:
         parts += [f"command: {self.command}"] if self.command != "none" else []
         parts += [f"{self.lost:.0%} of frames lost"] if self.lost else []
         parts += [f"{self.masked:.0%} of pixels masked"] if self.masked else []
+        parts += [f"{self.amplitude:.2g} times the file's amplitude"] if self.amplitude != 1 else []
         return "; ".join(parts)
 
 
 def _of_mode(mode: PlantProcess) -> str:
     if mode.kind == "resonance":
-        return f"{mode.swings:.3g} swings (damping {mode.damping:.2g})"
-    return mode.kind if mode.kind == "random walk" else f"{mode.kind} ({mode.swings:.2g})"
+        return f"{mode.swings:.3g} swings (damping {mode.damping:.2g}){', on a circle' * mode.quadrature}"
+    return f"{mode.kind} ({mode.swings:.2g})" if mode.swings else mode.kind
 
 
-def draw(seed: int) -> Scene:
-    """The scene of a seed."""
+def draw(seed: int, kind: Draw = "random") -> Scene:
+    """The scene of a seed: with anything in the ranges, or with exact ratios of frequency and frame rate."""
+    if kind == "exact":
+        return _exact(seed)
     rng = np.random.default_rng([18, seed])
     geometry: Geometry = get_args(Geometry)[rng.choice(3, p=[0.6, 0.2, 0.2])]
     steps = round(_between(rng, STEPS))
@@ -147,15 +161,42 @@ def draw(seed: int) -> Scene:
     )  # fmt: skip
 
 
+def _exact(seed: int) -> Scene:
+    """A scene of lines at mains frequency: the first makes an exact number of swings in an exposure, the swings and the
+    frequency taking turns from seed to seed; and one or two more lines, or a state that stays."""
+    rng = np.random.default_rng([21, seed])
+    geometry: Geometry = ("line", "plane, one plant")[seed % 2]
+    swings, hz = EXACT_SWINGS[seed // 2 % 5], MAINS_HZ[seed // 10 % 2]
+    steps, widths = int(rng.choice([40, 80, 160])), float(rng.uniform(0.5, 4.0))
+    sds = widths * _KERNEL_SD * np.sqrt(rng.dirichlet(np.full(int(rng.integers(1, MOST_MODES + 1)), 2.0)))
+    turns = [swings, *rng.permutation([each for each in EXACT_SWINGS if each != swings])]
+    modes = [
+        PlantProcess(
+            kind="resonance", swings=float(each), damping=_between(rng, (0.002, 0.05)), sd=float(sd),
+            direction=math.pi / 4, quadrature=geometry != "line" and bool(rng.integers(2)),
+        )
+        for each, sd in zip(turns, sds, strict=False)
+    ]  # fmt: skip
+    if rng.random() < 0.5:
+        stays = float(rng.choice([1e-4, 0.3 * _KERNEL_SD]))
+        modes[2:] = [PlantProcess(kind="constant", swings=0.0, sd=stays, direction=math.pi / 4)]
+    return Scene(
+        seed=seed, geometry=geometry, modes=tuple(modes), path_widths=widths, peak_snr=_between(rng, (5.0, 300.0)),
+        steps=steps, period=steps, kernel_pixels=_between(rng, (1.0, 2.5)), command="none", command_sd=0.0,
+        command_period=1.0, lost=0.0, masked=0.0, fast_step_s=swings / hz / steps,
+        amplitude=_between(rng, AMPLITUDES), exposures=(100, 16)[int(rng.integers(2))],
+    )  # fmt: skip
+
+
 def _between(rng: np.random.Generator, ends: tuple[float, float]) -> float:
     return float(np.exp(rng.uniform(*np.log(ends))))
 
 
 def _mode(rng: np.random.Generator, steps: int, period: int, share: float, path_sd: float) -> PlantProcess:
     sd, direction = path_sd * math.sqrt(share), float(rng.uniform(0, math.pi))
-    kind: Kind = get_args(Kind)[rng.choice(3, p=[0.75, 0.15, 0.1])]
+    kind: Kind = get_args(Kind)[rng.choice(4, p=[0.75, 0.15, 0.1, 0.0])]
     if kind == "random walk":
-        return PlantProcess(kind=kind, swings=0.0, damping=0.0, sd=sd, direction=direction)
+        return PlantProcess(kind=kind, swings=0.0, sd=sd, direction=direction)
     if kind == "Ornstein-Uhlenbeck":
         swings = 1 / (2 * math.pi * _between(rng, MEMORY))
         return PlantProcess(kind=kind, swings=swings, damping=1.0, sd=sd, direction=direction)
@@ -172,17 +213,19 @@ def _half_pixels(kernel_pixels: float, path_widths: float, command_sd: float) ->
     return math.ceil(kernel_pixels / math.sqrt(2) * (path_widths * (_REACH + command_sd) + 4)) + 1
 
 
-def plant_of(scene: Scene, axes: int, exposures: int) -> Plant:
-    """The plant of a scene; ``exposures`` is the length of a run, over which a random walk gains its sd."""
+def plant_of(scene: Scene, axes: int) -> Plant:
+    """The plant of a scene, as its rig file has it."""
     outputs = 2 if scene.geometry == "plane, one plant" else 1
     blocks, noises, stationary, rows = [], [], [], []
     for mode in scene.modes:
-        A, B_w, P = _dynamics(mode, scene.steps, exposures * scene.period)
+        A, B_w, P = _dynamics(mode, scene.steps, scene.exposures * scene.period)
         blocks.append(A)
         noises.append(B_w)
         stationary.append(P)
         row = np.zeros((outputs, len(A)))
         row[:, 0] = (math.cos(mode.direction), math.sin(mode.direction)) if outputs == 2 else 1.0
+        if outputs == 2 and mode.quadrature:
+            row[:] = np.eye(2)
         rows.append(row)
     A, B_w = linalg.block_diag(*blocks), linalg.block_diag(*noises)
     n = len(A)
@@ -195,6 +238,8 @@ def plant_of(scene: Scene, axes: int, exposures: int) -> Plant:
 
 def _dynamics(mode: PlantProcess, steps: int, run_steps: int) -> tuple[FloatArray, FloatArray, FloatArray]:
     """A, B_w for noise of variance one, and the covariance at the start."""
+    if mode.kind == "constant":
+        return np.eye(1), np.zeros((1, 1)), np.array([[mode.sd**2]])
     if mode.kind == "random walk":
         sd = mode.sd / math.sqrt(run_steps)
         return np.eye(1), np.array([[sd]]), np.array([[mode.sd**2 / 10]])
@@ -209,17 +254,37 @@ def _dynamics(mode: PlantProcess, steps: int, run_steps: int) -> tuple[FloatArra
     return np.asarray(A), gain * push, np.asarray(gain**2 * of_one)
 
 
-def rig_of(scene: Scene, runs: int, exposures: int) -> Rig:
-    """The rig whose axes are the runs of a scene; frames of a line sensor have a row for each run."""
+@dataclass(frozen=True, kw_only=True)
+class SensorRows(Sensor):
+    """A line sensor for each of several independent axes, read out as the rows of one frame."""
+
+    rows: int
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns of a frame."""
+        return (self.rows, self.pixels)
+
+
+def side_by_side(rig: Rig, runs: int) -> Rig:
+    """A rig whose axes are ``runs`` independent copies of one that has a single axis."""
+    values = {f.name: getattr(rig.sensor, f.name) for f in dataclasses.fields(Sensor)}
+    plant = dataclasses.replace(rig.plant, axes=runs)
+    return dataclasses.replace(rig, plant=plant, sensor=SensorRows(**values, rows=runs))
+
+
+def rig_of(scene: Scene, runs: int, grid: tuple[int, int] | None = None) -> Rig:
+    """The rig whose axes are the runs of a scene; frames of a line sensor have a row for each run, those on a plane a
+    row of windows, or a grid."""
     kernel = Kernel(shape="gaussian", sigma=_KERNEL_SD * math.sqrt(2))
-    half = _half_pixels(scene.kernel_pixels, scene.path_widths, scene.command_sd)
+    half = _half_pixels(scene.kernel_pixels, scene.path_widths * max(1.0, scene.amplitude), scene.command_sd)
     pixel = kernel.sigma / scene.kernel_pixels
     common = {
         "field": (-half * pixel, half * pixel), "kernel": kernel, "bit_depth": 16, "black_level": 20_000.0,
         "noise_density": 0.0, "counts_per_density": 1.0,
     }  # fmt: skip
     line = SensorRows(kind="line", pixels=2 * half, rows=runs, **common)  # type: ignore[arg-type]
-    spots = SpotSensor(kind="spots", grid=(1, runs), window=(2 * half, 2 * half), **common)  # type: ignore[arg-type]
+    spots = SpotSensor(kind="spots", grid=grid or (1, runs), window=(2 * half, 2 * half), **common)  # type: ignore[arg-type]
     sensor: Sensor | SpotSensor = line if scene.geometry == "line" else spots
     peak = sensor.peak_density
     sd = peak / scene.peak_snr
@@ -230,9 +295,9 @@ def rig_of(scene: Scene, runs: int, exposures: int) -> Rig:
     base, zeros = load_rig("section-vi"), np.zeros(axes)
     return dataclasses.replace(
         base,
-        name=f"family-{scene.seed}",
-        plant=plant_of(scene, axes, exposures),
-        timing=Timing(fast_step_s=_FAST_STEP_S, exposure_steps=scene.steps, frame_period_steps=scene.period),
+        name=f"scene-{scene.seed}",
+        plant=plant_of(scene, axes),
+        timing=Timing(fast_step_s=scene.fast_step_s, exposure_steps=scene.steps, frame_period_steps=scene.period),
         sensor=sensor,
         mirror=dataclasses.replace(
             base.mirror, dac_bits=0, input_min=zeros - np.inf, input_max=zeros + np.inf, park=zeros
@@ -257,12 +322,13 @@ def commands_of(scene: Scene, plant: Plant, n_steps: int) -> FloatArray:
     return np.repeat((scale * one)[:, None], plant.axes, axis=1)
 
 
-def exposures_of(scene: Scene, runs: int, exposures: int) -> tuple[Rig, list[Exposure]]:
+def exposures_of(scene: Scene, runs: int) -> tuple[Rig, list[Exposure]]:
     """Rig and exposures of a scene; frames that are lost are not among them."""
-    rig = rig_of(scene, runs, exposures)
-    inputs = commands_of(scene, rig.plant, exposures * scene.period)
-    made = simulate(rig, exposures, scene.seed, inputs=inputs)
-    return rig, list(with_flaws(scene, rig, made))
+    rig = rig_of(scene, runs)
+    inputs = commands_of(scene, rig.plant, scene.exposures * scene.period)
+    start = scene.amplitude**2 * rig.plant.initial_covariance
+    true = dataclasses.replace(rig, plant=dataclasses.replace(rig.plant, initial_covariance=start))
+    return rig, list(with_flaws(scene, rig, simulate(true, scene.exposures, scene.seed, inputs=inputs)))
 
 
 def with_flaws(scene: Scene, rig: Rig, made: Sequence[Exposure]) -> Iterator[Exposure]:
