@@ -170,5 +170,5 @@ def copy(
         + (f"; {sum(loss.count for loss in edited.losses)} part(s) of the source lost" if edited.losses else ""),
         markup=False,
     )
-    if edited.losses and not timed and len(files) == 1:
+    if edited.losses:
         raise typer.Exit(1)

@@ -10,6 +10,7 @@ import math
 from collections import OrderedDict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import repeat
 from pathlib import Path
 from typing import Any, Self
 
@@ -131,18 +132,17 @@ def recover(source: Path, target: Path, *, overwrite: bool = False, progress: Pr
     if not recording.counts:
         raise RecordingError(f"{source} holds no whole message: there is nothing to recover")
     notes = recording.metadata | {"recovered_from": source.name}
-    messages = (raw for raw, _ in recording.sound_messages())
-    return _copied([recording], target, messages, notes, overwrite, progress)
+    return _copied([recording], target, _sound(recording), notes, overwrite, progress)
 
 
 def cut(
     source: Path, target: Path, start_s: float, end_s: float, *, overwrite: bool = False,
     progress: Progress = no_progress,
 ) -> Edited:  # fmt: skip
-    """Copy the exposures that were received between two times, s from the recording's start, with all messages that
-    they need.
+    """Copy what was recorded between two times, s from the recording's start, with all that its exposures need.
 
-    The copy also has the earlier commands that reach into the first exposure, and the reports on the last one.
+    Each exposure that was received between the two is there with its pictures and estimates, and no other; so are the
+    earlier commands that reach into the first one, and the reports on the last one.
 
     Raises
     ------
@@ -152,7 +152,7 @@ def cut(
     if not -1e9 < start_s < end_s:
         raise RecordingError(f"nothing is {between(start_s, end_s)}: the end must be after the start")
     recording = Recording(source)
-    low, high = (recording.start_ns + round(t * 1e9) for t in (min(start_s, 1e9), min(end_s, 1e9)))
+    low, high = (recording.start_ns + round(t * 1e9) for t in (min(start_s, 1e11), min(end_s, 1e11)))
     notes = _begun(recording) | {"cut_from": source.name, "cut": f"{start_s:g} s to {end_s:g} s"}
     duration_s = (recording.end_ns - recording.start_ns) / 1e9
     nothing = f"{source} has no exposure {between(start_s, end_s)}: it is {duration_s:.3g} s long"
@@ -167,7 +167,8 @@ def between(start_s: float, end_s: float) -> str:
 def merge(
     sources: Sequence[Path], target: Path, *, overwrite: bool = False, progress: Progress = no_progress
 ) -> Edited:
-    """Join the parts of one session, in any order. Messages that are in several parts are written once.
+    """Join the parts of one session, in any order. What several parts hold is written once; equal messages within one
+    are several messages.
 
     Raises
     ------
@@ -183,6 +184,9 @@ def merge(
             raise RecordingError(
                 f"{other.path} is not of the same session as {first.path}: only parts of one session can be merged"
             )
+        first.schemas = other.schemas | first.schemas
+        first.encodings = other.encodings | first.encodings
+        first.attachments = other.attachments | first.attachments
     notes = _begun(first) | {"merged_from": " ".join(each.path.name for each in recordings)}
     end = recordings[-1].end_metadata
     return _copied(recordings, target, _joined(recordings), notes, overwrite, progress, end=end)
@@ -219,55 +223,57 @@ def _copied(
 
 
 def _between(recording: Recording, low: int, high: int) -> Iterator[RawMessage]:
-    lead, frames = Lead(), set[int]()
-    wanted: set[str] = set()  # pictures that belong to an exposure between the two
-    last_step = -1
+    lead, begun, last_step = Lead(), False, -1
+    frames: dict[int, bool] = {}  # whether the exposure is between the two; a message of one that was lost counts itself
+    wanted: dict[str, bool] = {}  # the same of the pictures that come next
     message: Any  # it has what its row of the table says
     for raw, message in recording.sound_messages():
-        row = topics.find(raw.topic, message)
-        inside = low <= raw.log_time_ns < high
-        if raw.topic in topics.PICTURES:
-            among = inside if raw.topic == topics.EXPOSURE else getattr(message, "frame_id", None) in frames
-            (wanted.update if among else wanted.difference_update)(topics.PICTURES[raw.topic])
-        if raw.topic == topics.EXPOSURE and message is not None:
-            if inside:
-                if not frames:
-                    yield from (RawMessage.of(*each) for each in lead.messages())
-                frames.add(message.frame_id)
-                last_step = message.last_step
-                yield raw
+        row, chosen = topics.find(raw.topic, message), low <= raw.log_time_ns < high
+        if chosen and not begun:
+            begun = True
+            yield from (RawMessage.of(*each) for each in lead.messages())
+        if row.name == topics.EXPOSURE:
+            frames[message.frame_id] = chosen
+            last_step = message.last_step if chosen else last_step
         elif row.after:
-            if raw.topic in wanted:
-                yield raw
+            chosen = wanted.get(raw.topic, chosen)
+        elif row.belongs_to == "exposure":
+            chosen = frames.get(message.frame_id, chosen)
         elif row.belongs_to == "steps":
             # Also after the end, until the last exposure is complete.
-            if frames and (inside or message.first_step <= last_step):
-                yield raw
-        elif row.belongs_to == "exposure":
-            if message.frame_id in frames:
-                yield raw
-        elif inside and frames:
+            chosen = begun and (raw.log_time_ns < high or message.first_step <= last_step)
+        wanted.update(dict.fromkeys(topics.PICTURES.get(raw.topic, ()), chosen))
+        if chosen:
             yield raw
-        if message is not None and not frames:
+        if message is not None and not begun:
             lead.add(raw.topic, message, raw.log_time_ns, raw.sequence)
 
 
 def _joined(recordings: Sequence[Recording]) -> Iterator[RawMessage]:
-    recent: OrderedDict[tuple[str, int, bytes], int] = OrderedDict()  # its first key is found at once, unlike a dict's
-    frames: dict[int, int] = {}
-    sound = ((raw for raw, _ in each.sound_messages()) for each in recordings)
-    for key, raw in heapq.merge(*map(in_time, sound), key=lambda each: each[0]):
-        name = (raw.topic, raw.log_time_ns, raw.data)
-        if name in recent:
-            continue
-        while recent and recent[next(iter(recent))] < key - _ALIKE_NS:
+    """A message that several recordings hold is written as often as that one holds it that has it most often."""
+    # Its first key is found at once, unlike a dict's. For each message: its time, and how often each recording had it.
+    recent: OrderedDict[tuple[str, int, bytes], tuple[int, list[int]]] = OrderedDict()
+    frames: dict[int, tuple[int, bytes]] = {}
+    sound = (zip(repeat(k), in_time(_sound(each))) for k, each in enumerate(recordings))
+    for source, (key, raw) in heapq.merge(*sound, key=lambda each: each[1][0]):
+        while recent and recent[next(iter(recent))][0] < key - _ALIKE_NS:
             recent.popitem(last=False)
-        recent[name] = key
+        name = (raw.topic, raw.log_time_ns, raw.data)
+        _, held = recent.pop(name, (0, [0] * len(recordings)))
+        recent[name] = key, held
+        written = max(held)
+        held[source] += 1
+        if held[source] <= written:
+            continue
         if raw.topic == topics.EXPOSURE and raw.schema == schemas_pb2.ExposureInfo.DESCRIPTOR.full_name:
             frame_id = schemas_pb2.ExposureInfo.FromString(raw.data).frame_id
-            if frame_id in frames:
+            other, data = frames.setdefault(frame_id, (source, raw.data))
+            if other != source and data != raw.data:
                 raise RecordingError(
                     f"frame {frame_id} is in two of the recordings, but not the same: nothing to merge"
                 )
-            frames[frame_id] = key
         yield raw
+
+
+def _sound(recording: Recording) -> Iterator[RawMessage]:
+    return (raw for raw, _ in recording.sound_messages())

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -78,7 +77,6 @@ class RecordedMessages:
         """Encoding of the messages by topic, where the file states it."""
         self.chunk_index: list[ChunkIndex] | None = None
         """The index of chunks; None where the file is scanned."""
-        self.index_digest: str | None = None
         self.left_out: frozenset[str] = frozenset()
         """Topics that are read from side files instead."""
         self._second_rig_text: str | None = None
@@ -105,17 +103,10 @@ class RecordedMessages:
 
     @cached_property
     def digest(self) -> str:
-        """The name of the recording in side files: SHA-256 of its index, which has the place and the length of all
-        records. Where there is no index, it is that of the results of a scan: rig, session, times and counts."""
-        if self.index_digest is None:
-            with open_recording(self.path) as file:
-                summary = read_summary(file)
-            if summary is not None and summary.is_index:
-                self.index_digest = summary.digest
-        if self.index_digest is not None:
-            return self.index_digest
-        facts = [self.rig_text, self.metadata.get("session"), self.start_ns, self.end_ns, sorted(self.counts.items())]
-        return hashlib.sha256(json.dumps(facts).encode()).hexdigest()
+        """The name of the recording in side files: SHA-256 of its bytes. An index would be cheaper to read, but two
+        recordings may have the same one."""
+        with open_recording(self.path) as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
 
     @property
     def side_of(self) -> str:
@@ -149,7 +140,6 @@ class RecordedMessages:
         held: dict[int, int] = {}
         """Number of messages by the channel's id."""
         if summary is not None and summary.is_index and (known := summary.statistics) is not None:
-            self.index_digest = summary.digest
             self.chunk_index, held = summary.chunks, dict(sorted(known.channel_message_counts.items()))
             self.start_ns, self.end_ns = known.message_start_time, known.message_end_time
             records = self._summarised(summary)

@@ -8,7 +8,6 @@ and no more time than a few readings of it.
 
 from __future__ import annotations
 
-import hashlib
 import os
 import stat
 import struct
@@ -93,8 +92,6 @@ class Summary:
     channels: dict[int, Channel] = field(default_factory=dict)
     chunks: list[ChunkIndex] = field(default_factory=list)
     others: list[AttachmentIndex | MetadataIndex] = field(default_factory=list)
-    digest: str = ""
-    """SHA-256 of its bytes."""
 
     @property
     def is_index(self) -> bool:
@@ -164,7 +161,7 @@ def read_summary(file: IO[bytes]) -> Summary | None:
 
 
 def _parse_summary(data: bytes, budget: Budget) -> Summary | None:
-    summary = Summary(digest=hashlib.sha256(data).hexdigest())
+    summary = Summary()
     records: list[McapRecord] = []
     position = 0
     try:

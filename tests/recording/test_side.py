@@ -9,6 +9,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from mcap.writer import CompressionType
+from mcap_protobuf.writer import Writer
 
 import aolink
 from aolink.batch import Model, estimate_file
@@ -48,6 +50,22 @@ def test_a_side_file_holds_no_frames_and_says_what_it_belongs_to(recorded: Sessi
     assert side.counts == {"/estimate/moments": EXPOSURES}
     assert side.side_of == Recording(recorded.path).digest == Recording(recorded.path, check=True).digest
     assert side.metadata["estimated_from"] == recorded.path.name
+
+
+def test_a_recording_of_the_same_schedule_does_not_take_it(tmp_path: Path) -> None:
+    """Their indexes are the same: that of an uncompressed file has lengths and times alone."""
+    for name, pixels in (("a.mcap", "black"), ("b.mcap", "full")):
+        plain = write_small(tmp_path / name, 3, pixels)  # type: ignore[arg-type]
+        with (tmp_path / f"uncompressed-{name}").open("wb") as file:
+            writer = Writer(file, compression=CompressionType.NONE)
+            writer.add_attachment(0, 0, "rig.toml", "application/toml", Recording(plain).rig.toml.encode())
+            for each in Recording(plain).messages():
+                writer.write_message(each.topic, each.message, each.log_time_ns, each.log_time_ns, each.sequence)
+            writer.finish()
+    estimate_file(tmp_path / "uncompressed-a.mcap", side := tmp_path / "side.mcap", "o1")
+    assert (tmp_path / "uncompressed-a.mcap").stat().st_size == (tmp_path / "uncompressed-b.mcap").stat().st_size
+    with pytest.raises(RecordingError, match="belong"):
+        Recording(tmp_path / "uncompressed-b.mcap", side=[side])
 
 
 def test_two_side_files_of_one_recording_stand_side_by_side(tmp_path: Path) -> None:
