@@ -224,7 +224,9 @@ def _copied(
 
 def _between(recording: Recording, low: int, high: int) -> Iterator[RawMessage]:
     lead, begun, last_step = Lead(), False, -1
-    frames: dict[int, bool] = {}  # whether the exposure is between the two; a message of one that was lost counts itself
+    frames: dict[
+        int, bool
+    ] = {}  # whether the exposure is between the two; a message of one that was lost counts itself
     wanted: dict[str, bool] = {}  # the same of the pictures that come next
     message: Any  # it has what its row of the table says
     for raw, message in recording.sound_messages():
@@ -251,7 +253,7 @@ def _between(recording: Recording, low: int, high: int) -> Iterator[RawMessage]:
 
 def _joined(recordings: Sequence[Recording]) -> Iterator[RawMessage]:
     """A message that several recordings hold is written as often as that one holds it that has it most often."""
-    # Its first key is found at once, unlike a dict's. For each message: its time, and how often each recording had it.
+    # Its first key is found at once, unlike a dict's. The time of each message, and how often each recording had it.
     recent: OrderedDict[tuple[str, int, bytes], tuple[int, list[int]]] = OrderedDict()
     frames: dict[int, tuple[int, bytes]] = {}
     sound = (zip(repeat(k), in_time(_sound(each))) for k, each in enumerate(recordings))

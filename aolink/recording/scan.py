@@ -14,7 +14,7 @@ import struct
 import zlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
-from io import BytesIO
+from io import BufferedReader, BytesIO
 from pathlib import Path
 from typing import IO
 
@@ -110,7 +110,7 @@ class Summary:
         )
 
 
-def open_recording(path: Path) -> IO[bytes]:
+def open_recording(path: Path) -> BufferedReader:
     """Open a file that should be a recording.
 
     Raises

@@ -4,8 +4,9 @@ and connections."""
 from __future__ import annotations
 
 import re
+from collections import deque
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, field
 from typing import cast
 
 from foxglove_schemas_protobuf.Log_pb2 import Log
@@ -21,6 +22,21 @@ _COUNTS = {each.name for each in pb.ConnectionStatistics.DESCRIPTOR.fields} - {"
 """What a device may count."""
 _NUMBER = re.compile(r"(?<![\w.:=-])[-+]?\d[\d.e+-]*")
 """A number, but not one that is part of a name, as in ``o3`` or ``sampled:particles=1000``."""
+_AT_ONCE = 5
+_MINUTE_NS = 60_000_000_000
+
+
+@dataclass
+class _Said:
+    """Warnings of one kind."""
+
+    times_ns: deque[int] = field(default_factory=lambda: deque(maxlen=_AT_ONCE))
+    """When the newest were said."""
+    newest: str = ""
+    """The newest that was said, and its place in the report."""
+    place: int = 0
+    left_out: int = 0
+    """How many have come since."""
 
 
 class Journal:
@@ -31,8 +47,8 @@ class Journal:
         self.record = writer.write
         self._time = time
         self.answers = AnswerCounter()
-        self._said: dict[str, tuple[int, str, int]] = {}
-        """The warnings by their kind: place in the report, text of the first one, how many there were."""
+        self._said: dict[str, _Said] = {}
+        """The warnings by their kind."""
 
     def log(self, text: str, level: Log.Level.ValueType = Log.INFO) -> None:
         """Record a sentence about the session."""
@@ -42,16 +58,18 @@ class Journal:
         self.record(topics.LOG, entry, now)
 
     def warn(self, text: str, level: Log.Level.ValueType = Log.WARNING) -> None:
-        """Record a warning, which the report has as well. Those that differ only in their numbers are of one kind: the
-        first one is recorded, and the report has the number of the others."""
-        warnings = self.report.warnings
-        place, first, before = self._said.get(kind := _NUMBER.sub("", text), (len(warnings), text, 0))
-        self._said[kind] = place, first, before + 1
-        if before:
-            warnings[place] = f"{first} ({before + 1} times)"
-            return
-        warnings.append(text)
-        self.log(text, level)
+        """Record a warning, which the report has as well. Of those that differ only in their numbers, `_AT_ONCE` are
+        said in a minute; the report has the number of the others."""
+        now, warnings = self._time.now_ns(), self.report.warnings
+        said = self._said.setdefault(_NUMBER.sub("", text), _Said())
+        if len(said.times_ns) < _AT_ONCE or now - said.times_ns[0] > _MINUTE_NS:
+            said.times_ns.append(now)
+            said.newest, said.place, said.left_out = text, len(warnings), 0
+            warnings.append(text)
+            self.log(text, level)
+        else:
+            said.left_out += 1
+            warnings[said.place] = f"{said.newest} (and {said.left_out} more of this kind)"
 
     def latency(self, latency: pb.Latency, log_time_ns: int) -> None:
         self.record(topics.LATENCY, latency, log_time_ns)

@@ -36,20 +36,39 @@ def test_a_count_that_recordings_have_no_field_for_is_named_once_and_left_out(tm
     assert counted == [ConnectionStatistics(device="mirror", bytes_sent=7)] * 2
 
 
-def test_warnings_that_differ_in_their_numbers_are_said_once_with_their_count(tmp_path: Path) -> None:
-    rig, report = load_rig("section-vi"), Report()
+class Seconds(Host):
+    """A clock that goes on by as much as it is told."""
+
+    now = 0
+
+    def now_ns(self) -> int:
+        return self.now
+
+
+def test_warnings_of_one_kind_are_limited_in_their_rate_and_the_others_counted(tmp_path: Path) -> None:
+    rig, report, time = load_rig("section-vi"), Report(), Seconds()
     with RecordingWriter(tmp_path / "a.mcap", rig, {}, 0, deterministic=True) as writer:
-        journal = Journal(writer, report, Host())
+        journal = Journal(writer, report, time)
         for frame in range(512):
             journal.warn(f"the model no longer fits (frame {frame}): NIS {frame / 7:.2f}, correlation {frame / 9:+.2g}")
-            journal.warn(f"the model fits again (frame {frame})")
         for name in ("o1", "o3", "profile:draws=10", "profile:draws=20"):
             journal.warn(f"the estimator {name} failed: after {len(name)} s")
+        time.now += 3_600_000_000_000
+        journal.warn("the model no longer fits (frame 9999): NIS 3.10, correlation +2")
         writer.close(report.counts())
-    fits, again, *others = report.warnings
-    assert fits == "the model no longer fits (frame 0): NIS 0.00, correlation +0 (512 times)"
-    assert again == "the model fits again (frame 0) (512 times)"
-    assert len(others) == 4
-    recording = Recording(tmp_path / "a.mcap")
-    assert recording.counts[topics.LOG] == 6
-    assert len(recording.metadata["warnings"]) < 400
+    fits, others = report.warnings[:5], report.warnings[5:9]
+    assert [each.partition("frame ")[2][0] for each in fits] == [*"01234"]
+    assert fits[4].endswith("(and 507 more of this kind)")
+    assert len({*others}) == 4
+    assert "frame 9999" in report.warnings[9]
+    assert Recording(tmp_path / "a.mcap").counts[topics.LOG] == len(report.warnings) == 10
+
+
+def test_a_warning_with_another_number_is_said(tmp_path: Path) -> None:
+    report = Report()
+    with RecordingWriter(tmp_path / "a.mcap", load_rig("section-vi"), {}, 0, deterministic=True) as writer:
+        journal = Journal(writer, report, Host())
+        said = [f"the camera's clock was set forward by {step} s" for step in ("0.000120", "3600.000000")]
+        for text in said:
+            journal.warn(text)
+    assert report.warnings == said
