@@ -67,8 +67,8 @@ def estimate_file(
     """Estimate one recording and write a side file: its estimates alone, which refer to the recording.
 
     A recording that was done before with the same arguments and version of aolink is not done again. The recording is
-    read twice: for its digest and for its exposures. Several processes may call this at the same time, on any machines that share
-    the folder of ``out``; the file appears when it is whole.
+    read twice: for its digest and for its exposures. Several processes may call this at the same time, on any machines
+    that share the folder of ``out``; the file appears when it is whole.
 
     Parameters
     ----------

@@ -224,9 +224,7 @@ def _copied(
 
 def _between(recording: Recording, low: int, high: int) -> Iterator[RawMessage]:
     lead, begun, last_step = Lead(), False, -1
-    frames: dict[
-        int, bool
-    ] = {}  # whether the exposure is between the two; a message of one that was lost counts itself
+    frames: dict[int, bool] = {}  # whether it is between the two; where it was lost, each message counts by itself
     wanted: dict[str, bool] = {}  # the same of the pictures that come next
     message: Any  # it has what its row of the table says
     for raw, message in recording.sound_messages():

@@ -115,7 +115,7 @@ def test_a_camera_that_sends_nothing_more_is_still_an_error(tmp_path: Path) -> N
 
 
 @pytest.mark.slow
-def test_several_are_said_once_with_their_number(tmp_path: Path) -> None:
+def test_each_of_several_is_said(tmp_path: Path) -> None:
     left = [80, 50, 20]
     hub = SimulatedTimeHub(RIG)
 
@@ -125,8 +125,7 @@ def test_several_are_said_once_with_their_number(tmp_path: Path) -> None:
             hub.hold_up(1.2)
 
     run = run_session(hub, RIG, tmp_path / "a.mcap", 100, progress=progress)
-    (said,) = run.report.warnings
-    assert said.endswith("may be lost (3 times)")
+    assert [each.endswith("may be lost") for each in run.report.warnings] == [True] * 3
 
 
 @pytest.mark.slow
