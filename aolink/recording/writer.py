@@ -34,14 +34,12 @@ _QUEUE_BYTES = 256 << 20
 """Most bytes that may wait for the disk."""
 _POLL_S = 0.005
 """Time between two checks of the queue, s: waking the thread for each message would cost more than the writing."""
-_STALL_S = 5.0
-"""A disk that takes longer over one write stops the session."""
-_AGAIN_S = 0.1
+_END_S = 60.0
+"""How long the end of a recording waits for one write."""
 _LOOK_S = 1.0
 """Time between two comparisons of the open file with its path, s."""
 _LOOK_BYTES = 16 << 10
-"""Bytes that go to the file between two readings of the clock, by which a stalled disk and the next synchronisation are
-noticed."""
+"""Bytes that go to the file between two readings of the clock, by which the next synchronisation is noticed."""
 _MESSAGE_BYTES = 64
 """Least bytes of a message in the queue besides its data."""
 _LARGEST_BASIS = 32 << 20
@@ -155,8 +153,7 @@ class RecordingWriter:
         if self._error:
             raise self._error
         data = message.SerializeToString()  # fields by their numbers: without maps always the same bytes
-        since = self._busy_since  # `_is_stalled`, for less: most messages come this way
-        if (since is not None and time.monotonic() - since > _STALL_S) or self._is_full():
+        if self._is_full():
             self._wait_for_room()
         if topic not in self._classes:
             self._classes[topic] = type(message)
@@ -164,21 +161,26 @@ class RecordingWriter:
         self._queue.append((topic, None if self._lead is None else message, data, log_time_ns))
 
     def _wait_for_room(self) -> None:
-        if self._is_stalled():  # or this whole process was stopped, and the thread has not gone on yet
-            time.sleep(_AGAIN_S)
-        while self._is_stalled() or self._is_full():
+        while self._is_full():
             if self._error:
                 raise self._error
-            if self._is_stalled() or not self._deterministic:  # a caller that has time to wait, waits
+            if not self._deterministic:  # a caller that has time to wait, waits
                 raise RecordingError(f"the disk of {self.path} is too slow for this session: record to a faster one")
             time.sleep(0.01)
 
     def _is_full(self) -> bool:
-        return self._put_bytes - self._taken_bytes > _QUEUE_BYTES
+        return self.waiting_bytes > _QUEUE_BYTES
 
-    def _is_stalled(self) -> bool:
+    @property
+    def waiting_bytes(self) -> int:
+        """Bytes that wait for the disk."""
+        return self._put_bytes - self._taken_bytes
+
+    @property
+    def held_up_s(self) -> float:
+        """How long the disk has been at its present work, s."""
         since = self._busy_since
-        return since is not None and time.monotonic() - since > _STALL_S
+        return 0.0 if since is None else time.monotonic() - since
 
     def close(self, end_metadata: dict[str, str] | None = None) -> None:
         """Write the queued messages, the index and ``end_metadata``. Raises RecordingError as `write` does."""
@@ -187,7 +189,7 @@ class RecordingWriter:
         self._closed = True
         self._end_metadata = end_metadata or {}
         self._ending.set()
-        while self._thread.is_alive() and not self._is_stalled():
+        while self._thread.is_alive() and self.held_up_s < _END_S:
             self._thread.join(0.1)
         if self._thread.is_alive():
             raise RecordingError(f"the disk of {self.path} does not answer: the end of the recording may be missing")

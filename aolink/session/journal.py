@@ -22,6 +22,8 @@ _COUNTS = {each.name for each in pb.ConnectionStatistics.DESCRIPTOR.fields} - {"
 """What a device may count."""
 _NUMBER = re.compile(r"(?<![\w.:=-])[-+]?\d[\d.e+-]*")
 """A number, but not one that is part of a name, as in ``o3`` or ``sampled:particles=1000``."""
+_DISK_S = 2.0
+"""Of a disk that takes longer over one write, a warning says how long."""
 _AT_ONCE = 5
 _MINUTE_NS = 60_000_000_000
 
@@ -44,7 +46,7 @@ class Journal:
 
     def __init__(self, writer: RecordingWriter, report: Report, time: Time) -> None:
         self.report = report
-        self.record = writer.write
+        self.record, self._writer = writer.write, writer
         self._time = time
         self.answers = AnswerCounter()
         self._said: dict[str, _Said] = {}
@@ -110,6 +112,14 @@ class Journal:
             message.device_ns = mirror.clock.device_ns(receive_ns)[0] if mirror.clock.ready else 0
         self.record(topics.ANSWER, message, receive_ns)
         self.answers.answered(message)
+
+    def disk(self) -> None:
+        """Warn of a disk that is held up: what ends the session is a full queue."""
+        if not self._time.virtual and (held_up_s := self._writer.held_up_s) > _DISK_S:
+            self.warn(
+                f"the disk of {self._writer.path} has not taken a write for {held_up_s:.1f} s:"
+                f" {self._writer.waiting_bytes} bytes wait"
+            )
 
     def statistics(self, devices: Sequence[Camera | Mirror], now: int) -> None:
         """Record what each connection has counted."""

@@ -450,6 +450,7 @@ class SessionLoop:
     def _note_statistics(self, now: int) -> None:
         self._count_tries()
         self._journal.statistics(self._devices, now)
+        self._journal.disk()
         self.report.chunks_refused = self._camera.chunks_refused
 
     def _count_tries(self) -> None:

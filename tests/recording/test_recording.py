@@ -267,8 +267,11 @@ def test_whatever_goes_wrong_in_the_writers_thread_reaches_the_session(tmp_path:
 
 
 @pytest.mark.slow
-def test_a_disk_that_does_not_answer_is_an_error_not_a_hang(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_disk_that_does_not_answer_is_an_error_when_the_queue_is_full(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A write that blocks: a pipe whose reader has stopped reading stands for the disk."""
+    monkeypatch.setattr("aolink.recording.writer._QUEUE_BYTES", 4 << 20)
     reader, disk = os.pipe()
     fcntl.fcntl(disk, fcntl.F_SETPIPE_SZ, 1 << 20)  # for what a recording begins with
     path, open_file = tmp_path / "a.mcap", os.open
@@ -288,8 +291,10 @@ def test_a_disk_that_does_not_answer_is_an_error_not_a_hang(tmp_path: Path, monk
 
     with pytest.raises(RecordingError, match="is too slow for this session"):
         record_much()
+    monkeypatch.setattr("aolink.recording.writer._END_S", 0.5)
     with pytest.raises(RecordingError, match="does not answer"):
         writer.close()
+    assert writer.held_up_s > 0.5
     os.close(reader)  # lets the thread go
 
 

@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
+import os
+import re
+import threading
+import time
 from pathlib import Path
 from typing import Any
+
+import pytest
 
 from aolink.devices.host import Host
 from aolink.devices.no_mirror import NoMirror
 from aolink.recording import topics
+from aolink.recording.mcap_file import WriteOptions
 from aolink.recording.reader import Recording
 from aolink.recording.schemas_pb2 import ConnectionStatistics
 from aolink.recording.writer import RecordingWriter
@@ -72,3 +79,29 @@ def test_a_warning_with_another_number_is_said(tmp_path: Path) -> None:
         for text in said:
             journal.warn(text)
     assert report.warnings == said
+
+
+def test_a_disk_that_is_held_up_is_a_warning_not_the_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """However long a write takes, few bytes wait; the warning says how long, and nothing is lost."""
+    goes_on, held_up, sync = threading.Event(), threading.Event(), os.fsync
+
+    def slow(descriptor: int) -> None:
+        held_up.set()
+        goes_on.wait()
+        sync(descriptor)
+
+    report, clock, begin = Report(), [0.0], time.monotonic()
+    with RecordingWriter(
+        tmp_path / "a.mcap", load_rig("section-vi"), {}, 0, options=WriteOptions(fsync_s=0.01)
+    ) as writer:
+        journal = Journal(writer, report, Host())
+        monkeypatch.setattr(os, "fsync", slow)
+        held_up.wait()
+        monkeypatch.setattr(time, "monotonic", lambda: begin + clock[0])
+        clock[0] = 30.0
+        journal.log("goes on")
+        journal.disk()
+        goes_on.set()
+    (warning,) = report.warnings
+    assert re.search(r"(29|30)\.\d s", warning)
+    assert Recording(tmp_path / "a.mcap").counts[topics.LOG] == 2
