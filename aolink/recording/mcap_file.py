@@ -68,13 +68,29 @@ AT_LEISURE = WriteOptions(compression="zstd", chunk_bytes=1 << 20, flush_s=60.0)
 
 
 class _File:
-    """An open file that writes all bytes or raises an error."""
+    """An open file that writes all bytes or raises an error.
+
+    Where another program has shortened it, its beginning is written again, so that what comes afterwards can be read.
+    """
 
     def __init__(self, descriptor: int) -> None:
         self.descriptor = descriptor
+        self.beginning: list[bytes] = []
+        """The first bytes, as far as nothing can be read without them."""
+        self.is_begun = self.was_shortened = False
         self._position = 0
 
+    def check_size(self) -> None:
+        """Note whether the file is shorter than what was written to it. Raises OSError."""
+        if os.fstat(self.descriptor).st_size < self._position:
+            self.was_shortened = True
+            os.pwrite(self.descriptor, b"".join(self.beginning), 0)
+            os.ftruncate(self.descriptor, self._position)
+
     def write(self, data: bytes) -> int:
+        self.check_size()
+        if not self.is_begun:
+            self.beginning.append(data)
         view = memoryview(data)
         while view:
             written = os.write(self.descriptor, view)
@@ -138,6 +154,13 @@ class McapFile:
         """Whether a chunk has been begun that is not in the file."""
         return self._chunk_start_ns is not None
 
+    @property
+    def was_shortened(self) -> bool:
+        """Whether another program has emptied or shortened the file: what comes afterwards is in it all the same."""
+        if not (self._closed or self._file.was_shortened):
+            self._file.check_size()
+        return self._file.was_shortened
+
     def add_attachment(self, name: str, media_type: str, data: bytes, time_ns: int) -> None:
         self.flush()
         self._writer.add_attachment(time_ns, time_ns, name, media_type, data)
@@ -153,6 +176,7 @@ class McapFile:
         encoding: str = MessageEncoding.Protobuf,
     ) -> None:  # fmt: skip
         """Add a message; the chunk before it goes to the file if it is old enough by the messages' own times."""
+        self._file.is_begun = True
         channel = self._channels.get(topic)
         if channel is None:
             channel = self._channels[topic] = self._register(topic, schema, encoding)

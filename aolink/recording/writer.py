@@ -275,9 +275,14 @@ class RecordingWriter:
             self.notes.append(f"parts of an older session were removed: {', '.join(removed)}")
 
     def _look(self) -> None:
-        """End the session where the file's name is no longer its own."""
+        """End the session where the file's name is no longer its own, or its content is gone."""
         if self._error is None and not self._place.is_there():
             self._error = RecordingError(f"{self._place.path} was removed, renamed or replaced by another program")
+        if self._error is None and self._file.was_shortened:
+            self._error = RecordingError(
+                f"{self._place.path} was emptied or shortened by another program: what it held is lost, what came"
+                " afterwards is in it"
+            )
 
     def _run(self) -> None:
         options = self._options

@@ -261,3 +261,28 @@ def test_a_file_whose_name_is_no_longer_its_own_ends_the_session_and_is_kept(
     assert len(list(found)) == EXPOSURES
     if what is replaced:
         assert (folder / "a.mcap").read_bytes() == b"theirs"
+
+
+@pytest.mark.parametrize("at_the_end", [False, True])
+@pytest.mark.parametrize("left", [0, 60_000])
+def test_a_file_that_is_emptied_or_shortened_ends_the_session_and_has_what_came_afterwards(
+    recorded: Session, tmp_path: Path, seconds: list[float], left: int, at_the_end: bool
+) -> None:
+    writing = Writing(recorded.path, path := tmp_path / "a.mcap")
+    for _ in range(3):
+        writing.write()
+    wait_until(lambda: path.stat().st_size > 2 * 60_000)
+    os.truncate(path, left)
+    writing.write()
+    if not at_the_end:
+        seconds.append(2.0)
+        with pytest.raises(RecordingError, match="shortened"):
+            writing.write_on()
+    with pytest.raises(RecordingError, match="shortened"):
+        writing.writer.close({"ended": "complete"})
+    found = Recording(path)
+    assert found.metadata["ended"] == "complete"
+    frames = [each.frame_id for each in found]
+    assert frames[-EXPOSURES:] == list(range(1, EXPOSURES + 1))
+    assert len(frames) < 4 * EXPOSURES
+    assert found.losses

@@ -281,6 +281,7 @@ def test_a_disk_that_does_not_answer_is_an_error_when_the_queue_is_full(
 
     monkeypatch.setattr(os, "open", of_a_slow_disk)
     monkeypatch.setattr(os, "ftruncate", lambda *_: None)  # which no pipe has
+    monkeypatch.setattr("aolink.recording.mcap_file._File.check_size", lambda _: None)
     monkeypatch.setattr(os.path, "samestat", lambda *_: True)  # nor is it the file that its path names
     writer = RecordingWriter(path, load_rig("section-vi"), {}, 0)
     os.read(reader, 1 << 20)
