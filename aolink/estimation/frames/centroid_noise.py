@@ -36,7 +36,7 @@ def centroid_covariance(rig: Rig) -> FloatArray:
 
 
 def _of_whole_spot(sensor: BaseSensor, n_outputs: int) -> FloatArray:
-    """Covariance of one spot's first moments by read-out noise, known flux, (1, 1), or (2, 2) for both directions."""
+    """Covariance of one spot's first moments by read-out noise, (1, 1), or (2, 2) for both directions."""
     line = sensor.profile
     _, first, second = noise_integrals(line, 2)
     own, other = effective_noise_density(line) * second, effective_noise_density(sensor) * first**2

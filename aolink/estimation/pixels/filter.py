@@ -62,7 +62,7 @@ class MixtureUpdate:
     """The posterior of the state at the exposure's end, without the response to the inputs."""
     innovation: Innovation
     log_evidence: FloatArray
-    """Log-likelihood of the pixels, by Laplace's method or, in `sampled`, by tempering, (axes,)."""
+    """Log-likelihood of the pixels, (axes,)."""
     several: BoolArray
     """Whether the posterior has several modes (more than one path explains the blur), (axes,)."""
     poor: BoolArray

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -131,11 +130,6 @@ def joined(*mixtures: GaussianMixture) -> GaussianMixture:
     """All components of several mixtures, their weights normalised together."""
     log_weight, mean, covariance = (np.concatenate(each, axis=1) for each in zip(*mixtures, strict=True))
     return GaussianMixture(log_weight - log_sum(log_weight, axis=1)[:, None], mean, covariance)
-
-
-def stacked_axes(mixtures: Sequence[GaussianMixture]) -> GaussianMixture:
-    """Mixtures of different axes, one after the other."""
-    return GaussianMixture(*map(np.concatenate, zip(*mixtures, strict=True)))
 
 
 def log_sum(values: FloatArray, axis: int) -> FloatArray:
