@@ -201,6 +201,7 @@ def record(
             path, rig, session_facts, start_ns, overwrite=overwrite, deterministic=clock.virtual,
             attachments=attachments, options=options,
         )  # fmt: skip
+        aside.enter_context(_closed_at_last(writer, report))
         report.warnings += warnings
         show, beside = _shown(rig, watch), None
         if not clock.virtual:
@@ -213,17 +214,17 @@ def record(
         try:
             loop.run(exposures, stop, progress)
         except BaseException as error:
+            report.ended = f"error: {error}" if isinstance(error, AolinkError) else f"error: {error!r}"
             clock.hurry()
             try:
                 _make_safe(loop)
                 if isinstance(error, ControlError):
                     error.args = (f"{error}; the mirror is parked",)
-            except AolinkError as unsafe:
+            except Exception as unsafe:  # also one of a driver
                 report.warnings.append(str(unsafe))
-            report.ended = f"error: {error}" if isinstance(error, AolinkError) else f"error: {error!r}"
-            with contextlib.suppress(AolinkError):
+            with contextlib.suppress(Exception):
                 loop.close_account()
-            with contextlib.suppress(AolinkError):
+            with contextlib.suppress(Exception):
                 loop.finish_estimates(ESTIMATES_S if isinstance(error, PortError | DeviceError) else 0.0)
             if not (isinstance(error, PortError | DeviceError) and stop()):
                 with contextlib.suppress(AolinkError):
@@ -246,6 +247,18 @@ def record(
     if not writer.paths:
         report.warnings.append(f"no exposure came: {path} is as it was")
     return report
+
+
+@contextlib.contextmanager
+def _closed_at_last(writer: RecordingWriter, report: Report) -> Iterator[None]:
+    """Whatever ends the session, its recording gets its index and facts."""
+    try:
+        yield
+    except BaseException as error:
+        report.ended = report.ended if report.ended.startswith("error") else f"error: {error!r}"
+        with contextlib.suppress(AolinkError):
+            writer.close(report.counts())  # this does nothing where it was closed
+        raise
 
 
 def _make_safe(loop: SessionLoop) -> None:

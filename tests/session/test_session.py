@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 import aolink
+from aolink.devices.native import NativeMirror
 from aolink.estimation import Driver, run, score
 from aolink.recording import topics
 from aolink.recording.compare import compare
@@ -256,3 +257,25 @@ def test_the_commands_of_a_session_by_hand_work_one_after_the_other(
     estimated = aolink("estimate", "a.mcap", "--estimator", "o3", "--estimator", "o1", "-o", "b.mcap")
     assert estimated.returncode == 0, estimated.stderr
     assert aolink("view", "b.mcap", "-o", "b.rrd").returncode == 0
+
+
+def test_a_recording_is_closed_whatever_is_raised_while_the_mirror_is_parked(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By a driver of another package, whose errors are not aolink's."""
+
+    def broken(*_: object, **__: object) -> None:
+        raise ZeroDivisionError("a driver's own")
+
+    def failing(exposures: int) -> None:
+        if exposures >= 3:
+            raise LookupError("the caller's own")
+
+    monkeypatch.setattr(NativeMirror, "park", broken)
+    rig = load_rig("section-vi")
+    with simulated_rig("section-vi") as (camera, mirror), pytest.raises(LookupError):
+        record(rig, camera, mirror, path := tmp_path / "a.mcap", exposures=8, progress=failing)
+    recording = Recording(path, check=True)
+    assert recording.complete
+    assert recording.end_metadata["ended"].startswith("error: LookupError")
+    assert recording.n_frames >= 3
