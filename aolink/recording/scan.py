@@ -94,6 +94,11 @@ class Summary:
     others: list[AttachmentIndex | MetadataIndex] = field(default_factory=list)
 
     @property
+    def places(self) -> list[int]:
+        """First bytes of the chunks, attachments and metadata that it names, in order."""
+        return sorted([each.chunk_start_offset for each in self.chunks] + [each.offset for each in self.others])
+
+    @property
     def is_index(self) -> bool:
         """Whether everything in the file can be found by it: writers may leave parts of it out."""
         known = self.statistics
@@ -136,7 +141,7 @@ def open_recording(path: Path) -> BufferedReader:
 
 
 def read_summary(file: IO[bytes]) -> Summary | None:
-    """The summary at a file's end; None if the file was cut off, or the summary fails its checksum.
+    """The summary at a file's end; None if the file was cut off, or the summary is damaged.
 
     It is empty where the writer has left it out.
     """
@@ -157,7 +162,9 @@ def read_summary(file: IO[bytes]) -> Summary | None:
     data = file.read(end - start)
     if crc and zlib.crc32(tail[: HEAD.size + 16], zlib.crc32(data)) != crc:
         return None
-    return _parse_summary(data, Budget(_name(file), size))
+    summary = _parse_summary(data, Budget(_name(file), size))
+    # Where it leads out of the file, it is no index.
+    return summary if summary is not None and all(place < start for place in summary.places) else None
 
 
 def _parse_summary(data: bytes, budget: Budget) -> Summary | None:
@@ -223,6 +230,7 @@ def scan(file: IO[bytes], on_loss: Callable[[Loss], None]) -> Iterator[tuple[Mca
     position = len(MAGIC)
     search, before = Search(file, size), 0
     whole_end: bool | None = None
+    places: list[int] = []
     readings, budget = _MOST_READINGS * size, Budget(_name(file), size)
     while position < size:
         opcode, length = _head_at(file, position)
@@ -236,6 +244,8 @@ def scan(file: IO[bytes], on_loss: Callable[[Loss], None]) -> Iterator[tuple[Mca
             lose(Loss(position, found - position, f"{found - position} bytes make no sense"))
             position, before = found, 0
             continue
+        if opcode in (Opcode.CHUNK, Opcode.ATTACHMENT, Opcode.METADATA):
+            places.append(position)
         lost: list[Loss] = []
         record = _record_at(file, position, lost.append, budget)
         if lost:
@@ -249,7 +259,11 @@ def scan(file: IO[bytes], on_loss: Callable[[Loss], None]) -> Iterator[tuple[Mca
         elif record is not None:
             yield record, False
         if opcode == Opcode.DATA_END:
-            whole_end = read_summary(file) is not None if whole_end is None else whole_end
+            if whole_end is None:
+                summary = read_summary(file)
+                whole_end = summary is not None
+                if summary is not None and whole and summary.is_index and summary.places != places:
+                    lose(Loss(end, size - end, "its index is damaged: it names other places"))
             if whole_end:
                 if whole:
                     _check_data(file, position, on_loss)

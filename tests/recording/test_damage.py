@@ -7,6 +7,7 @@ import io
 import os
 import struct
 import tracemalloc
+import zlib
 from collections.abc import Callable
 from itertools import count
 from pathlib import Path
@@ -37,6 +38,7 @@ from aolink.recording.writer import begin_recording
 from aolink.rig import load_rig
 from aolink.wire import messages_pb2 as wire
 from tests.conftest import Session
+from tests.recording.small import write_small
 
 
 @pytest.fixture(scope="module")
@@ -425,3 +427,21 @@ def test_a_picture_that_lies_is_one_loss_everywhere(tmp_path: Path, change: dict
     edited = recover(path, tmp_path / "b.mcap")
     assert ([each.what for each in edited.losses], edited.exposures) == ([said], 2)
     assert not Recording(tmp_path / "b.mcap", check=True).losses
+
+
+@pytest.mark.parametrize("place", [1 << 63, (1 << 64) - 1, 1000])
+def test_an_index_that_leads_elsewhere_is_damage_for_the_reader_and_the_check(tmp_path: Path, place: int) -> None:
+    """Its checksum is right: other software may have written it so."""
+    data = bytearray(write_small(path := tmp_path / "a.mcap", 3).read_bytes())
+    footer = len(data) - 8 - 29
+    (start,) = struct.unpack_from("<Q", data, footer + 9)
+    at = start
+    while data[at] != 0x08:  # the chunk's index
+        at += 9 + struct.unpack_from("<Q", data, at + 1)[0]
+    struct.pack_into("<Q", data, at + 9 + 16, place)
+    struct.pack_into("<I", data, footer + 25, zlib.crc32(data[start : footer + 25]))
+    path.write_bytes(data)
+    for check in (False, True):
+        recording = Recording(path, check=check)
+        list(recording)
+        assert "damaged" in recording.damage
