@@ -194,7 +194,7 @@ def test_an_index_that_lies_costs_no_memory(recorded: Session, tmp_path: Path) -
     for each in summary.chunk_indexes:
         known = (each.message_start_time, each.message_end_time, each.chunk_start_offset)
         at = bytes(data).rindex(struct.pack("<QQQ", *known)) + 16
-        struct.pack_into("<Q", data, at, int(rng.integers(0, 2 * len(data))))
+        struct.pack_into("<Q", data, at, int(rng.integers(0, len(data) // 2)))
     # Without a checksum of the summary, which a hostile writer leaves out, it is believed until it fails.
     struct.pack_into("<I", data, len(data) - 12, 0)
     (path := tmp_path / "lies.mcap").write_bytes(data)
@@ -206,7 +206,7 @@ def test_an_index_that_lies_costs_no_memory(recorded: Session, tmp_path: Path) -
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 20 << 20
-    assert not Recording(path, check=True).damage
+    assert "its index is damaged" in Recording(path, check=True).damage
 
 
 def test_only_the_chunks_of_the_asked_time_and_topics_are_read(
