@@ -17,7 +17,7 @@ from aolink.estimation.kalman.path_moments import Observation, PathMoments
 from aolink.estimation.kalman.steady_gain import steady_gain
 from aolink.estimation.model.exposure_model import exposure_model
 from aolink.estimation.moments.joint_moments import JointMoments
-from aolink.estimation.moments.spots import WindowedSpots
+from aolink.estimation.moments.windowed import WindowedMoments
 from aolink.estimation.options import Options
 from aolink.estimation.pixels.joint_pixels import JointProfile
 from aolink.numerics.arrays import FloatArray
@@ -25,8 +25,8 @@ from aolink.optics.sensor import SpotSensor
 from aolink.plant.alike import alike_systems
 from aolink.rig import Rig
 
-_WARM: set[tuple[type, int]] = set()
-"""Updaters of pixels, and along how many directions, whose code is loaded in this process."""
+_WARM: set[int] = set()
+"""Directions of pixels for which the code of `profile` is loaded in this process."""
 
 
 def _blur_filter(rig: Rig, options: Options, observation: Observation[Any] | None, **more: Any) -> BlurFilter:
@@ -78,15 +78,9 @@ def moments(rig: Rig, options: Options) -> Filter:
 
 def _windowed(rig: Rig) -> Observation[Any]:
     """Windowed moments of a line sensor, of spots, or of all spots of a plant with hundreds of states."""
-    n_outputs = rig.plant.n_outputs
-    if n_outputs == 1:
-        from aolink.estimation.moments.lines import WindowedMoments
-
-        return WindowedMoments(rig.sensor.profile)
-    sensor = _spots(rig)
     if alike_systems(rig.plant) is not None:
-        return JointMoments(sensor, n_outputs)
-    return WindowedSpots(sensor, n_outputs // 2)
+        return JointMoments(_spots(rig), rig.plant.n_outputs)
+    return WindowedMoments(rig.sensor, rig.plant.n_outputs)
 
 
 def _spots(rig: Rig) -> SpotSensor:
@@ -117,20 +111,14 @@ def _warm_up_line(rig: Rig) -> None:
 
 def profile(rig: Rig, options: Options) -> Filter:
     if alike_systems(rig.plant) is None:
-        from aolink.estimation.pixels.profile import ProfileUpdater
+        from aolink.estimation.pixels.likelihood import reduction
+        from aolink.estimation.pixels.profile import ProfileFilter
 
-        return _of_pixels(rig, options, ProfileUpdater(options.draws / 100))
+        few = ProfileFilter(rig.plant, rig.sensor, gate=options.gate)
+        if rig.sensor.directions not in _WARM:
+            few.warm_up()
+            _WARM.add(rig.sensor.directions)
+        reduction(exposure_model(rig.plant, rig.window_steps, rig.timing.exposure_offset), rig.sensor)
+        return few
     _warm_up(rig)
     return _blur_filter(rig, options, JointProfile(_spots(rig), rig.plant.n_outputs))
-
-
-def _of_pixels(rig: Rig, options: Options, updates: Any) -> Filter:
-    """The filters that use every pixel; their compiled code is loaded when the first one is made."""
-    from aolink.estimation.pixels.filter import MixtureFilter
-
-    pixels = MixtureFilter(rig.plant, rig.sensor, updates, gate=options.gate)
-    if (kind := (type(updates), rig.sensor.directions)) not in _WARM:
-        pixels.warm_up(updates)
-        _WARM.add(kind)
-    updates.reduction(exposure_model(rig.plant, rig.window_steps, rig.timing.exposure_offset), rig.sensor)
-    return pixels

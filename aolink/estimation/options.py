@@ -9,8 +9,6 @@ from aolink.errors import EstimatorError
 
 Engine = Literal["aolink", "filterpy"]
 
-_MOST_DRAWS = 400
-
 
 @dataclass(frozen=True)
 class Options:
@@ -24,10 +22,6 @@ class Options:
     """Whether o2 and o3 include the second-order terms that their linearisation leaves out (`PathMoments`):
     their covariance is then right where the prior is as wide as the spot's motion, at the price of a weaker
     correction."""
-    draws: int = 100
-    """Points that `profile` draws for importance sampling, in per cent of the usual number: the budget of work. With 5
-    an exposure takes a sixth of the time, the estimates have larger errors, and the log-evidence, which is not from
-    these points, still tells models that differ much apart."""
 
 
 _NAMES = tuple(Options.__dataclass_fields__)
@@ -60,11 +54,7 @@ def _read(text: str, key: str, default: object, value: str) -> object:
         if value not in ("true", "false"):
             raise EstimatorError(f"{text}: {key} = {value!r}, expected true or false")
         return value == "true"
-    if isinstance(default, str):
-        return value
-    if not value.isdecimal():
-        raise EstimatorError(f"{text}: {key} = {value!r}, expected a whole number")
-    return int(value)
+    return value
 
 
 def checked_options(**options: Any) -> Options:
@@ -76,8 +66,6 @@ def checked_options(**options: Any) -> Options:
     for key, kind in get_type_hints(Options).items():
         if get_origin(kind) is Literal and getattr(chosen, key) not in (values := get_args(kind)):
             raise EstimatorError(f"{key} = {getattr(chosen, key)!r} is not known: use one of {', '.join(values)}")
-    if not 1 <= chosen.draws <= _MOST_DRAWS:
-        raise EstimatorError(f"draws = {chosen.draws}: use 1 to {_MOST_DRAWS} per cent of the usual points")
     if chosen.second_order and chosen.engine == "filterpy":
         raise EstimatorError("second_order is not for the engine 'filterpy', whose filters are of first order")
     return chosen

@@ -29,8 +29,7 @@ from aolink.identification.search import DECAY, KEPT, SHORT_RUN, SPACING, Maximu
 from aolink.numerics.arrays import FloatArray
 from aolink.rig import Rig
 
-_ESTIMATOR = "profile:draws=5"
-"""With few points, which cost most of the rest and of which the evidence is not made."""
+_ESTIMATOR = "profile"
 _RULED_OUT = 30.0
 """Nats by which a candidate is behind where it is left out: the evidence is approximate."""
 _MOST = 10.0

@@ -13,11 +13,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from aolink.estimation.compiled.small import compiled, compiled_sums, inlined
+from aolink.estimation.compiled.small import compiled, inlined
 from aolink.numerics.arrays import BoolArray, FloatArray, IntArray
 
-_AT_ONCE = 64
-"""Points whose paths are computed together."""
 LARGE = 1e200
 """A product of variance ratios is replaced by its logarithm when it exceeds this."""
 
@@ -54,26 +52,23 @@ class Pixels(NamedTuple):
 
 @compiled
 def places_of(
-    paths: FloatArray, count: int, low: float, per_unit: float, pixels: int, points: int, reach: int,
-    firsts: IntArray, nearest: IntArray, away: FloatArray,
+    path: FloatArray, low: float, per_unit: float, pixels: int, points: int, reach: int, firsts: IntArray,
+    nearest: IntArray, away: FloatArray,
 ) -> None:  # fmt: skip
     """First pixel in a padded row that a spot lights, or -1; nearest point of the table; distance from it in pixels.
 
-    Of each node of ``count`` paths (nodes, points), without a branch, so that several are computed at a time; all
-    results are (nodes, points). Where the first pixel is -1 the others mean nothing.
+    Of each node of a path (nodes,). Where the first pixel is -1 the others mean nothing.
     """
-    least, most = -0.5 * reach, pixels + 0.5 * reach
-    for node in range(len(paths)):
-        for k in range(count):
-            v = (paths[node, k] - low) * per_unit
-            lit = v > least and v < most
-            v = v if lit else 0.0
-            cell = math.floor(v)
-            u = v - cell
-            point = min(int(u * points), points - 1)
-            firsts[node, k] = int(cell) + reach // 2 if lit else -1
-            nearest[node, k] = point
-            away[node, k] = u - (point + 0.5) / points
+    for node in range(len(path)):
+        v = (path[node] - low) * per_unit
+        lit = v > -0.5 * reach and v < pixels + 0.5 * reach
+        v = v if lit else 0.0
+        cell = math.floor(v)
+        u = v - cell
+        point = min(int(u * points), points - 1)
+        firsts[node] = int(cell) + reach // 2 if lit else -1
+        nearest[node] = point
+        away[node] = u - (point + 0.5) / points
 
 
 @inlined
@@ -87,92 +82,10 @@ def path_of(offset: FloatArray, basis: FloatArray, t: FloatArray, path: FloatArr
             path[k] += x * basis[i, k]
 
 
-@compiled
-def _paths_of(offset: FloatArray, basis: FloatArray, t: FloatArray, first: int, count: int, paths: FloatArray) -> None:
-    """Paths at the nodes, (nodes, points), of ``count`` points from ``first`` on of t (n, points)."""
-    for node in range(len(offset)):
-        for k in range(count):
-            paths[node, k] = offset[node]
-        for i in range(len(t)):
-            for k in range(count):
-                paths[node, k] += basis[i, node] * t[i, np.uintp(first) + np.uintp(k)]
-
-
 @inlined
 def _padding(seen: Pixels) -> tuple[int, int]:
     """Rows and columns about a window that hold the light of a spot outside of it."""
     return 0 if seen.y.shape[2] == 1 else seen.down.shape[3], seen.across.shape[3]
-
-
-@compiled
-def log_likelihoods_of_row(seen: Pixels, row: int, t: FloatArray, begin: int, end: int, out: FloatArray) -> None:
-    """Log-likelihoods of the points ``begin`` to ``end`` of t (n, points) in one row.
-
-    In the loop over points no part of an array and no field of the `Pixels` is taken: each would be counted as another
-    reference, and that would take as long as all the rest.
-    """
-    weights, terms, low, per_unit = seen.weights, seen.terms, seen.low, seen.per_unit
-    across, down, read_noise, gain = seen.across, seen.down, seen.read_noise, seen.gain
-    (_, spots, height, width), (high, wide) = seen.y.shape, _padding(seen)
-    nodes, directions = len(weights), len(seen.basis) // spots
-    f = np.zeros((height + 2 * high, width + 2 * wide))
-    columns, rows = np.empty((2, wide)), np.empty((2, down.shape[3]))
-    path = np.empty((nodes, _AT_ONCE))
-    firsts, nearest = np.zeros((2, nodes, _AT_ONCE), np.int64), np.zeros((2, nodes, _AT_ONCE), np.int64)
-    away = np.zeros((2, nodes, _AT_ONCE))
-    for first in range(begin, end, _AT_ONCE):
-        count = min(_AT_ONCE, end - first)
-        for k in range(count):
-            out[first + k] = 0.0
-        for spot in range(spots):
-            for d in range(directions):
-                o, table, size = directions * spot + d, (down if d else across), (height if d else width)
-                _paths_of(seen.inputs[row, o], seen.basis[o], t, first, count, path)
-                places_of(
-                    path, count, low, per_unit, size, table.shape[1], table.shape[3], firsts[d], nearest[d], away[d]
-                )
-            light, usable = seen.y[row, spot], seen.usable[row, spot]
-            dark = _squares(light, usable)
-            for k in range(count):
-                top, bottom, left, right = _add_light(
-                    k, firsts, nearest, away, weights, terms, across, down, columns, rows, f
-                )
-                out[first + k] += _log_likelihood(
-                    light, usable, f, high, wide, top, bottom, left, right, dark, read_noise, gain
-                )
-                for r in range(top, bottom):
-                    for c in range(left, right):
-                        f[r, c] = 0.0
-
-
-@inlined
-def _add_light(
-    point: int, firsts: IntArray, nearest: IntArray, away: FloatArray, weights: FloatArray, terms: FloatArray,
-    across: FloatArray, down: FloatArray, columns: FloatArray, rows: FloatArray, f: FloatArray,
-) -> tuple[int, int, int, int]:  # fmt: skip
-    """Densities without noise of one of the paths that `places_of` has placed, added to padded densities f.
-
-    The results are the first row and the one after the last that get light, and the same for columns.
-    """
-    wide, high = across.shape[3], down.shape[3]
-    begin, end, first, last = len(f), 0, f.shape[1], 0
-    for j in range(len(terms)):
-        for k in range(len(weights)):
-            left, top = firsts[0, k, point], firsts[1, k, point]
-            if left < 0 or top < 0:
-                continue
-            begin, end, first, last = min(begin, top), max(end, top + high), min(first, left), max(last, left + wide)
-            weight, column, dx = terms[j] * weights[k], np.uintp(nearest[0, k, point]), away[0, k, point]
-            if high == 1:  # at once: a row of its own would take half as long again
-                for m in range(wide):
-                    c = np.uintp(m)
-                    slope = across[j, column, 1, c] + dx * (across[j, column, 2, c] + dx * across[j, column, 3, c])
-                    f[top, np.uintp(left) + c] += weight * (across[j, column, 0, c] + dx * slope)
-                continue
-            _taylor(across, j, nearest[0, k, point], dx, weight, columns)
-            _taylor(down, j, nearest[1, k, point], away[1, k, point], 1.0, rows)
-            _add_product(f, top, left, rows, columns)
-    return begin, end, first, last
 
 
 @inlined
@@ -201,55 +114,6 @@ def _taylor_slope(table: FloatArray, term: int, point: int, d: float, factor: fl
         p = np.uintp(k)
         steeper = 2.0 * table[term, row, 2, p] + 3.0 * d * table[term, row, 3, p]
         out[1, p] = factor * (table[term, row, 1, p] + d * steeper)
-
-
-@compiled_sums
-def _squares(y: FloatArray, usable: BoolArray) -> float:
-    total = 0.0
-    for r in range(len(y)):
-        for c in range(y.shape[1]):
-            total += y[r, c] * y[r, c] if usable[r, c] else 0.0
-    return total
-
-
-@compiled_sums
-def _log_likelihood(
-    y: FloatArray, usable: BoolArray, f: FloatArray, down: int, across: int, top: int, bottom: int, left: int,
-    right: int, dark: float, read_noise: float, gain: float,
-) -> float:  # fmt: skip
-    """Log-likelihood of the usable pixels of y (height, width) with padded expected densities f.
-
-    Only the padded rows ``top`` to ``bottom`` and columns ``left`` to ``right`` have light. ``dark`` are the `_squares`
-    of y.
-    """
-    height, width = y.shape
-    squares, logs, quiet = dark, 0.0, 1.0 / read_noise
-    first, end = max(left - across, 0), min(right - across, width)
-    for padded in range(max(top, down), min(bottom, down + height)):
-        r = padded - down
-        if gain:
-            product = 1.0
-            for c in range(first, end):
-                if usable[r, c] and f[padded, across + c] > 0.0:
-                    # One logarithm of a product is taken: one a pixel would take longer than everything else here.
-                    product *= 1.0 + gain * quiet * f[padded, across + c]
-                    if product > LARGE:
-                        logs += math.log(product)
-                        product = 1.0
-            logs += math.log(product)
-        less, base, line = 0.0, np.uintp(across), np.uintp(r)
-        for k in range(first, end):
-            p = np.uintp(k)
-            light, seen = f[padded, base + p], 1.0 if usable[line, p] else 0.0
-            grows = gain if light > 0.0 else 0.0
-            information = 1.0 / (read_noise + grows * light) if gain else quiet
-            e = seen * (y[line, p] - light)
-            score = e * information
-            less += seen * y[line, p] * y[line, p] - read_noise * e * score
-            # Nobody reads the derivative: without it these sums would be in another order, and have other last bits.
-            f[padded, base + p] = score + 0.5 * grows * information * (e * score - seen)
-        squares -= less
-    return -0.5 * (squares * quiet + logs)
 
 
 @compiled
@@ -282,27 +146,26 @@ def _linearise(seen: Pixels, spot: int, path: FloatArray, basis: FloatArray, f: 
     (_, spots, height, width), nodes = seen.y.shape, path.shape[1]
     across, down, directions = seen.across, seen.down, len(basis) // spots
     columns, rows = np.empty((2, across.shape[3])), np.empty((2, down.shape[3]))
-    firsts, nearest = np.zeros((2, nodes, 1), np.int64), np.zeros((2, nodes, 1), np.int64)
-    away = np.zeros((2, nodes, 1))
+    firsts, nearest = np.zeros((2, nodes), np.int64), np.zeros((2, nodes), np.int64)
+    away = np.zeros((2, nodes))
     x = directions * spot
     for d in range(directions):
         table, size = (down if d else across), (height if d else width)
         places_of(
-            path[x + d].reshape(nodes, 1), 1, seen.low, seen.per_unit, size, table.shape[1], table.shape[3],
-            firsts[d], nearest[d], away[d],
+            path[x + d], seen.low, seen.per_unit, size, table.shape[1], table.shape[3], firsts[d], nearest[d], away[d]
         )  # fmt: skip
     f[:] = 0.0
     J[:] = 0.0
     for node in range(nodes):
-        left, top = firsts[0, node, 0], firsts[1, node, 0]
+        left, top = firsts[0, node], firsts[1, node]
         if left < 0 or top < 0:
             continue
         for j in range(len(seen.terms)):
             weight = seen.terms[j] * seen.weights[node]
-            _taylor(across, j, nearest[0, node, 0], away[0, node, 0], weight, columns)
-            _taylor(down, j, nearest[1, node, 0], away[1, node, 0], 1.0, rows)
-            _taylor_slope(across, j, nearest[0, node, 0], away[0, node, 0], weight * seen.per_unit, columns)
-            _taylor_slope(down, j, nearest[1, node, 0], away[1, node, 0], seen.per_unit, rows)
+            _taylor(across, j, nearest[0, node], away[0, node], weight, columns)
+            _taylor(down, j, nearest[1, node], away[1, node], 1.0, rows)
+            _taylor_slope(across, j, nearest[0, node], away[0, node], weight * seen.per_unit, columns)
+            _taylor_slope(down, j, nearest[1, node], away[1, node], seen.per_unit, rows)
             _add_product(f, top, left, rows, columns)
             for d in range(directions):
                 for i in range(len(J)):

@@ -177,7 +177,7 @@ class BlurFilter(Filter):
     ) -> tuple[Gaussian, IntArray]:
         """The updated Gaussian where it is finite and not gated, otherwise the prior; and the status of each axis."""
         after = done.posterior
-        used = done.nis <= self._gate
+        used = (done.nis if done.gate is None else done.gate) <= self._gate
         # Sums are finite where all is; those that overflow are checked again, axis by axis.
         if not (_has_finite_sum(after.mean) and _has_finite_sum(after.covariance)):
             used &= np.isfinite(after.mean).all(axis=1) & np.isfinite(after.covariance).all(axis=(1, 2))
@@ -297,7 +297,7 @@ def _without(done: Update, usable: BoolArray | None) -> Update:
     innovation = np.where(usable[:, None], done.innovation, 0.0)
     covariance = done.innovation_covariance
     covariance = np.where(usable.reshape(-1, *[1] * (covariance.ndim - 1)), covariance, 0.0)
-    return Update(done.posterior, innovation, covariance, np.where(usable, done.nis, 0.0))
+    return Update(done.posterior, innovation, covariance, np.where(usable, done.nis, 0.0), done.gate)
 
 
 def _kept(covariance: FloatArray) -> FloatArray:

@@ -51,3 +51,5 @@ class Update:
     """(axes, n_measurements, n_measurements), or its diagonal, (axes, n_measurements)."""
     nis: FloatArray
     """(axes,)"""
+    gate: FloatArray | None = None
+    """What the gate compares instead of the NIS, by the covariance that the update itself has, (axes,)."""

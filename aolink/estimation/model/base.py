@@ -27,7 +27,7 @@ from collections.abc import Callable
 from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Self
+from typing import NamedTuple, Self
 
 import numpy as np
 
@@ -63,6 +63,17 @@ class InputResponse:
             end=self.end[some], mean=self.mean[some], slope=self.slope[some], square=self.square[some],
             whole=lambda: self.path[some],
         )  # fmt: skip
+
+
+class Dynamics(NamedTuple):
+    """How an error of an exposure's coefficients goes on to the next exposure."""
+
+    transition: FloatArray
+    """A^N, (n_states, n_states)."""
+    end_rows: FloatArray
+    """End states of the coefficients, (n_states, n)."""
+    gram: FloatArray
+    """Mean of (C A^i)'(C A^i) over the steps, summed over the outputs, (n_states, n_states)."""
 
 
 class ExposureModel(ABC):
@@ -168,6 +179,16 @@ class ExposureModel(ABC):
         first, last = self.plant.C, self.last_rows
         squares = last[:, :, None] * last[:, None, :] - first[:, :, None] * first[:, None, :]
         return np.asarray(mean + self.moved * squares)
+
+    @cached_property
+    def path_gram(self) -> FloatArray:
+        """Mean of (C A^i)'(C A^i) over the steps, summed over the outputs, (n_states, n_states)."""
+        return np.asarray(self.quadratic.sum(axis=0))
+
+    @property
+    def dynamics(self) -> Dynamics:
+        """Of all its coefficients."""
+        return Dynamics(self.transition, self.end_rows, self.path_gram)
 
     @cached_property
     def last_rows(self) -> FloatArray:

@@ -17,11 +17,13 @@ from functools import lru_cache
 import numpy as np
 
 from aolink.estimation.model.base import ExposureModel, InputResponse
+from aolink.estimation.model.exposure_model import exposure_model
 from aolink.numerics import batched
 from aolink.numerics.arrays import FloatArray, Indices
+from aolink.numerics.covariance import psd_root
 from aolink.optics.camera import effective_noise_density, shot_gain
 from aolink.optics.kernel import gaussian_below
-from aolink.optics.sensor import Sensor
+from aolink.optics.sensor import BaseSensor, Sensor
 
 # Largest rms difference between the light of a path at the nodes and at all steps, in standard deviations of noise.
 _WRONG = 0.05
@@ -34,6 +36,10 @@ _LEAST_LIGHT = 0.01
 # Longest way of the predicted path from node to node, in standard deviations of kernel and pixel: a mean over Gaussians
 # at such distances has hardly any ripple, exp(-2 pi^2 / 1.2^2).
 _STRIDE = 1.2
+# Random paths from which the number of nodes is found.
+_PATHS = 64
+# Resolutions that are kept: more than the estimators that a scan of frequencies runs side by side.
+_SIDE_BY_SIDE = 256
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,3 +171,28 @@ def resolution(paths: FloatArray, variance: float, sensor: Sensor) -> Resolution
     while len(levels[-1].weights) < n_steps:
         levels.append(equal_parts(n_steps, min(n_steps, 2 * max(len(levels[-1].weights), 8))))
     return Resolution(tuple(levels), _STRIDE * math.sqrt(variance + sensor.pixel_width**2 / 12))
+
+
+@lru_cache(maxsize=_SIDE_BY_SIDE)
+def resolution_of(model: ExposureModel, sensor: BaseSensor) -> Resolution:
+    """The resolution for a plant's typical paths before a sensor, made once."""
+    if model.moved:  # it is the same whenever in a step an exposure starts
+        return resolution_of(exposure_model(model.plant, model.n_steps), sensor)
+    variance = float(np.linalg.eigvalsh(sensor.kernel.covariance)[0])
+    return resolution(typical_paths(model, _PATHS), variance, sensor.profile)
+
+
+def typical_paths(model: ExposureModel, count: int) -> FloatArray:
+    """Random paths of the outputs by the plant's prior, (count * n_outputs, exposed_steps)."""
+    basis = model.seen(model.basis)
+    z, n = np.random.default_rng(0).standard_normal((count, basis.shape[-1])), model.plant.n_states
+    z[:, :n] = z[:, :n] @ psd_root(model.plant.initial_covariance).T
+    return np.asarray(np.tensordot(z, basis, axes=(1, 2))).reshape(-1, model.exposed_steps)
+
+
+def paths_for(model: ExposureModel, sensor: BaseSensor, mean: FloatArray, response: InputResponse) -> QuadraturePaths:
+    """An exposure at the nodes that paths about the predicted ones need; ``mean`` is that of the first coefficients,
+    (axes, any)."""
+    seen = resolution_of(model, sensor)
+    level = seen.of(model.seen_path(model.path(mean, response.path))).max(initial=0)
+    return quadrature_paths(model, response, seen.levels[int(level)])

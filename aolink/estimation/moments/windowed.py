@@ -1,6 +1,4 @@
-"""Moments in a window about the spot, used by iterated statistical linearisation.
-
-Line sensors have compiled code for it (`aolink.estimation.moments.lines`); the class here is for spots on a plane.
+"""The estimator `moments`: moments 0 to 3 in a window about each spot, by iterated statistical linearisation.
 
 A moment, with any window or mask, is a weighted sum of pixels, y = sum_i W_i Y_i D. A
 spot resting at theta makes g(theta) = sum_i W_i (kernel integrated over pixel i) of it, so that
@@ -14,188 +12,167 @@ window drawn tighter each time.
 Omega depends on the state, which hardly changes from frame to frame on a plant that remembers: its errors
 do not average out as independent ones would. It is therefore weighted with (1 + rho)/(1 - rho), as the
 variance of a mean of errors that are correlated by rho. Without that, a filter that follows a resonance trusts one of
-several phases that the blur cannot distinguish. Where the frames carry little information, the plant correlates the
-errors, by the largest eigenvalue of A^N; where they carry much, an error is passed on by A^N (I - K H) only, as far as
-that is linear. rho is the geometric mean of both: the first alone wastes the frames' information, the second gives too
-small a covariance where several paths explain the blur.
+several phases that the blur cannot distinguish. rho is how much of the path that an error makes in this exposure it
+makes in the next (rms). Where the frames carry little information, the plant correlates the errors, by A^N; where they
+carry much, an error is passed on by A^N (I - K H) only, as far as that is linear. rho is the geometric mean of both:
+the first alone wastes the frames' information, the second gives too small a covariance where several paths explain the
+blur.
 """
 
 from __future__ import annotations
 
-import math
-from abc import ABC, abstractmethod
-from dataclasses import dataclass
-from typing import Generic, TypeVar
+from itertools import pairwise
 
 import numpy as np
 
-from aolink.estimation.frames.frame_data import Densities
+from aolink.estimation.compiled.windows import LINE, PLANE, Optics, Path, Regression, Windows, linearise
+from aolink.estimation.frames.frame_data import HALF, Needs, Profile, SpotWindows
 from aolink.estimation.kalman.gaussian import Gaussian, Update
 from aolink.estimation.kalman.update import joseph_update
-from aolink.estimation.model.base import ExposureModel, InputResponse
-from aolink.estimation.model.quadrature import QuadraturePaths, equal_parts, quadrature_paths
+from aolink.estimation.model.base import Dynamics, ExposureModel, InputResponse
+from aolink.estimation.model.quadrature import QuadraturePaths, paths_for
 from aolink.numerics import batched
-from aolink.numerics.arrays import BoolArray, FloatArray
+from aolink.numerics.arrays import FloatArray
+from aolink.numerics.workers import in_threads, thread_count
 from aolink.optics.camera import effective_noise_density
-from aolink.optics.kernel import gaussian_below
-from aolink.optics.sensor import BaseSensor, Sensor
+from aolink.optics.sensor import BaseSensor
 
 PASSES = 3
-# Half width of the window beyond the path's mean, in standard deviations of the path, and of the kernel beyond that.
-PATH_REACH = 3.0
-KERNEL_REACH = 2.0
-# The path is averaged over equal parts of the steps so that there are no more than this; a mean over it stays exact.
-MOST_NODES = 100
-MOST_MEMORY = 1e3
-# Axes together: more of them do not fit into the processor's cache.
-_AT_ONCE = 8
-
-Data = TypeVar("Data", bound=Densities)
+MOST_INFLATION = 1e3
+# With fewer axes a second thread costs more than it saves, and more of them do not fit into the processor's cache.
+_AXES_OF_A_THREAD, _AT_ONCE = 16, 512
 
 
-@dataclass(frozen=True, eq=False)
-class Regression:
-    """Linear regression of measurements on the coefficients, z being where it was made."""
+class WindowedMoments:
+    """Moments of all spots that one copy of the plant moves, as an observation of `BlurFilter`.
 
-    expected: FloatArray
-    """E[y], (axes, m)."""
-    slope: FloatArray
-    """H, (axes, m, n_coefficients)."""
-    remainder: FloatArray
-    """Omega, covariance of what is not linear, (axes, m, m)."""
-
-
-class Windowed(ABC, Generic[Data]):
-    """Iterated statistical linearisation: the common part for line sensors and spots on a plane."""
+    One output is that of a line sensor; more are spot 0's x and y, spot 1's x and y, ...
+    """
 
     models_noise = True
-    most_nodes = MOST_NODES
-    most_memory = MOST_MEMORY
-    """Bound of `error_memory`; with 1, errors of an exposure count as independent of those before."""
 
-    def update(self, model: ExposureModel, response: InputResponse, prior: Gaussian, measured: Data) -> Update:
+    def __init__(self, sensor: BaseSensor, outputs: int) -> None:
+        line = outputs == 1
+        self.sensor: BaseSensor = sensor.profile if line else sensor
+        self.orders, spots = LINE if line else PLANE, max(1, outputs // 2)
+        self.n_measurements = spots * len(self.orders)
+        self.needs = Needs(what="profile" if line else "windows", least_usable=HALF)
+        size = self.sensor.pixel_size
+        self._optics = Optics(
+            low=float(sensor.profile.edges[0]), pixel=sensor.profile.pixel_width, size=size,
+            read_noise=effective_noise_density(self.sensor) * size,
+            shot_noise=size / self.sensor.photoelectrons if self.sensor.photoelectrons else 0.0,
+            kernel=np.ascontiguousarray(self.sensor.kernel.covariance), widening=0.0,
+        )  # fmt: skip
+
+    def update(
+        self, model: ExposureModel, response: InputResponse, prior: Gaussian, measured: Profile | SpotWindows
+    ) -> Update:
         """Iterated statistical linearisation, from the prior to the posterior."""
-        nodes = quadrature_paths(model, response, equal_parts(model.exposed_steps, self.most_nodes))
-        parts = [
-            self._update(model, nodes.part(s), prior.part(s), measured.part(s))
-            for s in (slice(k, k + _AT_ONCE) for k in range(0, len(prior.mean), _AT_ONCE))
-        ]
-        if len(parts) == 1:
-            return parts[0]
-        joined = [np.concatenate(arrays) for arrays in zip(*(_arrays(part) for part in parts), strict=True)]
-        return Update(Gaussian(joined[0], joined[1]), *joined[2:])
+        nodes = paths_for(model, self.sensor, prior.mean[:, : model.plant.n_states], response)
+        return self.updated(model.dynamics, nodes, prior, measured)
 
-    def _update(self, model: ExposureModel, nodes: QuadraturePaths, prior: Gaussian, measured: Data) -> Update:
-        about, rho = prior, np.full(len(prior.mean), slowest(model.transition[None])[0])
-        memory = error_memory(rho, self.most_memory)
+    def updated(
+        self, dynamics: Dynamics, nodes: QuadraturePaths, prior: Gaussian, measured: Profile | SpotWindows
+    ) -> Update:
+        """`update` with the paths at their nodes, whose coefficients the prior may be of."""
+        axes = len(prior.mean)
+        threads = min(thread_count(), -(-axes // _AXES_OF_A_THREAD))
+        count = max(threads, -(-axes // _AT_ONCE))
+        ends = [axes * k // count for k in range(count + 1)]
+        parts = in_threads(
+            lambda s: self._updated(dynamics, nodes.part(s), prior.part(s), measured.part(s)),
+            [slice(*each) for each in pairwise(ends)],
+        )
+        if count == 1:
+            return parts[0]
+        mean, covariance, *rest = (np.concatenate(each) for each in zip(*map(_arrays, parts), strict=True))
+        return Update(Gaussian(mean, covariance), *rest)
+
+    def _updated(
+        self, dynamics: Dynamics, nodes: QuadraturePaths, prior: Gaussian, measured: Profile | SpotWindows
+    ) -> Update:
+        about, inflation = prior, Inflation(dynamics, prior)
+        windows, path, factor = windows_of(measured), path_of(nodes), inflation.by_plant
         for to_come in reversed(range(PASSES)):
-            y, noise, fit = self.look(nodes, about, measured)
-            innovation = y - fit.expected - batched.matvec(fit.slope, prior.mean - about.mean)
-            R = noise + memory[:, None, None] * fit.remainder
+            fit = self.regression(windows, path, about, nodes.widening)
+            innovation = fit.value - fit.expected - batched.matvec(fit.slope, prior.mean - about.mean)
+            R = fit.noise + factor[:, None, None] * fit.remainder
             done = joseph_update(prior, innovation, fit.slope, R)
             about = done.posterior
             if to_come:
-                rho_here = np.sqrt(rho * slowest(_closed_loop(model, prior, fit.slope, R)))
-                memory = error_memory(rho_here, self.most_memory)
-        # The covariance of this one innovation is without the memory.
-        HP = batched.matmul(fit.slope, prior.covariance)
-        S = batched.symmetric(batched.matmul(HP, batched.transpose(fit.slope)) + noise + fit.remainder)
+                factor = inflation.by_frames(prior, fit.slope, R)
+        # The covariance of this one innovation is without the inflation; the gate is that of the update.
+        S = done.innovation_covariance - R + fit.noise + fit.remainder
         nis = batched.dot(innovation, batched.matvec(batched.inverse(S), innovation))
-        return Update(about, innovation, S, nis)
+        return Update(about, innovation, S, nis, done.nis)
 
-    @abstractmethod
-    def look(
-        self, nodes: QuadraturePaths, about: Gaussian, measured: Data
-    ) -> tuple[FloatArray, FloatArray, Regression]:
-        """The sums (axes, sums), their noise (axes, sums, sums), and their regression on the coefficients."""
+    def regression(self, windows: Windows, path: Path, about: Gaussian, widening: float = 0.0) -> Regression:
+        """The moments and their regression on the coefficients under a Gaussian of these.
 
-    def window(
-        self, sensor: Sensor, kernel: float, mean: FloatArray, variance: FloatArray, mask: BoolArray
-    ) -> tuple[FloatArray, BoolArray]:
-        """u in [-1, 1] across the window about a path, and the pixels that are in it, both (axes, pixels).
-
-        ``kernel`` is the variance of the kernel in this direction, slope units squared; mean and variance are those of
-        the path at its nodes, (axes, nodes); ``mask``, (axes, pixels), is True where a pixel can be used.
+        ``widening`` is the variance of the path about its nodes that no coefficient covers, slope units squared.
         """
-        sd = np.sqrt(np.maximum(variance, 0.0))
-        margin = KERNEL_REACH * math.sqrt(kernel + sensor.pixel_width**2 / 12)
-        # A window needs room on the sensor, wherever the path is expected.
-        room = max(margin, 2 * sensor.pixel_width)
-        low = np.minimum((mean - PATH_REACH * sd).min(axis=1) - margin, sensor.field[1] - room)
-        high = np.maximum((mean + PATH_REACH * sd).max(axis=1) + margin, sensor.field[0] + room)
-        low, high = np.maximum(low, sensor.field[0]), np.minimum(high, sensor.field[1])
-        edges = sensor.edges
-        inside = (edges[1:] > low[:, None]) & (edges[:-1] < high[:, None]) & mask
-        return (sensor.centres - (low + high)[:, None] / 2) / ((high - low)[:, None] / 2), inside
+        (axes, n), m = about.mean.shape, windows.density.shape[1] * len(self.orders)
+        out = Regression(*(np.empty((axes, *shape)) for shape in ((m,), (m, m), (m,), (m, n), (m, m))))
+        optics = self._optics._replace(widening=float(widening))
+        linearise(windows, optics, path, self.orders, *map(_contiguous, (about.mean, about.covariance)), out)
+        return out
 
 
-def weighted_sums(
-    sensor: BaseSensor, W: FloatArray, density: FloatArray, light: FloatArray | None = None
-) -> tuple[FloatArray, FloatArray]:
-    """Weighted sums of pixels, (..., m), and the covariance of the pixels' noise in them, (..., m, m).
+def windows_of(measured: Profile | SpotWindows) -> Windows:
+    """The pixels as compiled code takes them: a line is a window of one row."""
+    density, mask, light = measured.density, measured.mask, measured.light
+    if density.ndim == 2:
+        density, mask = density[:, None, None], mask[:, None, None]
+    share = np.ones(density.shape[:2]) if light is None else light.reshape(density.shape[:2])
+    return Windows(_contiguous(density), np.ascontiguousarray(mask), _contiguous(share))
 
-    W is (..., m, pixels). ``density``, (..., pixels), is zero where a pixel cannot be used; its weights are zero as
-    well. ``light`` is that of the spot, as a share of a whole one's, that the density was divided by, (...); one where
-    None.
+
+def path_of(nodes: QuadraturePaths) -> Path:
+    """The path as compiled code takes it."""
+    return Path(*map(_contiguous, (nodes.basis.swapaxes(1, 2), nodes.inputs, nodes.weights)))
+
+
+class Inflation:
+    """The factor of the remainder's covariance: an error that the linearisation leaves out returns in later exposures.
+
+    A state that stays but is known makes no path's error, and does not count.
     """
-    D = sensor.pixel_size
-    y = batched.matvec(W, density * D)
-    variance = np.full_like(density, effective_noise_density(sensor) * D)
-    if sensor.photoelectrons:
-        electrons = sensor.photoelectrons if light is None else sensor.photoelectrons / light[..., None]
-        variance += np.maximum(density, 0.0) * (D / electrons)
-    if light is not None:
-        variance /= light[..., None] ** 2
-    noise = batched.matmul(W * variance[..., None, :], batched.transpose(W))
-    # Where a window has fewer pixels than functions, their sums are linearly dependent; where it has none, all are
-    # zero, and say nothing whatever their noise is.
-    largest = noise.max(axis=(-2, -1), keepdims=True)
-    noise += np.eye(W.shape[-2]) * np.where(largest > 0, 1e-12 * largest, 1.0)
-    return y, noise
+
+    def __init__(self, dynamics: Dynamics, prior: Gaussian) -> None:
+        n = len(dynamics.transition)
+        self._dynamics, self._P = dynamics, prior.covariance[:, :n, :n]
+        self._here = np.einsum("ij,aji->a", dynamics.gram, self._P)
+        self._by_plant = self._persistence(dynamics.transition)
+        self.by_plant = inflation(self._by_plant)
+        """By the plant alone, (axes,)."""
+
+    def by_frames(self, prior: Gaussian, H: FloatArray, R: FloatArray) -> FloatArray:
+        """By the plant and by what a frame corrects, A (I - K H), (axes,): the geometric mean of both."""
+        n = len(self._dynamics.transition)
+        PH = batched.matmul(prior.covariance, batched.transpose(H))
+        K = batched.matmul(PH, batched.inverse(batched.symmetric(batched.matmul(H, PH)) + R))
+        kept = np.eye(prior.mean.shape[1])[:, :n] - batched.matmul(K, H[:, :, :n])
+        return inflation(np.sqrt(self._by_plant * self._persistence(np.matmul(self._dynamics.end_rows, kept))))
+
+    def _persistence(self, transition: FloatArray) -> FloatArray:
+        """Rms of the path that an error of the prior makes in the next exposure, over that in this one, (axes,)."""
+        moved = np.matmul(transition, self._P)
+        there = (np.matmul(self._dynamics.gram, moved) * transition).sum(axis=(1, 2))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.asarray(np.where(self._here > 0, np.sqrt(np.maximum(there, 0.0) / self._here), 0.0))
 
 
-def expected_response(
-    kernel_variance: float, edges: FloatArray, W: FloatArray, mean: FloatArray, variance: FloatArray, highest: int = 3
-) -> list[FloatArray]:
-    """Expectations of g and its derivatives up to ``highest`` for theta ~ N(mean, variance), (..., nodes), each (...,
-    nodes, m); W are weights of the pixels, (..., m, pixels)."""
-    # The sum over pixels of W_i times a difference of edges, summed by edges instead.
-    padded = np.zeros((*W.shape[:-1], W.shape[-1] + 2))
-    padded[..., 1:-1] = W
-    steps = batched.transpose(-np.diff(padded, axis=-1))
-    below = gaussian_below(kernel_variance + variance, edges, mean, highest)
-    return [batched.matmul(each, steps) for each in below]
+def inflation(rho: FloatArray) -> FloatArray:
+    """Variance of a mean of errors correlated by rho, over that of independent ones: (1 + rho) / (1 - rho), bounded."""
+    return np.asarray(np.minimum(MOST_INFLATION, (1 + rho) / np.maximum(1 - rho, 1e-9)))
 
 
-def _arrays(correction: Update) -> tuple[FloatArray, ...]:
-    after = correction.posterior
-    rest = correction.innovation, correction.innovation_covariance, correction.nis
-    return (after.mean, after.covariance, *rest)
+def _arrays(done: Update) -> tuple[FloatArray, ...]:
+    assert done.gate is not None
+    after = done.posterior
+    return after.mean, after.covariance, done.innovation, done.innovation_covariance, done.nis, done.gate
 
 
-def slowest(transition: FloatArray) -> FloatArray:
-    """Spectral radius: the modulus of the largest eigenvalue, (axes, n, n) -> (axes,)."""
-    finite = np.isfinite(transition).all(axis=(1, 2), keepdims=True)
-    # What is not finite is refused by the filter; here it must only not stop the others.
-    A = np.where(finite, transition, 0.0)
-    if A.shape[1] != 2:
-        return np.asarray(np.abs(np.linalg.eigvals(A)).max(axis=1))
-    half, away = (A[:, 0, 0] + A[:, 1, 1]) / 2, (A[:, 0, 0] - A[:, 1, 1]) / 2
-    square = away * away + A[:, 0, 1] * A[:, 1, 0]
-    turning = np.sqrt(np.abs(half * half - square))
-    return np.asarray(np.where(square < 0, turning, np.abs(half) + np.sqrt(np.abs(square))))
-
-
-def error_memory(rho: FloatArray, most: float) -> FloatArray:
-    """Variance of a mean of errors correlated by rho, over that of independent ones: (1 + rho) / (1 - rho), at most
-    ``most``."""
-    return np.asarray(np.minimum(most, (1 + rho) / np.maximum(1 - rho, 1e-9)))
-
-
-def _closed_loop(model: ExposureModel, prior: Gaussian, H: FloatArray, R: FloatArray) -> FloatArray:
-    """How an error of the start state goes on to the next exposure's, A (I - K H), (axes, n_states, n_states)."""
-    n = len(model.transition)
-    PH = batched.matmul(prior.covariance, batched.transpose(H))
-    K = batched.matmul(PH, batched.inverse(batched.symmetric(batched.matmul(H, PH)) + R))
-    kept = np.eye(prior.mean.shape[1])[:, :n] - batched.matmul(K, H[:, :, :n])
-    return batched.matmul(np.broadcast_to(model.end_rows, (len(kept), *model.end_rows.shape)), kept)
+def _contiguous(values: FloatArray) -> FloatArray:
+    return np.ascontiguousarray(values, dtype=np.float64)

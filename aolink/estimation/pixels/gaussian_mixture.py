@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from aolink.estimation.compiled import mixtures as compiled_mixtures
 from aolink.estimation.kalman.gaussian import Gaussian
-from aolink.numerics import batched
 from aolink.numerics.arrays import FloatArray, Indices
-from aolink.numerics.covariance import cholesky, lower_inverse
 
 _LEAST_LOG_WEIGHT = math.log(1e-12)
 
@@ -57,20 +56,6 @@ class GaussianMixture(NamedTuple):
         after = Gaussian(self.mean, self.covariance).mapped(rows, remainder)
         return GaussianMixture(self.log_weight, after.mean, after.covariance)
 
-    def log_density(self, points: FloatArray) -> FloatArray:
-        """Log-density of the mixture, (axes, points, n) -> (axes, points)."""
-        return log_sum(self.component_log_densities(points), axis=1)
-
-    def component_log_densities(self, points: FloatArray) -> FloatArray:
-        """The log-density of each component times its weight, (axes, components, points)."""
-        n = points.shape[-1]
-        root = cholesky(self.covariance)
-        away = points[:, None] - self.mean[:, :, None]
-        white = batched.long_matmul(away, batched.transpose(lower_inverse(root)))
-        log_root = np.add.reduce(np.log(np.einsum("...ii->...i", root)), axis=-1)
-        constant = self.log_weight - log_root - 0.5 * n * math.log(2 * math.pi)
-        return np.asarray(constant[..., None] - 0.5 * np.add.reduce(white * white, axis=-1))
-
     @property
     def contiguous(self) -> list[FloatArray]:
         """Log-weights, means and covariances, each contiguous in memory, as compiled code takes them."""
@@ -91,6 +76,16 @@ class GaussianMixture(NamedTuple):
         compiled_mixtures.merge(*merged.contiguous, most, free)
         return merged.ordered(most)
 
+    def moved(self, by: FloatArray) -> GaussianMixture:
+        """The mixture with all components moved by a vector of each axis, (axes, n)."""
+        return self._replace(mean=self.mean + by[:, None])
+
+    @classmethod
+    def stacked(cls, mixtures: Sequence[GaussianMixture]) -> GaussianMixture:
+        """Mixtures of different axes, one after the other."""
+        most = max(each.mean.shape[1] for each in mixtures)
+        return cls(*map(np.concatenate, zip(*(each.with_components(most) for each in mixtures), strict=True)))
+
     def with_components(self, count: int) -> GaussianMixture:
         """The mixture with ``count`` components, those after its own with weight zero."""
         more = count - self.mean.shape[1]
@@ -105,6 +100,8 @@ class GaussianMixture(NamedTuple):
 
     def replaced(self, axes: Indices, by: GaussianMixture) -> GaussianMixture:
         """The mixtures with those of these axes replaced."""
+        if not len(axes):
+            return self
         count = max(self.mean.shape[1], by.mean.shape[1])
         out, new = self.with_components(count).copy(), by.with_components(count)
         for room, each in zip(out, new, strict=True):
@@ -124,12 +121,6 @@ class GaussianMixture(NamedTuple):
 def single(gaussian: Gaussian) -> GaussianMixture:
     """A mixture of one component."""
     return GaussianMixture(np.zeros((len(gaussian.mean), 1)), gaussian.mean[:, None], gaussian.covariance[:, None])
-
-
-def joined(*mixtures: GaussianMixture) -> GaussianMixture:
-    """All components of several mixtures, their weights normalised together."""
-    log_weight, mean, covariance = (np.concatenate(each, axis=1) for each in zip(*mixtures, strict=True))
-    return GaussianMixture(log_weight - log_sum(log_weight, axis=1)[:, None], mean, covariance)
 
 
 def log_sum(values: FloatArray, axis: int) -> FloatArray:

@@ -128,9 +128,7 @@ class JointProfile(JointObservation):
         super().__init__(sensor, n_outputs)
         self._moments = JointMoments(sensor, n_outputs)
 
-    def corrected(
-        self, paths: JointPaths, prior: Gaussian, windows: SpotWindows
-    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
+    def corrected(self, paths: JointPaths, prior: Gaussian, windows: SpotWindows) -> tuple[FloatArray, ...]:
         before, P, view = prior.mean, prior.covariance, JointPixels(self.sensor, paths, windows)
         if paths.rms_spread(P) <= LARGEST_SPREAD * np.sqrt(view.kernel_variance):
             mode = find_mode(view, before, paths.prior_information(P), before)
@@ -138,7 +136,8 @@ class JointProfile(JointObservation):
         else:
             t, after, *_ = self._moments.corrected(paths, prior, windows)
             at = view.at(t)
-        return t, after, *displacements(paths, before, P, t, at)
+        new, S, nis = displacements(paths, before, P, t, at)
+        return t, after, new, S, nis, nis
 
 
 def displacements(

@@ -32,17 +32,13 @@ from aolink.estimation.compiled.pixels import Pixels
 from aolink.estimation.frames.frame_data import Profile, SpotWindows
 from aolink.estimation.kalman.gaussian import Gaussian
 from aolink.estimation.model import quadrature
-from aolink.estimation.model.base import ExposureModel, InputResponse
-from aolink.estimation.model.exposure_model import exposure_model
-from aolink.estimation.moments.spots import WindowedSpots
-from aolink.estimation.moments.windowed import Regression
+from aolink.estimation.model.base import Dynamics, ExposureModel, InputResponse
 from aolink.numerics import batched
 from aolink.numerics.arrays import FloatArray, Indices
-from aolink.numerics.covariance import psd_root
 from aolink.optics.camera import effective_noise_density, shot_gain
 from aolink.optics.kernel import pixel_masses
 from aolink.optics.plane import mehler_series
-from aolink.optics.sensor import BaseSensor, SpotSensor
+from aolink.optics.sensor import BaseSensor
 
 # Rms of the noise path that is left out, in standard deviations of the kernel.
 _LEFT_OUT = 0.1
@@ -61,8 +57,8 @@ _ONE_SPOT = 2
 # many coefficients as `_MOST_SEEN`. Where it adds more, directions are chosen by how much they change the pixels, until
 # what is left out adds no more than the second number.
 _MOST_VISIBLE, _HARDLY_VISIBLE = 4.0, 0.2
-# Random paths from which the number of nodes is found, and those from which it is found what changes the pixels.
-_PATHS, _FEW_PATHS = 64, 16
+# Random paths from which it is found what changes the pixels.
+_FEW_PATHS = 16
 # The table of a pixel's light over the spot's position: points in one standard deviation of the kernel, and its end.
 _POINTS = 16
 _REACH = 5.0
@@ -87,6 +83,8 @@ class Reduction:
     widening: float
     """Mean variance of the part of the path that t leaves out, by which the kernel is widened."""
     resolution: quadrature.Resolution
+    least_blur: float
+    """Variance with which the pixels show the blur's variance, slope units^4."""
 
     @property
     def size(self) -> int:
@@ -110,20 +108,17 @@ def reduction(model: ExposureModel, sensor: BaseSensor, *, left_out: float = _LE
     """
     n = model.plant.n_states
     variance = float(np.linalg.eigvalsh(sensor.kernel.covariance)[0])
-    V, rest = _kept(model, sensor, left_out * math.sqrt(variance), _resting_sd(sensor, variance))
+    V, rest = _kept(model, sensor, left_out * math.sqrt(variance), math.sqrt(_resting_noise(sensor, variance, 1)))
     size, kept = V.shape
     expand = np.zeros((n + size, n + kept))
     expand[:n, :n], expand[n:, n:] = np.eye(n), V
     hidden = np.zeros((n + size, n + size))
     hidden[n:, n:] = np.eye(size) - V @ V.T
     remainder = model.end_remainder + model.end_rows @ hidden @ model.end_rows.T
-    if model.moved:  # it is the same whenever in a step an exposure starts
-        seen = reduction(exposure_model(model.plant, model.n_steps), sensor).resolution
-    else:
-        seen = quadrature.resolution(_paths(model, expand), variance, sensor.profile)
     return Reduction(
         expand=expand, left_out=hidden, end_rows=model.end_rows @ expand, end_remainder=remainder,
-        widening=rest + model.unmodelled_rest, resolution=seen,
+        widening=rest + model.unmodelled_rest, resolution=quadrature.resolution_of(model, sensor),
+        least_blur=_resting_noise(sensor, variance, 2) * 4,
     )  # fmt: skip
 
 
@@ -171,7 +166,7 @@ def _visibility(model: ExposureModel, sensor: BaseSensor, noise: FloatArray) -> 
     A spot's window on a plane counts by its sums over rows and over columns.
     """
     line = sensor.profile
-    every = _paths(model, np.eye(model.basis.shape[-1]), _FEW_PATHS).reshape(_FEW_PATHS, len(noise), -1)
+    every = quadrature.typical_paths(model, _FEW_PATHS).reshape(_FEW_PATHS, len(noise), -1)
     S = np.zeros((noise.shape[-1],) * 2)
     for output, changed in enumerate(noise):
         variance = float(sensor.kernel.covariance[output, output])
@@ -184,25 +179,17 @@ def _visibility(model: ExposureModel, sensor: BaseSensor, noise: FloatArray) -> 
     return S
 
 
-def _resting_sd(sensor: BaseSensor, variance: float) -> float:
-    """Standard deviation of the position of a spot at rest as measured from its pixels (Cramer and Rao's bound).
+def _resting_noise(sensor: BaseSensor, variance: float, order: int) -> float:
+    """Variance of what is measured from the pixels of a spot at rest (Cramer and Rao's bound): of its position for
+    order 1; for order 2 a quarter of that of the variance of its blur, since d/dv = 1/2 d^2/dx^2 of a Gaussian's light.
 
     By the mean information over positions in a pixel: a spot much narrower than that is seen only at its edges.
     """
     line = sensor.profile
     positions = line.pixel_size * np.linspace(0, 1, _POINTS, endpoint=False)
-    light, slope = (each / line.pixel_size for each in pixel_masses(variance, line.edges, positions, 1))
-    noise = effective_noise_density(line) / line.pixel_size + shot_gain(line) * np.maximum(light, 0.0)
-    return float((slope**2 / noise).sum(axis=1).mean() ** -0.5)
-
-
-def _paths(model: ExposureModel, expand: FloatArray, count: int = _PATHS) -> FloatArray:
-    """Random paths of the outputs by the plant's prior, (count * n_outputs, n_steps)."""
-    t = np.random.default_rng(0).standard_normal((count, expand.shape[1]))
-    n = model.plant.n_states
-    t[:, :n] = t[:, :n] @ psd_root(model.plant.initial_covariance).T
-    basis = model.seen(model.basis)
-    return np.asarray(np.tensordot(t, basis @ expand, axes=(1, 2))).reshape(-1, model.exposed_steps)
+    masses = [each / line.pixel_size for each in pixel_masses(variance, line.edges, positions, order)]
+    noise = effective_noise_density(line) / line.pixel_size + shot_gain(line) * np.maximum(masses[0], 0.0)
+    return float(1 / (masses[order] ** 2 / noise).sum(axis=1).mean())
 
 
 class PixelView:
@@ -233,6 +220,7 @@ class PixelView:
         self.gain = shot_gain(self.optics)
         self.kernel = sensor.kernel.covariance + reduced.widening * np.eye(2)
         """Covariance of the kernel with that widening, slope units squared, (2, 2)."""
+        self.dynamics = Dynamics(model.transition, reduced.end_rows, model.path_gram)
 
     def part(self, axes: slice | Indices) -> PixelView:
         """The part of these axes."""
@@ -257,13 +245,6 @@ class PixelView:
         return float(np.linalg.eigvalsh(self.kernel)[0])
 
     @property
-    def work(self) -> int:
-        """Products that the log-likelihood of a point takes, about."""
-        each = [2 * _half(float(v), self.optics.profile.pixel_size) for v in np.diag(self.kernel)]
-        lit = each[0] if self.on_line else math.prod(each) * self.outputs // 2
-        return len(self.nodes.weights) * (self.outputs * self.reduced.size + lit)
-
-    @property
     def rows(self) -> FloatArray:
         """Path at the nodes of the coefficients, (n_outputs * nodes, n)."""
         return self.nodes.basis.reshape(-1, self.reduced.size)
@@ -273,11 +254,16 @@ class PixelView:
         """R'R for these rows R, as a mean over the exposure and a sum over outputs, (n, n)."""
         return np.asarray((self.rows * np.tile(self.nodes.weights, self.outputs)[:, None]).T @ self.rows)
 
-    def moments(self, about: Gaussian) -> tuple[FloatArray, FloatArray, Regression]:
-        """Windowed moments about a Gaussian of t, their noise and regression, as `Windowed.look`; of all axes."""
-        assert isinstance(self.sensor, SpotSensor)
-        assert isinstance(self.measured, SpotWindows)
-        return WindowedSpots(self.sensor, self.outputs // 2).look(self.nodes, about, self.measured)
+    @property
+    def moment_nodes(self) -> quadrature.QuadraturePaths:
+        """The nodes for windowed moments, which widen the kernel by what t leaves out."""
+        return replace(self.nodes, widening=self.reduced.widening)
+
+    def blur_of(self, covariance: FloatArray) -> FloatArray:
+        """Variance of the blur's variance, slope units^4, that paths of these covariances of t have, (axes, k, n, n) ->
+        (axes, k): 2 tr(G P G P), G being `gram`."""
+        GP = self.gram @ covariance
+        return np.asarray(2 * np.einsum("...ij,...ji->...", GP, GP))
 
     @property
     def seen(self) -> Pixels:
@@ -307,7 +293,7 @@ def _light_table(variance: float, pixel: float, order: int) -> FloatArray:
     spot's position.
     """
     points = math.ceil(_POINTS * pixel / math.sqrt(variance))
-    half = _half(variance, pixel)
+    half = math.ceil(_REACH * math.sqrt(variance) / pixel) + 1
     if points * half > _MOST_LIGHT:
         raise EstimatorError(
             f"a spot is {math.sqrt(variance) / pixel:.3g} pixels wide (sd): check sensor.kernel, sensor.field and the"
@@ -316,8 +302,3 @@ def _light_table(variance: float, pixel: float, order: int) -> FloatArray:
     places = (np.arange(points) + 0.5) * pixel / points
     masses = pixel_masses(variance, pixel * np.arange(-half, half + 1.0), places, order + 3)[order:]
     return np.stack([mass * pixel ** (k - 1) / math.factorial(k) for k, mass in enumerate(masses)], axis=1)
-
-
-def _half(variance: float, pixel: float) -> int:
-    """Pixels on either side of a spot that it lights."""
-    return math.ceil(_REACH * math.sqrt(variance) / pixel) + 1

@@ -5,34 +5,69 @@ log-likelihood, with Fisher's information instead of the Hessian. At a mode its 
 (Laplace) the log-evidence is log p(y | s) - |s|^2 / 2 - log |H| / 2.
 
 A search starts at the posterior of windowed moments, and others start from there along the directions in which that
-leaves the path most uncertain: a path and its reversal in time give the same blur. Where the path moves by more than
-the kernel is wide a mode is not Gaussian, so mean and covariance are those of points drawn about the modes
-(`importance`).
+leaves the path most uncertain: a path and its reversal in time give the same blur.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 from scipy import special
 
 from aolink.estimation.compiled import modes as compiled_modes
-from aolink.estimation.frames.frame_data import Profile
 from aolink.estimation.kalman.filter import GATE_PROBABILITY
 from aolink.estimation.kalman.gaussian import Gaussian
-from aolink.estimation.kalman.update import joseph_update
-from aolink.estimation.moments.lines import updated
-from aolink.estimation.pixels.constants import PROFILE
-from aolink.estimation.pixels.filter import Innovation
 from aolink.estimation.pixels.gaussian_mixture import log_sum
 from aolink.estimation.pixels.levenberg_marquardt import FIRST_DAMPING, FREE_DAMPING, LARGEST_DAMPING
 from aolink.estimation.pixels.likelihood import PixelView
-from aolink.numerics import batched
 from aolink.numerics.arrays import BoolArray, FloatArray, Indices
-from aolink.numerics.covariance import cholesky, lower_inverse
 
-_NO_NOISE = 1e-14
+WIDE_PATH = 0.5
+"""Variance of the path, in variances of the kernel, above which a search starts along more than one direction."""
+DIRECTIONS = 3
+"""Most directions: those that leave the path most uncertain."""
+START_REACH = 1.3
+"""Distance of a start from the mean, in standard deviations: near enough to be likely, far enough to lead to another
+mode."""
+REVERSED_TO = 0.2
+"""A start for a reversed path fits it to this many standard deviations of the kernel, if the prior allows."""
+PASSES = 16
+"""Most steps of a search, which bounds the work."""
+CONVERGED = 0.03
+"""Nats by which the objective still changes at a mode."""
+APART = 0.7
+"""Modes that are nearer to each other than this many standard deviations count as one."""
+NEW_DIRECTIONS = 4
+"""Directions of the innovation, for each output; the others hold hardly more than noise."""
+NO_INFORMATION = 1e-13
+"""Information of a direction, as a share of the largest, that is rounding."""
+
+
+class Innovation(NamedTuple):
+    """Innovation of the pixels, in the directions in which the prior lets them vary most."""
+
+    value: FloatArray
+    """(axes, k)"""
+    covariance: FloatArray
+    """(axes, k, k)"""
+    nis: FloatArray
+    """(axes,)"""
+    within_gate: BoolArray
+    """Whether the chi-square of pixels and prior together passes the gate, (axes,)."""
+
+    @classmethod
+    def none(cls, axes: int, k: int) -> Innovation:
+        """Zeros for axes of which nothing was measured."""
+        return cls(np.zeros((axes, k)), np.zeros((axes, k, k)), np.zeros(axes), np.zeros(axes, dtype=bool))
+
+    def spread(self, parts: Sequence[Innovation], seen: Indices) -> Innovation:
+        """Innovations of these axes in their places, and nothing for the others."""
+        out = Innovation.none(len(self.nis), parts[0].value.shape[1])
+        for room, *each in zip(out, *parts, strict=True):
+            room[seen] = np.concatenate(each)
+        return out
 
 
 class Modes(NamedTuple):
@@ -79,8 +114,8 @@ def find_modes(
     found = Modes.none(axes, count + (3 if reversals else 0), n)
     compiled_modes.find_modes(
         view.seen, np.ascontiguousarray(prior.mean), np.ascontiguousarray(prior.covariance),
-        np.ascontiguousarray(starts), of_axis, view.whole_nodes, precision, PROFILE.passes, FIRST_DAMPING,
-        LARGEST_DAMPING, FREE_DAMPING, PROFILE.converged, *found,
+        np.ascontiguousarray(starts), of_axis, view.whole_nodes, precision, PASSES, FIRST_DAMPING,
+        LARGEST_DAMPING, FREE_DAMPING, CONVERGED, *found,
     )  # fmt: skip
     return found
 
@@ -92,7 +127,7 @@ def modes_of(view: PixelView, prior: Gaussian, wide: Gaussian, at_length: BoolAr
     (`spread_starts`). After their modes come those that the best mode's reversal and mirror images lead to.
     """
     starts, squares = spread_starts(view, prior, wide)
-    many = at_length & (squares[:, 0] > PROFILE.wide_path * view.kernel_variance)
+    many = at_length & (squares[:, 0] > WIDE_PATH * view.kernel_variance)
     of_axis = np.where(many, starts.shape[1], np.where(at_length, 3, 1))
     return find_modes(view, prior, starts, of_axis, reversals=True)
 
@@ -100,25 +135,8 @@ def modes_of(view: PixelView, prior: Gaussian, wide: Gaussian, at_length: BoolAr
 def without_repeats(modes: Modes) -> Modes:
     """The modes without those that an earlier start has led to; the remaining ones come first."""
     mean, covariance, *rest = kept = [each.copy() for each in modes]
-    most = compiled_modes.drop_repeats(mean, covariance, PROFILE.apart, *rest)
+    most = compiled_modes.drop_repeats(mean, covariance, APART, *rest)
     return Modes(*(each[:, : max(most, 1)] for each in kept))
-
-
-def broad(view: PixelView, prior: Gaussian) -> Gaussian:
-    """The prior of t updated with windowed moments: wide where the posterior has several modes."""
-    if view.on_line:
-        assert isinstance(view.measured, Profile)
-        return updated(
-            view.optics.profile, view.nodes, prior, view.measured, np.ones(len(prior.mean)), PROFILE.broad_passes
-        )
-    about = prior
-    for _ in range(PROFILE.broad_passes):
-        y, noise, fit = view.moments(about)
-        innovation = y - fit.expected - batched.matvec(fit.slope, prior.mean - about.mean)
-        # A window without a pixel that can be used has neither moments nor noise.
-        spread = noise + fit.remainder + _NO_NOISE * np.eye(y.shape[1])
-        about = joseph_update(prior, innovation, fit.slope, spread).posterior
-    return about
 
 
 def spread_starts(view: PixelView, prior: Gaussian, wide: Gaussian) -> tuple[FloatArray, FloatArray]:
@@ -129,23 +147,17 @@ def spread_starts(view: PixelView, prior: Gaussian, wide: Gaussian) -> tuple[Flo
     largest first, (axes, n).
     """
     axes, n = wide.mean.shape
-    starts, squares = np.empty((axes, 1 + 2 * min(PROFILE.directions, n), n)), np.empty((axes, n))
+    starts, squares = np.empty((axes, 1 + 2 * min(DIRECTIONS, n), n)), np.empty((axes, n))
     compiled_modes.spread_starts(
         *(np.ascontiguousarray(each) for each in (prior.mean, prior.covariance, wide.mean, wide.covariance)),
-        view.gram, PROFILE.start_reach, starts, squares,
+        view.gram, START_REACH, starts, squares,
     )  # fmt: skip
     return starts, squares
 
 
 def precision_of_reversal(view: PixelView) -> float:
     """Precision with which a path is fitted to the reversal of another, one over slope units squared."""
-    return 1 / (PROFILE.reversed_to**2 * view.kernel_variance)
-
-
-def whitened(prior: Gaussian, points: FloatArray) -> FloatArray:
-    """Points (axes, k, n) in coordinates in which the prior is N(0, I)."""
-    inverse = lower_inverse(cholesky(prior.covariance))
-    return batched.matmul(points - prior.mean[:, None], batched.transpose(inverse))
+    return 1 / (REVERSED_TO**2 * view.kernel_variance)
 
 
 def innovation(view: PixelView, prior: Gaussian, modes: Modes) -> Innovation:
@@ -156,11 +168,11 @@ def innovation(view: PixelView, prior: Gaussian, modes: Modes) -> Innovation:
     rows = np.arange(len(modes.mean)), modes.best
     t, distance = modes.mean[rows], modes.distance[rows]
     axes, n = t.shape
-    k = min(PROFILE.new_directions * view.outputs, n)
+    k = min(NEW_DIRECTIONS * view.outputs, n)
     u, values, nis, square = np.empty((axes, k)), np.empty((axes, k)), np.empty(axes), np.empty(axes)
     compiled_modes.innovations(
         view.seen, np.ascontiguousarray(prior.mean), np.ascontiguousarray(prior.covariance), t,
-        PROFILE.no_information, u, values, nis, square,
+        NO_INFORMATION, u, values, nis, square,
     )  # fmt: skip
     # At the truth this is chi-square of all pixels and coefficients, and where the objective is least it is less.
     total = square + distance

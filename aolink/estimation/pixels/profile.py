@@ -1,101 +1,203 @@
-"""The estimator `profile`: the posterior of the pixels is a Gaussian mixture, which is carried from exposure to
-exposure.
+"""The estimator `profile`: the modes of the posterior of all pixels, carried from exposure to exposure as at most four
+Gaussians.
 
-In words: the modes of the posterior are searched for, points are drawn about them and weighted by importance sampling
-(`aolink.estimation.pixels.importance`), the weights are flattened until enough of the points count, and at most four
-Gaussians that fit them go on to the next exposure. The fewer points count, the larger is the part of the posterior that
-remains the wide Gaussians of windowed moments. Modes alone are not enough, since they are not Gaussian: the blur
-determines how much a path moves but not in which direction, and such a posterior is curved. The work for an axis and
-exposure is bounded, and `aolink.estimation.pixels.constants` has all numbers.
+By Laplace's method each mode is a Gaussian, and its evidence a weight. That holds where the path bends the light little
+over the mode's own uncertainty. Where a mode is wider than that, as the ring of all phases of a vibration that makes a
+whole number of swings in an exposure, its weight is wrong, and so much the more as the same error returns in the next
+exposures. So one rule decides: **where the uncertainty of a mode that counts changes the blur by more than its noise
+shows, the posterior is the Gaussian of windowed moments**, whose covariance has what the linearisation leaves out, with
+its memory (`aolink.estimation.moments.windowed`). No weight is carried on there, and `profile` is `moments`.
 
-A mode that was lost is found again: a thousandth of the prior is the prediction without any measurement. Its modes are
-searched for where the NIS is larger than chance explains.
+Timing, gate and status are those of `BlurFilter`: an exposure corrects the state at its start, a gated frame leaves the
+prediction, and after several of them the filter starts again from the prediction without any measurement.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from typing import NamedTuple
 
 import numpy as np
-from scipy import special
 
+from aolink.estimation.estimate import Status
+from aolink.estimation.frames.frame_data import HALF, Needs, Profile, SpotWindows
+from aolink.estimation.kalman.filter import PATIENCE, Filter, Posterior, gate_status
 from aolink.estimation.kalman.gaussian import Gaussian
-from aolink.estimation.model.base import ExposureModel
-from aolink.estimation.pixels.constants import PROFILE
-from aolink.estimation.pixels.filter import MixtureUpdate
-from aolink.estimation.pixels.gaussian_mixture import GaussianMixture, joined, log_sum, single
-from aolink.estimation.pixels.importance import posterior, proposed
-from aolink.estimation.pixels.likelihood import PixelView, Reduction, reduction
-from aolink.estimation.pixels.modes import Modes, broad, innovation, modes_of, without_repeats
-from aolink.numerics.arrays import BoolArray
+from aolink.estimation.kalman.predict import predict
+from aolink.estimation.model.base import ExposureModel, InputResponse, over_steps
+from aolink.estimation.model.exposure_model import exposure_model
+from aolink.estimation.moments.windowed import WindowedMoments
+from aolink.estimation.pixels.gaussian_mixture import GaussianMixture, single
+from aolink.estimation.pixels.likelihood import PixelView, reduction
+from aolink.estimation.pixels.modes import Innovation, Modes, innovation, modes_of, without_repeats
+from aolink.numerics.arrays import BoolArray, FloatArray, Indices
+from aolink.numerics.workers import in_threads, thread_count
+from aolink.optics.camera import effective_noise_density
 from aolink.optics.sensor import BaseSensor
+from aolink.rig import Plant
+
+CARRIED = 4
+"""Most Gaussians that go on to the next exposure."""
+FREE = 0.01
+"""They are merged further while a merger costs less than this, in nats."""
+COUNTS = 0.01
+"""A mode of a smaller share of the posterior may be wide, ..."""
+NEGLIGIBLE = 1e-6
+"""... and one of a smaller share than this is dropped."""
+REPORTED = 0.05
+"""A second mode of this share of the posterior is reported as another path."""
+# Largest variance of the prediction without measurements, relative to that of the plant's prior and noise.
+_WIDEST = 1e6
+# Chunks of axes: what NumPy computes for them together fits into the cache; compiled code has fewer calls to pay for.
+_AT_ONCE = 32
+_AT_ONCE_COMPILED = 450
 
 
-@dataclass(frozen=True)
-class ProfileUpdater:
-    """Updates a Gaussian mixture by importance sampling about the modes of the posterior."""
+class Found(NamedTuple):
+    """What a frame shows of some axes."""
 
-    draws: float = 1.0
-    """Share of the usual number of points, and of the usual effective sample size."""
+    posterior: GaussianMixture
+    """Of the reduced coefficients t."""
+    innovation: Innovation
+    log_evidence: FloatArray
+    """Log-likelihood of the pixels by Laplace's method, (axes,)."""
+    is_multimodal: BoolArray
+    """(axes,)"""
 
-    def reduction(self, model: ExposureModel, sensor: BaseSensor) -> Reduction:
-        return reduction(model, sensor)
 
-    def update(self, view: PixelView, prior: GaussianMixture, unseen: Gaussian) -> MixtureUpdate:
-        reduced = view.reduced
-        modes, after = explored(view, prior)
-        new = innovation(view, reduced.prior(prior.gaussian), modes)
-        doubted = np.flatnonzero(new.nis > 2 * special.gammainccinv(new.value.shape[1] / 2, PROFILE.doubted))
-        wide = _wide_part(after, prior)
-        if len(doubted):
-            anew = single(unseen.part(doubted))
-            _, more = explored(view.part(doubted), anew)
-            after = after.replaced(doubted, joined(after.part(doubted), more))
-            wide = wide.replaced(doubted, joined(wide.part(doubted), _wide_part(more, anew)))
-        before = joined(prior.weighted(1 - PROFILE.doubt), single(unseen).weighted(PROFILE.doubt))
-        several, poor = has_several(modes, PROFILE.least_doubted_share), np.zeros(len(prior.mean), dtype=bool)
-        for which, share in ((~several, PROFILE.share_of_one_mode), (several, 1.0)):
-            if len(rows := np.flatnonzero(which)):
-                fit, poor[rows] = posterior(
-                    view.part(rows), before.part(rows), after.part(rows), wide.part(rows), self.draws * share
-                )
-                after = after.replaced(rows, fit)
-        carried = after.mapped(reduced.end_rows, reduced.end_remainder).reduced(PROFILE.carried, PROFILE.free)
-        return MixtureUpdate(
-            after, after.gaussian, carried, new, modes.total_evidence, has_several(modes), poor & new.within_gate
+class ProfileFilter(Filter):
+    """A mixture for each axis, carried from exposure to exposure. ``gate`` says whether frames that are too far from
+    their prediction are left out."""
+
+    def __init__(self, plant: Plant, sensor: BaseSensor, *, gate: bool = True) -> None:
+        self.plant, self.sensor, self._gate = plant, sensor, gate
+        self._moments = WindowedMoments(sensor, plant.n_outputs)
+        axes = plant.axes
+        start = Gaussian(np.tile(plant.initial_mean, (axes, 1)), np.tile(plant.initial_covariance, (axes, 1, 1)))
+        self.prior = single(start)
+        # The prediction without any measurement.
+        self._unseen = start
+        self._missed = np.zeros(axes, dtype=np.int64)
+
+    def warm_up(self) -> None:
+        """Update one axis with a dark exposure, so that what this compiles is compiled before the session."""
+        one = slice(0, 1)
+        model, outputs, pixels = exposure_model(self.plant, 2), self.plant.n_outputs, self.sensor.profile.pixels
+        kind = Profile if outputs == 1 else SpotWindows
+        shape = (1, pixels) if outputs == 1 else (1, outputs // 2, pixels, pixels)
+        dark = kind(density=np.zeros(shape), mask=np.ones(shape, dtype=bool))
+        response = model.response(np.zeros((2, self.plant.n_inputs * self.plant.axes)))
+        view = PixelView(self.sensor, model, response, dark, reduction(model, self.sensor))
+        two = GaussianMixture(*(np.repeat(each[one], 2, axis=1) for each in self.prior)).weighted(0.5)
+        self.found(view.part(one), two)[0].reduced(1)
+
+    @property
+    def needs(self) -> Needs:
+        return Needs(what="windows" if self.plant.n_outputs > 1 else "profile", least_usable=HALF)
+
+    def bridge(self, inputs: FloatArray) -> None:
+        if len(inputs):
+            transition, noise, kick = over_steps(self.plant, inputs)
+            self.prior = self.prior.mapped(transition, noise).moved(kick)
+            self._unseen = self._unwatched(transition, noise, kick)
+
+    def _unwatched(self, transition: FloatArray, noise: FloatArray, kick: FloatArray) -> Gaussian:
+        """The prediction of `_unseen`; on an unstable plant it stops once it is so wide that it carries no
+        information."""
+        now, later = self._unseen, predict(self._unseen, transition, noise, kick)
+        widest = _WIDEST * (np.trace(self.plant.initial_covariance) + np.trace(noise))
+        grows = np.isfinite(later.mean).all(axis=1) & (np.einsum("aii->a", later.covariance) <= widest)
+        return Gaussian(
+            np.where(grows[:, None], later.mean, now.mean),
+            np.where(grows[:, None, None], later.covariance, now.covariance),
         )
 
+    def step(self, model: ExposureModel, response: InputResponse, measured: Profile | SpotWindows | None) -> Posterior:
+        axes, reduced = self.plant.axes, reduction(model, self.sensor)
+        lost = self._missed >= PATIENCE
+        prior = self.prior.replaced(np.flatnonzero(lost), single(self._unseen.part(lost)))
+        predicted = reduced.prior(Gaussian(prior.mean, prior.covariance))
+        posterior = GaussianMixture(prior.log_weight, predicted.mean, predicted.covariance)
+        status = np.full(axes, int(Status.INPUT_INVALID), dtype=np.int64)
+        new = Innovation.none(axes, 0)
+        is_multimodal, log_evidence = np.zeros(axes, dtype=bool), np.full(axes, np.nan)
+        if measured is not None:
+            parts, views = self._parts(model, response, measured, prior)
+            done = in_threads(lambda p: self.found(views[p[0]].part(p), prior.part(p)), parts)
+            if parts:
+                seen = np.concatenate(parts)
+                new = new.spread([each.innovation for each in done], seen)
+                log_evidence[seen] = np.concatenate([each.log_evidence for each in done])
+                # The pixels' own noise is left out of their likelihoods, being the same at all points of one camera.
+                pixels = np.count_nonzero(measured.mask.reshape(axes, -1), axis=1)
+                log_evidence -= 0.5 * pixels * math.log(effective_noise_density(self.sensor) / self.sensor.pixel_size)
+                trusted = new.within_gate[seen] | (not self._gate)
+                status[seen], self._missed[seen] = gate_status(trusted, lost[seen], self._missed[seen])
+                posterior = posterior.replaced(
+                    seen[trusted], GaussianMixture.stacked([each.posterior for each in done]).part(trusted)
+                )
+                is_multimodal[seen] = trusted & np.concatenate([each.is_multimodal for each in done])
+        after = posterior.mapped(reduced.end_rows, reduced.end_remainder).moved(response.end)
+        self.prior = after.reduced(CARRIED, FREE)
+        self._unseen = self._unwatched(model.transition, model.process_noise, response.end)
+        return Posterior(
+            coefficients=reduced.coefficients(posterior.gaussian), end=after.gaussian, status=status,
+            innovation=new.value, innovation_covariance=new.covariance, nis=new.nis, several=is_multimodal,
+            log_evidence=log_evidence, likeliest=posterior.likeliest,
+        )  # fmt: skip
 
-def has_several(modes: Modes, least: float = PROFILE.least_share) -> BoolArray:
-    """Whether a second mode has at least this share of the posterior, (axes,)."""
-    share = np.exp(modes.log_evidence - log_sum(modes.log_evidence, axis=1)[:, None])
-    return np.asarray((share > least).sum(axis=1) > 1)
+    def _parts(
+        self, model: ExposureModel, response: InputResponse, measured: Profile | SpotWindows, prior: GaussianMixture
+    ) -> tuple[list[Indices], dict[int, PixelView]]:
+        """Axes that are computed together, and the view of each part by its first axis.
 
+        Each axis gets the nodes in time that its own predicted path needs, whatever the other axes need.
+        """
+        reduced = reduction(model, self.sensor)
+        usable = np.arange(self.plant.axes) if measured.usable is None else np.flatnonzero(measured.usable)
+        level = reduced.resolution.of(model.seen_path(model.path(prior.gaussian.mean, response.path)))
+        parts, views = [], {}
+        for k in np.unique(level[usable]).tolist():
+            view, alike = PixelView(self.sensor, model, response, measured, reduced, k), usable[level[usable] == k]
+            at_once = min(_AT_ONCE_COMPILED if view.on_line else _AT_ONCE, -(-len(alike) // thread_count()))
+            for j in range(0, len(alike), at_once):
+                parts.append(alike[j : j + at_once])
+                views[int(alike[j])] = view
+        return parts, views
 
-def explored(view: PixelView, prior: GaussianMixture) -> tuple[Modes, GaussianMixture]:
-    """The modes for each component of the start state's prior, and the proposal density: a mixture to draw points from.
+    def found(self, view: PixelView, prior: GaussianMixture) -> Found:
+        """The posterior of some axes."""
+        before = view.reduced.prior(prior.gaussian)
+        by_moments = self._by_moments(view, before)
+        modes = self._modes(view, prior, by_moments)
+        log_share = modes.log_evidence - modes.total_evidence[:, None]
+        bent = view.blur_of(modes.covariance) > view.reduced.least_blur
+        wide = np.flatnonzero((bent & (log_share > math.log(COUNTS))).any(axis=1))
+        log_share = np.where(log_share > math.log(NEGLIGIBLE), log_share, -np.inf)
+        posterior = GaussianMixture(log_share, modes.mean, modes.covariance).ordered()
+        posterior = posterior.replaced(wide, single(by_moments.part(wide)))
+        is_multimodal = (log_share > math.log(REPORTED)).sum(axis=1) > 1
+        return Found(posterior, innovation(view, before, modes), modes.total_evidence, is_multimodal)
 
-    The heaviest component is searched at length, the others from one start each. The modes' log-evidence includes the
-    weights of the components.
-    """
-    before = view.reduced.prior(Gaussian(prior.mean, prior.covariance))
-    axes, count, _ = before.mean.shape
-    there = np.nonzero(np.isfinite(prior.log_weight))
-    rows, own = view.part(there[0]), Gaussian(before.mean[there], before.covariance[there])
-    wide = broad(rows, own)
-    heaviest = np.argmax(prior.log_weight, axis=1)[there[0]] == there[1]
-    found = modes_of(rows, own, wide, heaviest)
-    found = found._replace(log_evidence=found.log_evidence + prior.log_weight[there][:, None])
-    modes = Modes.none(axes, count * found.mean.shape[1], found.mean.shape[2])
-    for room, each in zip(modes, found, strict=True):
-        room.reshape(axes, count, *each.shape[1:])[there] = each
-    modes = without_repeats(modes)
-    flat = GaussianMixture(prior.log_weight, np.zeros_like(before.mean), np.zeros_like(before.covariance))
-    flat.mean[there], flat.covariance[there] = wide.mean, wide.covariance
-    return modes, proposed(GaussianMixture(modes.log_evidence, modes.mean, modes.covariance), flat)
+    def _by_moments(self, view: PixelView, prior: Gaussian) -> Gaussian:
+        return self._moments.updated(view.dynamics, view.moment_nodes, prior, view.measured).posterior
 
+    def _modes(self, view: PixelView, prior: GaussianMixture, by_moments: Gaussian) -> Modes:
+        """The modes for each component of the start state's prior; their log-evidence includes the components' weights.
 
-def _wide_part(proposal: GaussianMixture, prior: GaussianMixture) -> GaussianMixture:
-    """The Gaussians of windowed moments, the last ones of a proposal density, with the weights of the prior's."""
-    count = prior.mean.shape[1]
-    return GaussianMixture(prior.log_weight, proposal.mean[:, -count:], proposal.covariance[:, -count:])
+        The heaviest component is searched at length, the others from one start each.
+        """
+        before = view.reduced.prior(Gaussian(prior.mean, prior.covariance))
+        axes, count, _ = before.mean.shape
+        there = np.nonzero(np.isfinite(prior.log_weight))
+        rows, own = view.part(there[0]), Gaussian(before.mean[there], before.covariance[there])
+        wide = by_moments if count == 1 else self._by_moments(rows, own)
+        heaviest = np.argmax(prior.log_weight, axis=1)[there[0]] == there[1]
+        found = modes_of(rows, own, wide, heaviest)
+        found = found._replace(log_evidence=found.log_evidence + prior.log_weight[there][:, None])
+        if count == 1:
+            return without_repeats(found)
+        modes = Modes.none(axes, count * found.mean.shape[1], found.mean.shape[2])
+        for room, each in zip(modes, found, strict=True):
+            room.reshape(axes, count, *each.shape[1:])[there] = each
+        return without_repeats(modes)
