@@ -6,20 +6,20 @@ import numpy as np
 import pytest
 from scipy import linalg
 
-from aolink.estimation import Status, exposure_model, run, score
+from aolink.estimation import Status, exposure_model, make_estimator, run, score
+from aolink.estimation.compiled.windows import Path
 from aolink.estimation.frames.frame_data import Profile
 from aolink.estimation.kalman.filter import BlurFilter
 from aolink.estimation.kalman.gaussian import Gaussian
+from aolink.estimation.model.base import Dynamics
 from aolink.estimation.model.quadrature import equal_parts, quadrature_paths
-from aolink.estimation.moments.lines import WindowedMoments
-from aolink.estimation.moments.windowed import weighted_sums
-from aolink.optics.camera import pixel_noise_sd, shot_gain
+from aolink.estimation.moments.windowed import Inflation, WindowedMoments, inflation, path_of, windows_of
+from aolink.numerics.covariance import psd_root
+from aolink.optics.camera import pixel_noise_sd, shot_gain, to_counts
 from aolink.optics.kernel import exposure_density, pixel_mass
 from aolink.rig import Rig, load_rig
-from aolink.rig.parts import UnmodelledSlopes
 from aolink.simulation.model import simulate
-from tests.estimation.moments.plain import PlainMoments
-from tests.kinds import line_of
+from tests.kinds import line_of, truth_of
 
 RIG = load_rig("section-vi-lively")
 SENSOR = line_of(RIG)
@@ -56,34 +56,40 @@ def upper_bound_of_ratio(ours, theirs, seed=0):
 # What is expected, by sampling
 
 
-def spread_prior(axes=2):
-    """A prior of the lively plant's coefficients about an offset."""
-    model = exposure_model(dataclasses.replace(RIG.plant, axes=axes), 200)
-    count = model.n_coefficients
-    covariance = np.eye(count)
-    covariance[:2, :2] = RIG.plant.initial_covariance / 4
-    mean = np.zeros((axes, count))
-    mean[:, 0] = np.linspace(0.2, -0.3, axes)
-    return model, Gaussian(mean, np.tile(covariance, (axes, 1, 1)))
+def nodes_of(rig, steps=200):
+    model = exposure_model(dataclasses.replace(rig.plant, axes=1), steps)
+    return model, quadrature_paths(
+        model, model.response(np.zeros((steps, model.plant.n_inputs))), equal_parts(steps, 50)
+    )
+
+
+def prior_of(rig, model, share=0.25, seed=0):
+    """A prior of an exposure's coefficients about an offset."""
+    count, n = model.n_coefficients, rig.plant.n_states
+    covariance, mean = np.eye(count), np.zeros((1, count))
+    covariance[:n, :n] = rig.plant.initial_covariance * share
+    mean[0, :n] = psd_root(rig.plant.initial_covariance) @ np.random.default_rng(seed).normal(0, 0.5, n)
+    return Gaussian(mean, covariance[None])
+
+
+def dark(shape, **changes):
+    return windows_of(Profile(density=np.zeros(shape), mask=np.ones(shape, bool), **changes))
 
 
 @pytest.mark.slow
 def test_regression_is_that_of_samples():
-    model, prior = spread_prior()
-    observation = PlainMoments(SENSOR)
-    nodes = quadrature_paths(
-        model, model.response(np.zeros((model.n_steps, model.plant.axes))), equal_parts(model.n_steps, 100)
-    )
-    rows, weights = nodes.basis[0], nodes.weights
-    mean = prior.mean @ rows.T
-    spread = rows @ prior.covariance @ rows.T
-    W = observation.window_weights(mean, np.einsum("akk->ak", spread), np.ones((2, 40), bool))
-    fit = observation.regression(W, mean, spread, rows, weights)
-    rng = np.random.default_rng(1)
-    samples = 4000
-    z = rng.standard_normal((samples, len(prior.mean[0]))) @ np.linalg.cholesky(prior.covariance[0]).T
-    paths = (z + prior.mean[0]) @ rows.T
-    y = np.array([weights @ pixel_mass(SENSOR.kernel, SENSOR.edges, path) for path in paths]) @ W[0].T
+    model, nodes = nodes_of(RIG)
+    prior, observation = prior_of(RIG, model), WindowedMoments(SENSOR, 1)
+    fit = observation.regression(dark((1, 40)), path_of(nodes), prior)
+    rng, samples = np.random.default_rng(1), 4000
+    z = rng.standard_normal((samples, model.n_coefficients)) @ np.linalg.cholesky(prior.covariance[0]).T
+    paths = (z + prior.mean[0]) @ nodes.basis[0].T
+    frames = np.array([nodes.weights @ pixel_mass(SENSOR.kernel, SENSOR.edges, path) for path in paths])
+    # The window is that of the prior, whatever the frame, so the sums of frames are values of the same observation.
+    windows = windows_of(Profile(density=frames / SENSOR.pixel_width, mask=np.ones(frames.shape, bool)))
+    many = Gaussian(np.tile(prior.mean, (samples, 1)), np.tile(prior.covariance, (samples, 1, 1)))
+    path = path_of(nodes)._replace(inputs=np.zeros((samples, 1, len(nodes.weights))))
+    y = observation.regression(windows, path, many).value
     slope = np.linalg.lstsq(np.column_stack([np.ones(samples), z]), y, rcond=None)[0][1:].T
     rest = y - y.mean(axis=0) - z @ slope.T
     scale = y.std(axis=0)
@@ -95,25 +101,22 @@ def test_regression_is_that_of_samples():
     np.testing.assert_allclose(fit.remainder[0], np.cov(rest.T), atol=0.12 * scale.max() ** 2)
 
 
-def test_slope_is_the_derivative_of_what_is_expected():
-    model, prior = spread_prior(1)
-    observation = PlainMoments(SENSOR)
-    nodes = quadrature_paths(
-        model, model.response(np.zeros((model.n_steps, model.plant.axes))), equal_parts(model.n_steps, 100)
-    )
-    rows, weights = nodes.basis[0], nodes.weights
-    spread = rows @ prior.covariance @ rows.T
-    W = observation.window_weights(prior.mean @ rows.T, np.einsum("akk->ak", spread), np.ones((1, 40), bool))
-
-    def at(z):
-        return observation.regression(W, z @ rows.T, spread, rows, weights)
-
-    slope = at(prior.mean).slope[0]
-    for k in range(slope.shape[1]):
-        h = np.zeros_like(prior.mean)
-        h[0, k] = 1e-5
-        difference = (at(prior.mean + h).expected - at(prior.mean - h).expected)[0] / 2e-5
-        np.testing.assert_allclose(slope[:, k], difference, atol=1e-7)
+@pytest.mark.parametrize("photoelectrons", [0.0, 400.0])
+def test_noise_of_the_sums_is_that_of_many_frames(photoelectrons):
+    clean = exposure_density(SENSOR.kernel, SENSOR.edges, np.linspace(0.1, 0.4, 200))
+    sensor = dataclasses.replace(SENSOR, photoelectrons=photoelectrons)
+    sd = np.sqrt(pixel_noise_sd(sensor) ** 2 + shot_gain(sensor) * clean)
+    model, nodes = nodes_of(RIG)
+    count, observation, path = 20_000, WindowedMoments(sensor, 1), path_of(nodes)
+    frames = np.concatenate([clean[None], clean + sd * np.random.default_rng(3).standard_normal((count, 40))])
+    prior = prior_of(RIG, model, share=1e-3)
+    many = Gaussian(np.tile(prior.mean, (count + 1, 1)), np.tile(prior.covariance, (count + 1, 1, 1)))
+    found = observation.regression(
+        windows_of(Profile(density=frames, mask=np.ones(frames.shape, bool))),
+        path._replace(inputs=np.zeros((count + 1, 1, len(nodes.weights)))), many,
+    )  # fmt: skip
+    spread = np.cov(found.value[1:], rowvar=False)
+    np.testing.assert_allclose(found.noise[0], spread, atol=0.03 * spread.max())
 
 
 def test_expected_sums_are_those_of_a_noiseless_frame():
@@ -122,65 +125,60 @@ def test_expected_sums_are_those_of_a_noiseless_frame():
     density = exposure_density(SENSOR.kernel, SENSOR.edges, path)[None]
     mask = np.ones((1, 40), bool)
     mask[0, 24] = False
-    observation = PlainMoments(SENSOR)
-    W = observation.window_weights(path[None], np.zeros((1, 200)), mask)
-    fit = observation.regression(W, path[None], np.zeros((1, 200, 200)), np.zeros((200, 3)), np.full(200, 1 / 200))
-    y, _ = weighted_sums(observation.sensor, W, density)
-    np.testing.assert_allclose(y, fit.expected, atol=1e-12)
-    assert W[0, 0, 24] == 0
+    still = Path(basis=np.zeros((1, 3, 200)), inputs=path[None, None], weights=np.full(200, 1 / 200))
+    nothing = Gaussian(np.zeros((1, 3)), np.zeros((1, 3, 3)))
+    windows = windows_of(Profile(density=np.where(mask, density, 0.0), mask=mask))
+    fit = WindowedMoments(SENSOR, 1).regression(windows, still, nothing)
+    np.testing.assert_allclose(fit.value, fit.expected, atol=1e-11)
+    whole = windows_of(Profile(density=density, mask=np.ones((1, 40), bool)))
+    assert abs(WindowedMoments(SENSOR, 1).regression(whole, still, nothing).value - fit.value).max() > 1e-3
 
 
-@pytest.mark.parametrize("photoelectrons", [0.0, 400.0])
-def test_noise_of_the_sums_is_that_of_many_frames(photoelectrons):
-    path = np.linspace(0.1, 0.4, 200)
-    clean = exposure_density(SENSOR.kernel, SENSOR.edges, path)
-    rng = np.random.default_rng(3)
-    sensor = dataclasses.replace(SENSOR, photoelectrons=photoelectrons)
-    sd = np.sqrt(pixel_noise_sd(sensor) ** 2 + shot_gain(sensor) * clean)
-    observation = PlainMoments(sensor)
-    W = observation.window_weights(path[None], np.full((1, 200), 0.001), np.ones((1, 40), bool))
-    _, noise = weighted_sums(observation.sensor, W, clean[None])
-    spread = np.cov((clean + sd * rng.standard_normal((20_000, 40))) @ W[0].T * SENSOR.pixel_width, rowvar=False)
-    np.testing.assert_allclose(noise[0], spread, atol=0.03 * spread.max())
+@pytest.mark.parametrize("kind", ["line", "plane"])
+def test_slope_is_the_derivative_of_what_is_expected(kind):
+    """The window is where the spread is wide, so a small move of the mean leaves it as it is."""
+    rig = RIG if kind == "line" else load_rig("tip-tilt")
+    model, nodes = nodes_of(rig, rig.timing.exposure_steps)
+    prior, outputs = prior_of(rig, model), rig.plant.n_outputs
+    size = rig.sensor.profile.pixels
+    shape = (1, size) if kind == "line" else (1, outputs // 2, size, size)
+    observation = WindowedMoments(rig.sensor, outputs)
+    # All pixels are in the window whichever way the mean moves.
+    wide = Gaussian(prior.mean, prior.covariance * 60)
+
+    def at(mean):
+        return observation.regression(dark(shape), path_of(nodes), Gaussian(mean, wide.covariance))
+
+    slope = at(prior.mean).slope[0]
+    for k in range(min(slope.shape[1], 6)):
+        h = np.zeros_like(prior.mean)
+        h[0, k] = 1e-5
+        difference = (at(prior.mean + h).expected - at(prior.mean - h).expected)[0] / 2e-5
+        np.testing.assert_allclose(slope[:, k], difference, atol=2e-3 * np.abs(slope).max())
 
 
-def test_equal_parts_of_the_steps_keep_the_mean_of_the_path():
-    model = exposure_model(RIG.plant, 1037)
-    nodes = quadrature_paths(
-        model, model.response(np.zeros((model.n_steps, model.plant.axes))), equal_parts(model.n_steps, 100)
-    )
-    rows, weights = nodes.basis[0], nodes.weights
-    assert len(weights) <= 100
-    np.testing.assert_allclose(weights @ rows, model.basis[0].mean(axis=0), atol=1e-14)
+@pytest.mark.parametrize("rho", [0.0, 0.5, 0.999999, 1.5])
+def test_errors_that_return_count_as_often_as_they_do(rho):
+    """The variance of a mean of many errors with this correlation, over that of independent ones."""
+    factor = float(inflation(np.array(rho)))
+    if rho < 0.9:
+        count = 4000
+        each = rho ** np.abs(np.subtract.outer(np.arange(count), np.arange(count)))
+        assert factor == pytest.approx(each.sum() / count, rel=2e-3)
+    else:
+        assert factor == 1e3
 
 
-# In compiled code
-
-
-@pytest.mark.parametrize("photoelectrons", [0.0, 400.0])
-@pytest.mark.parametrize("offset", [0.0, 0.3])
-def test_the_update_is_that_of_the_twin(photoelectrons, offset):
-    rng, axes = np.random.default_rng(4), 5
-    sensor = dataclasses.replace(SENSOR, photoelectrons=photoelectrons)
-    unmodelled = UnmodelledSlopes(sd=0.04, correlation_steps=30.0) if offset else None
-    plant = dataclasses.replace(RIG.plant, axes=axes, unmodelled=unmodelled)
-    model = exposure_model(plant, 150, offset)
-    prior = Gaussian(rng.normal(0, 0.1, (axes, 2)), np.tile(plant.initial_covariance / 3, (axes, 1, 1)))
-    paths = rng.uniform(-0.3, 0.3, (axes, 1)) + 0.1 * np.sin(np.linspace(0, 6, 150))
-    mask = rng.random((axes, 40)) > 0.02
-    density = exposure_density(SENSOR.kernel, SENSOR.edges, paths) + 0.1 * rng.standard_normal((axes, 40))
-    light = rng.uniform(0.5, 1.5, axes) if photoelectrons else None
-    given = (
-        model, model.response(rng.normal(0, 0.01, (150, axes))), prior.with_noise(model.n_coefficients),
-        Profile(density=np.where(mask, density, 0.0), mask=mask, light=light),
-    )  # fmt: skip
-    ours, twin = WindowedMoments(sensor).update(*given), PlainMoments(sensor).update(*given)
-    for found, expected in (
-        (ours.posterior.mean, twin.posterior.mean), (ours.posterior.covariance, twin.posterior.covariance),
-        (ours.innovation, twin.innovation), (ours.innovation_covariance, twin.innovation_covariance),
-        (ours.nis, twin.nis),
-    ):  # fmt: skip
-        np.testing.assert_allclose(found, expected, rtol=1e-8, atol=1e-9 * np.abs(expected).max())
+def test_a_state_that_stays_but_is_known_does_not_count():
+    """A constant beside a vibration changes nothing of how long the vibration's errors last."""
+    turn, decay = 1.3, 0.8
+    A = decay * np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+    both = linalg.block_diag(A, 1.0)
+    known = np.diag([0.04, 0.04, 1e-8])[None]
+    alone = Inflation(Dynamics(A, A, np.eye(2)), Gaussian(np.zeros((1, 2)), known[:, :2, :2]))
+    beside = Inflation(Dynamics(both, both, np.eye(3)), Gaussian(np.zeros((1, 3)), known))
+    assert beside.by_plant[0] == pytest.approx(alone.by_plant[0], rel=1e-6)
+    assert alone.by_plant[0] == pytest.approx((1 + decay) / (1 - decay), rel=1e-9)
 
 
 # What it is good for
@@ -219,6 +217,55 @@ def test_a_blur_that_has_several_readings_is_not_believed_in_one(resonance_hz):
 # Trust
 
 
+def test_missing_and_saturated_pixels_are_left_out():
+    exposures = simulate(RIG, 110, seed=5)
+    holed = []
+    for e in exposures:
+        pixels, mask = e.pixels.copy(), e.mask.copy()
+        pixels[0, 17], pixels[0, 25] = 0, 65535  # one never came, one is stuck
+        mask[0, 17] = False
+        holed.append(dataclasses.replace(e, pixels=pixels, mask=mask))
+    whole, given = (run(RIG, series, ["moments"])["moments"] for series in (exposures, holed))
+    assert {e.status for e in given} == {Status.OK}
+    assert "left out" in given[0].reason
+    assert score(exposures, given, 10).path_rmse < 1.3 * score(exposures, whole, 10).path_rmse
+
+
+def test_half_a_frame_is_not_enough():
+    (exposure,) = simulate(RIG, 1)
+    mask = exposure.mask.copy()
+    mask[0, :30] = False
+    given = make_estimator(RIG, "moments").step(dataclasses.replace(exposure, mask=mask))
+    assert given.status == Status.INPUT_INVALID
+
+
+def test_a_spot_that_is_not_where_it_should_be_is_lost_and_found():
+    exposures = simulate(RIG, 40, seed=6)
+    moved = exposures[:15]
+    for e in exposures[15:]:
+        path = np.clip(truth_of(e).path - 0.8 * np.sign(truth_of(e).path.mean()), -0.9, 0.9)
+        noise = np.random.default_rng(e.frame_id).standard_normal((1, 40)) * np.sqrt(0.01 / 0.05)
+        counts = to_counts(SENSOR, exposure_density(SENSOR.kernel, SENSOR.edges, path) + noise)
+        moved.append(dataclasses.replace(e, pixels=counts))
+    statuses = [e.status for e in run(RIG, moved, ["moments"])["moments"]]
+    assert set(statuses[:15]) == {Status.OK}
+    assert statuses[15] == Status.GATED
+    assert Status.DIVERGED in statuses[15:]
+    for estimate in run(RIG, moved, ["moments"])["moments"]:
+        assert np.isfinite(estimate.path).all()
+        assert np.linalg.eigvalsh(estimate.coefficient_covariance[0]).min() > -1e-12
+
+
+def test_a_frame_without_a_spot_is_refused():
+    exposures = simulate(RIG, 2)
+    noise = np.random.default_rng(1).standard_normal((1, 40)) * np.sqrt(0.01 / 0.05)
+    estimator = make_estimator(RIG, "moments")
+    estimator.step(exposures[0])
+    dark = estimator.step(dataclasses.replace(exposures[1], pixels=to_counts(SENSOR, noise)))
+    assert dark.status == Status.INPUT_INVALID
+    assert "no spot" in dark.reason
+
+
 @pytest.mark.slow
 def test_shot_noise_by_the_rig_file_is_allowed_for():
     """With 300 photo-electrons there is more noise than the camera's own; without allowing for it, NEES shows it."""
@@ -245,7 +292,7 @@ def test_an_axis_does_not_depend_on_those_beside_it(axes):
 
     def steps(n):
         plant = dataclasses.replace(RIG.plant, axes=n)
-        filter_ = BlurFilter(plant, WindowedMoments(SENSOR))
+        filter_ = BlurFilter(plant, WindowedMoments(SENSOR, 1))
         model = exposure_model(plant, 200)
         for frame, usable in zip(density, mask, strict=True):
             response = model.response(np.full((200, n), 0.001))
@@ -278,7 +325,7 @@ def test_numbers_beyond_all_bounds_are_gated_and_stop_nothing():
     plant = dataclasses.replace(RIG.plant, axes=2)
     model = exposure_model(plant, 200)
     for density in (1e200, -1e200):
-        filter_ = BlurFilter(plant, WindowedMoments(SENSOR))
+        filter_ = BlurFilter(plant, WindowedMoments(SENSOR, 1))
         profile = Profile(density=np.full((2, 40), density), mask=np.ones((2, 40), bool))
         profile.density[1] = exposure_density(SENSOR.kernel, SENSOR.edges, np.zeros(200))
         with np.errstate(all="ignore"):
