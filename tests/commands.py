@@ -46,7 +46,6 @@ _MODULES = (
     "aolink.cli.tables.recordings",
     "aolink.cli.tables.scores",
     "aolink.cli.tables.sessions",
-    "aolink.estimation.pixels.filter",
     "aolink.estimation.pixels.profile",
     "typer._adapters",  # with which it reads options
 )

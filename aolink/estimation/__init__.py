@@ -17,8 +17,7 @@ if TYPE_CHECKING:
     from aolink.estimation.kalman.update import joseph_update
     from aolink.estimation.model.base import ExposureModel
     from aolink.estimation.model.exposure_model import exposure_model, path_from_coefficients
-    from aolink.estimation.moments.lines import WindowedMoments
-    from aolink.estimation.moments.spots import WindowedSpots
+    from aolink.estimation.moments.windowed import WindowedMoments
     from aolink.estimation.options import Engine, Options
     from aolink.estimation.registry import EstimatorRow, estimator_row, estimator_rows, make_estimator
     from aolink.estimation.smoother import smooth
@@ -43,8 +42,7 @@ else:  # the type checker would accept any name
             "kalman.update": "joseph_update",
             "model.base": "ExposureModel",
             "model.exposure_model": "exposure_model path_from_coefficients",
-            "moments.lines": "WindowedMoments",
-            "moments.spots": "WindowedSpots",
+            "moments.windowed": "WindowedMoments",
             "options": "Engine Options",
             "registry": "EstimatorRow estimator_row estimator_rows make_estimator",
             "smoother": "smooth",
@@ -63,7 +61,7 @@ else:  # the type checker would accept any name
 __all__ = [
     "ESTIMATOR_NAMES", "BlurFilter", "Consistency", "Driver", "Engine", "Estimate", "Estimator", "EstimatorRow",
     "ExposureModel", "Filter", "Gaussian", "Measurement", "Needs", "Options", "PathMoments", "Posterior", "Profile",
-    "Score", "Scorer", "SpotWindows", "Status", "Update", "WindowedMoments", "WindowedSpots", "estimator_row",
+    "Score", "Scorer", "SpotWindows", "Status", "Update", "WindowedMoments", "estimator_row",
     "estimator_rows", "exposure_model", "joseph_update", "make_estimator", "measure_moments", "measure_moments_2d",
     "path_from_coefficients", "run", "score", "smooth",
 ]  # fmt: skip

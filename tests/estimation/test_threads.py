@@ -14,7 +14,7 @@ from aolink.estimation import ESTIMATOR_NAMES, exposure_model, run
 from aolink.estimation.kalman.filter import BlurFilter
 from aolink.estimation.pixels import joint_pixels
 from aolink.estimation.frames.spots import measure_spots
-from aolink.estimation.moments.lines import WindowedMoments
+from aolink.estimation.moments.windowed import WindowedMoments
 from aolink.estimation.frames.frame_data import Needs, Profile
 from aolink.rig import load_rig
 from aolink.simulation.model import simulate
@@ -29,7 +29,7 @@ plant = dataclasses.replace(rig.plant, axes=64)
 rng = np.random.default_rng(1)
 profile = Profile(density=rng.standard_normal((64, 40)), mask=np.ones((64, 40), bool))
 model = exposure_model(plant, 200)
-step = BlurFilter(plant, WindowedMoments(rig.sensor)).step(model, model.response(rng.random((200, 64))), profile)
+step = BlurFilter(plant, WindowedMoments(rig.sensor, 1)).step(model, model.response(rng.random((200, 64))), profile)
 digest.update(step.coefficients.covariance.tobytes())
 small = load_rig("sh-4x4")
 sensor = dataclasses.replace(small.sensor, grid=(30, 30))

@@ -6,13 +6,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from aolink.estimation.moments.lines import WindowedMoments
 from scipy import stats
 
 from aolink.estimation import Profile, exposure_model, make_estimator
 from aolink.estimation.frames.measure import measure
 from aolink.estimation.kalman.gaussian import Gaussian
 from aolink.estimation.kalman.update import joseph_update
-from aolink.estimation.moments.lines import WindowedMoments
 from aolink.estimation.pixels import likelihood
 from aolink.estimation.pixels.gaussian_mixture import GaussianMixture, single
 from aolink.rig import load_rig

@@ -22,6 +22,7 @@ from typing import NamedTuple
 from zlib import crc32
 
 import numpy as np
+from aolink.estimation.pixels.filter import MixtureFilter, MixtureUpdate
 from scipy import optimize
 
 from aolink.estimation import Estimator, make_estimator
@@ -30,8 +31,7 @@ from aolink.estimation.compiled.pixels import Pixels, information_of_row, path_o
 from aolink.estimation.compiled.small import compiled
 from aolink.estimation.kalman.gaussian import Gaussian
 from aolink.estimation.model.base import ExposureModel
-from aolink.estimation.pixels.filter import MixtureFilter, MixtureUpdate
-from aolink.estimation.pixels.gaussian_mixture import GaussianMixture, log_sum
+from aolink.estimation.pixels.gaussian_mixture import GaussianMixture, log_sum, stacked_axes
 from aolink.estimation.pixels.likelihood import PixelView, Reduction, reduction
 from aolink.estimation.pixels.modes import find_modes, innovation, whitened, without_repeats
 from aolink.estimation.pixels.profile import has_several
@@ -101,8 +101,7 @@ class TemperedUpdater:
         away = t - mean[:, None]
         with by_one_thread:
             after = Gaussian(mean, batched.matmul(batched.transpose(away), away) / (t.shape[1] - 1))
-        each = [fitted(points, reduced.end_rows, _COMPONENTS, self.seed) for points in t]
-        fit = GaussianMixture(*map(np.concatenate, zip(*each, strict=True)))
+        fit = stacked_axes([fitted(points, reduced.end_rows, _COMPONENTS, self.seed) for points in t])
         # With one Gaussian as the prior: components of a mixture that overlap would count as modes of their own.
         starts = whitened(before, fit.ordered(_SEARCHED).mean)
         modes = without_repeats(find_modes(view, before, starts, reversals=True))

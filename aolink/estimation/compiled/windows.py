@@ -5,8 +5,6 @@ the rows, in a window about the spot in both directions. Kernel and Gaussian tog
 (X, Y) from where the path's mean has it, and E[a(X) b(Y)] is, by Mehler's series, the sum over j of
 c^j / j! E[a^(j)(X)] E[b^(j)(Y)], c their covariance. So are the covariances between two nodes in time and two spots: of
 first order they are the regression, and of second and third what it leaves out. Each factor is in closed form.
-
-The plain twin is `tests/estimation/moments/plain.py`.
 """
 
 from __future__ import annotations

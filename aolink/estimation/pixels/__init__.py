@@ -1,1 +1,1 @@
-"""Every pixel as a measurement: likelihood, modes of the posterior, mixtures, importance sampling, tempering."""
+"""Every pixel as a measurement: likelihood, modes of the posterior, mixtures."""

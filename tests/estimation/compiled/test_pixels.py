@@ -9,27 +9,23 @@ from scipy import linalg, stats
 
 from aolink.estimation import exposure_model, make_estimator
 from aolink.estimation.compiled import modes as compiled_modes
-from aolink.estimation.compiled.pixels import information_of_row, log_likelihoods_of_row, places_of
+from aolink.estimation.compiled.pixels import information_of_row, places_of
 from aolink.estimation.frames.frame_data import Needs, Profile, SpotWindows
 from aolink.estimation.frames.measure import measure
 from aolink.estimation.kalman.filter import GATE_PROBABILITY
 from aolink.estimation.kalman.gaussian import Gaussian
 from aolink.estimation.pixels import likelihood, modes
-from aolink.estimation.pixels.filter import MixtureFilter
-from aolink.estimation.pixels.gaussian_mixture import GaussianMixture, single
-from aolink.estimation.pixels.importance import importance_corrected
+from aolink.estimation.pixels.gaussian_mixture import GaussianMixture
 from aolink.estimation.pixels.levenberg_marquardt import FIRST_DAMPING, FREE_DAMPING, LARGEST_DAMPING
 from aolink.estimation.pixels.modes import (
     Modes,
-    broad,
     find_modes,
     innovation,
     modes_of,
     spread_starts,
-    whitened,
     without_repeats,
 )
-from aolink.estimation.pixels.profile import ProfileUpdater, explored
+from aolink.estimation.pixels.profile import ProfileFilter
 from aolink.numerics import batched
 from aolink.numerics.covariance import cholesky
 from aolink.optics.camera import to_density
@@ -37,7 +33,7 @@ from aolink.optics.sensor import Kernel
 from aolink.rig import load_rig
 from aolink.simulation.model import simulate
 from tests.estimation.pixels import plain
-from tests.estimation.pixels.plain import PlainView, settled_modes
+from tests.estimation.pixels.plain import PlainView, by_moments, settled_modes, whitened
 from tests.kinds import must_be, truth_of
 
 LIVELY = load_rig("section-vi-lively")
@@ -57,7 +53,6 @@ def side_by_side(rig, axes):
 
 
 AXES = 12
-MANY = 150  # more points than are computed together
 KINDS = {
     "lively": changed(LIVELY, noise_density=0.01),
     "bright": changed(LIVELY, noise_density=0.001),
@@ -94,39 +89,18 @@ def looked_at(kind):
     return view, PlainView.of(view), Gaussian(mean, np.tile(P, (AXES, 1, 1)))
 
 
-def log_likelihoods(seen, t):
-    """Log-likelihoods of points (rows, points, n), (rows, points)."""
-    out = np.empty(t.shape[:2])
-    for row, points in enumerate(np.ascontiguousarray(t.transpose(0, 2, 1))):
-        log_likelihoods_of_row(seen, row, points, 0, t.shape[1], out[row])
-    return out
-
-
 @pytest.fixture(scope="module", params=KINDS)
 def pair(request):
     return looked_at(request.param)
 
 
-def test_the_likelihood_of_many_points_is_that_of_the_twin(pair):
-    view, in_numpy, state = pair
-    prior = view.reduced.prior(state)
-    rng = np.random.default_rng(2)
-    t = prior.mean[:, None] + rng.standard_normal((AXES, MANY, view.reduced.size)) * 0.3
-    f = in_numpy.predicted(t)
-    ours, theirs = log_likelihoods(view.seen, t), in_numpy.log_likelihoods(t)
-    # An error of the light by 2e-7 of the brightest pixel moves it by what that is of a pixel's noise, times residuals.
-    noise = np.sqrt(view.read_noise)
-    residual = np.abs(view.y[:, None] - f).sum(axis=2) / noise
-    assert np.all(np.abs(ours - theirs) < 2e-7 * f.max() / noise * (residual + 1) + 1e-9 * np.abs(theirs))
-
-
 def test_places_beside_the_edges_of_pixels_beyond_the_sensor_and_without_a_number():
     edges = np.linspace(-0.8, 1.2, 41)
     beside = np.nextafter(edges, -9), np.nextafter(edges, 9)
-    paths = np.concatenate([edges, *beside, [np.nan, np.inf, -1e300, 1e19]])[None]
+    paths = np.concatenate([edges, *beside, [np.nan, np.inf, -1e300, 1e19]])
     firsts, nearest = np.empty(paths.shape, np.int64), np.empty(paths.shape, np.int64)
     away = np.empty(paths.shape)
-    places_of(paths, paths.shape[1], -0.3, 20.0, 16, 12, 8, firsts, nearest, away)
+    places_of(paths, -0.3, 20.0, 16, 12, 8, firsts, nearest, away)
     v = (paths + 0.3) * 20.0
     lit = (v > -4) & (v < 20)
     assert 20 < lit.sum() < paths.size - 20
@@ -135,20 +109,10 @@ def test_places_beside_the_edges_of_pixels_beyond_the_sensor_and_without_a_numbe
     assert np.abs(away[lit]).max() < 0.5 / 12 + 1e-12
 
 
-def test_the_windowed_moments_are_those_of_the_twin(pair):
-    view, in_numpy, state = pair
-    prior = view.reduced.prior(state)
-    ours, theirs = broad(view, prior), broad(in_numpy, prior)
-    sd = np.sqrt(np.einsum("aii->ai", theirs.covariance))
-    # The two error functions differ by 8e-8, and how their sums are rounded depends on the processor.
-    np.testing.assert_allclose(ours.mean / sd, theirs.mean / sd, atol=1e-4)
-    np.testing.assert_allclose(ours.covariance, theirs.covariance, atol=1e-7 * sd.max() ** 2)
-
-
 def test_the_search_starts_where_its_twin_does(pair):
     view, in_numpy, state = pair
     prior = view.reduced.prior(state)
-    wide = broad(in_numpy, prior)
+    wide = by_moments(in_numpy, prior)
     (ours, squares), (theirs, their_squares) = (
         starts_of(each, prior, wide) for starts_of, each in ((spread_starts, view), (plain.spread_starts, in_numpy))
     )
@@ -162,7 +126,7 @@ def test_the_search_starts_where_its_twin_does(pair):
 def test_every_start_leads_to_the_same_mode(pair):
     view, in_numpy, state = pair
     prior = view.reduced.prior(state)
-    starts, _ = plain.spread_starts(in_numpy, prior, broad(in_numpy, prior))
+    starts, _ = plain.spread_starts(in_numpy, prior, by_moments(in_numpy, prior))
     for k in range(starts.shape[1]):
         ours, theirs = (settled_modes(each, prior, starts[:, k : k + 1]) for each in (view, in_numpy))
         # A long search may end in another mode, as one that begins 1e-6 away may.
@@ -181,7 +145,7 @@ def test_searches_that_end_early_find_the_modes_that_matter(pair):
     view, in_numpy, state = pair
     prior, some = view.reduced.prior(state), slice(1, None)  # not the one beyond the sensor
     prior = Gaussian(prior.mean[some], prior.covariance[some])
-    wide, at_length = broad(in_numpy.part(some), prior), np.arange(AXES - 1) % 4 > 0
+    wide, at_length = by_moments(in_numpy.part(some), prior), np.arange(AXES - 1) % 4 > 0
     ours, theirs = (
         without_repeats(found(each.part(some), prior, wide, at_length))
         for found, each in ((modes_of, view), (plain.modes_of, in_numpy))
@@ -202,7 +166,7 @@ def test_searches_that_end_early_find_the_modes_that_matter(pair):
 def test_a_mode_is_where_the_gradient_is_zero(pair):
     view, in_numpy, state = pair
     prior = view.reduced.prior(state)
-    start = whitened(prior, broad(view, prior).mean[:, None])
+    start = whitened(prior, by_moments(view, prior).mean[:, None])
     found = settled_modes(view, prior, start)
     t, root = found.mean[1:], np.linalg.cholesky(found.covariance[1:, 0])
     inverse, rest = np.linalg.inv(prior.covariance[1:]), in_numpy.part(slice(1, None))
@@ -245,7 +209,7 @@ def test_modes_that_repeat_another_are_left_out():
 def test_the_innovation_is_that_of_the_twin(pair):
     view, in_numpy, state = pair
     prior = view.reduced.prior(state)
-    found = find_modes(view, prior, whitened(prior, broad(view, prior).mean[:, None]))
+    found = find_modes(view, prior, whitened(prior, by_moments(view, prior).mean[:, None]))
     ours, k = innovation(view, prior, found), innovation(view, prior, found).value.shape[1]
     value, information, _, square = plain.innovations(in_numpy, prior, found.mean[:, 0], k)
     # In a direction of next to no information, the innovation is the noise along any direction of the pixels.
@@ -255,25 +219,6 @@ def test_the_innovation_is_that_of_the_twin(pair):
     degrees = view.mask.sum(axis=1) + found.mean.shape[2]
     total = square + found.distance[:, 0]
     np.testing.assert_array_equal(ours.within_gate, total <= stats.chi2(degrees).isf(GATE_PROBABILITY))
-
-
-@pytest.mark.slow
-def test_importance_sampling_with_the_same_points(pair):
-    view, in_numpy, state = pair
-    some = slice(1, 7)  # not the one beyond the sensor, where no point counts
-    prior = single(Gaussian(state.mean[some], state.covariance[some]))
-    _, proposal = explored(view.part(some), prior)
-    proposal = proposal.ordered()
-    (ours, points), (theirs, their_points) = (
-        corrected(each.part(some), prior, proposal, 1.0, np.full(6, 100.0))
-        for corrected, each in ((importance_corrected, view), (plain.importance_corrected, in_numpy))
-    )
-    np.testing.assert_allclose(points, their_points, rtol=0.02)
-    weights, their_weights = (np.exp(each.ordered().log_weight) for each in (ours, theirs))
-    np.testing.assert_allclose(weights, their_weights, atol=2e-3)
-    sd = np.sqrt(np.einsum("aii->ai", theirs.gaussian.covariance))
-    np.testing.assert_allclose(ours.gaussian.mean / sd, theirs.gaussian.mean / sd, atol=5e-3)
-    np.testing.assert_allclose(np.sqrt(np.einsum("aii->ai", ours.gaussian.covariance)) / sd, 1.0, atol=5e-3)
 
 
 SPOTS = load_rig("single-lenslet")
@@ -306,29 +251,6 @@ def looked_at_plane(kind, masked):
     return view, PlainView.of(view), Gaussian(truth, plant.initial_covariance[None] / 20)
 
 
-@pytest.mark.parametrize("masked", [0, 9])
-@pytest.mark.parametrize("kind", PLANES)
-def test_the_likelihood_of_a_spot_on_a_plane_is_that_of_the_twin(kind, masked):
-    """Points far away are among them: spots half outside the window, and quite outside."""
-    view, in_numpy, state = looked_at_plane(kind, masked)
-    prior = view.reduced.prior(state)
-    rng = np.random.default_rng(4)
-    t = prior.mean[:, None] + rng.standard_normal((1, MANY, view.reduced.size)) * 0.3
-    t[0, -20:-10, 0] += 1.0
-    t[0, -10:, :4] += 7.0
-    f = in_numpy.predicted(t)
-    light = f.sum(axis=2) * view.optics.pixel_size
-    assert light[0, :-20].min() > 0.5  # one of the 130 random paths leaves the window for a while
-    assert np.median(light[0, :-20]) > 0.99
-    assert ((light[0, -20:-10] > 0.01) & (light[0, -20:-10] < 0.9)).any()
-    assert light[0, -10:].max() < 1e-6
-    ours, theirs = log_likelihoods(view.seen, t), in_numpy.log_likelihoods(t)
-    noise = np.sqrt(view.read_noise)
-    residual = np.abs(view.y[:, None] - f).sum(axis=2) / noise
-    assert np.all(np.abs(ours - theirs) < 4e-7 * f.max() / noise * (residual + 1) + 1e-9 * np.abs(theirs))
-    assert masked == 0 or not np.allclose(theirs, looked_at_plane(kind, 0)[1].log_likelihoods(t))
-
-
 def three_spots(one):
     """Three spots, each with a frame, a path and bad pixels of its own, made from one; and all of them together."""
     spots = [
@@ -345,33 +267,22 @@ def three_spots(one):
     return spots, one._replace(**joined)
 
 
+def informed(seen, row, t):
+    """Lower half of the information of coefficients t (n,), the score, the log-likelihood, and sum of score^2 / I."""
+    path = seen.inputs[row] + np.einsum("oim,i->om", seen.basis, t)
+    H, pull = np.zeros((len(t), len(t))), np.zeros(len(t))
+    return H, pull, *information_of_row(seen, row, path, seen.basis, H, pull)
+
+
 @pytest.mark.parametrize("gain", [0.0, 0.01])
 def test_the_likelihood_of_several_spots_is_the_product_of_theirs(gain):
     view, _, state = looked_at_plane("round", 9)
-    one = view.seen._replace(gain=gain * view.seen.y.max())
-    t = np.random.default_rng(6).standard_normal((1, view.reduced.size, MANY)) * 0.3
-    t += view.reduced.prior(state).mean[:, :, None]
-    together, apart = np.empty((1, MANY)), np.empty((3, 1, MANY))
-    spots, joined = three_spots(one)
-    for spot, out in zip(spots, apart, strict=True):
-        out[:] = log_likelihoods(spot, t.transpose(0, 2, 1))
-    together[:] = log_likelihoods(joined, t.transpose(0, 2, 1))
-    np.testing.assert_allclose(together, apart.sum(axis=0), rtol=1e-12)
-    assert len(np.unique(apart[:, 0, 0])) == 3
-
-
-@pytest.mark.parametrize("kind", ["lively", "dark pixels", "round", "aslant", "shot noise"])
-def test_points_have_the_same_likelihood_wherever_they_are_among_others(kind):
-    view, _, state = looked_at_plane(kind, 0) if kind in PLANES else looked_at(kind)
-    t = np.random.default_rng(7).standard_normal((view.reduced.size, MANY)) * 0.3
-    t += view.reduced.prior(state).mean[1 if view.on_line else 0, :, None]
-    whole, part = np.empty(MANY), np.full(MANY, np.nan)
-    log_likelihoods_of_row(view.seen, len(view.y) - 1, t, 0, MANY, whole)
-    log_likelihoods_of_row(view.seen, len(view.y) - 1, t, 37, 133, part)
-    assert np.isfinite(whole).all()
-    assert part[37:133].tobytes() == whole[37:133].tobytes()
-    assert np.isnan(part[:37]).all()
-    assert np.isnan(part[133:]).all()
+    t = view.reduced.prior(state).mean[0]
+    spots, joined = three_spots(view.seen._replace(gain=gain * view.seen.y.max()))
+    together, *apart = (informed(each, 0, t) for each in (joined, *spots))
+    for whole, *each in zip(together, *apart, strict=True):
+        np.testing.assert_allclose(whole, sum(each), rtol=1e-9, atol=1e-9 * np.abs(whole).max())
+    assert len({each[2] for each in apart}) == 3
 
 
 @pytest.mark.parametrize("kind", [*KINDS, *PLANES])
@@ -381,18 +292,20 @@ def test_the_information_of_the_pixels_is_the_twins(kind):
     t = np.tile(view.reduced.prior(state).mean[-1:, None], (1, 3, 1))
     t[0, 1, 0] += 1.0
     t[0, 2, :4] += 7.0
-    seen, n, last = view.seen, t.shape[2], len(view.y) - 1
-    f, J = in_numpy.part(slice(last, None)).linearised(t)
-    score, information = in_numpy.part(slice(last, None)).information(f)
+    seen, last = view.seen, len(view.y) - 1
+    twin = in_numpy.part(slice(last, None))
+    f, J = twin.linearised(t)
+    score, information = twin.information(f)
+    residual = np.abs(view.y[last] - f[0]).sum(axis=1) / np.sqrt(view.read_noise)
     for k in range(3):
-        path = seen.inputs[last] + np.einsum("oim,i->om", seen.basis, t[0, k])
-        H, pull = np.zeros((n, n)), np.zeros(n)
-        log_likelihood, square = information_of_row(seen, last, path, seen.basis, H, pull)
+        H, pull, log_likelihood, square = informed(seen, last, t[0, k])
         expected = (J[0, k] * information[0, k][:, None]).T @ J[0, k]
         np.testing.assert_allclose(np.tril(H), np.tril(expected), atol=1e-4 * np.abs(expected).max() + 1e-12)
         scale = np.abs(score[0, k]) @ np.abs(J[0, k])
         np.testing.assert_allclose(pull, score[0, k] @ J[0, k], atol=1e-4 * scale.max() + 1e-9)
-        assert log_likelihood == pytest.approx(log_likelihoods(seen, t.repeat(last + 1, axis=0))[last, k], rel=1e-9)
+        # An error of the light by 4e-7 of the brightest pixel, times the residuals, in units of the pixels' noise.
+        off = 4e-7 * f.max() / np.sqrt(view.read_noise) * (residual[k] + 1)
+        assert log_likelihood == pytest.approx(twin.log_likelihood(f)[0, k], rel=1e-9, abs=off)
         lit = information[0, k] > 0
         # With shot noise a pixel of next to no light counts otherwise than one of none.
         assert view.gain or square == pytest.approx((score[0, k][lit] ** 2 / information[0, k][lit]).sum(), rel=1e-4)
@@ -406,7 +319,7 @@ def test_reversals_of_the_best_are_those_of_the_twin(kind):
     if kind in PLANES:  # a start state that hardly anything is known of: its path may well be the reverse
         state = Gaussian(state.mean, 100 * state.covariance)
     prior = view.reduced.prior(state)
-    starts, _ = plain.spread_starts(in_numpy, prior, broad(in_numpy, prior))
+    starts, _ = plain.spread_starts(in_numpy, prior, by_moments(in_numpy, prior))
     starts = np.ascontiguousarray(starts[:, :3])
     found = Modes.none(axes, 6, starts.shape[2])
     compiled_modes.find_modes(
@@ -427,7 +340,7 @@ def test_reversals_of_the_best_are_those_of_the_twin(kind):
 def test_the_modes_of_a_spot_on_a_plane_are_those_of_the_twin(kind):
     view, in_numpy, state = looked_at_plane(kind, 0)
     prior = view.reduced.prior(state)
-    wide, at_length = broad(view, prior), np.ones(1, dtype=bool)
+    wide, at_length = by_moments(view, prior), np.ones(1, dtype=bool)
     ours, theirs = (
         without_repeats(found(each, prior, wide, at_length))
         for found, each in ((modes_of, view), (plain.modes_of, in_numpy))
@@ -438,20 +351,24 @@ def test_the_modes_of_a_spot_on_a_plane_are_those_of_the_twin(kind):
     np.testing.assert_allclose(found, expected, atol=0.2)
 
 
-@pytest.mark.parametrize("kind", ["round", "aslant"])
-def test_importance_sampling_of_a_spot_on_a_plane_with_the_same_points(kind):
-    view, in_numpy, state = looked_at_plane(kind, 0)
-    prior = single(state)
-    _, proposal = explored(view, prior)
-    (ours, points), (theirs, their_points) = (
-        corrected(each, prior, proposal, 0.5, np.full(1, 100.0))
-        for corrected, each in ((importance_corrected, view), (plain.importance_corrected, in_numpy))
-    )
-    assert points[0] > 30
-    np.testing.assert_allclose(points, their_points, rtol=0.02)
-    sd = np.sqrt(np.einsum("aii->ai", theirs.gaussian.covariance))
-    np.testing.assert_allclose(ours.gaussian.mean / sd, theirs.gaussian.mean / sd, atol=5e-3)
-    np.testing.assert_allclose(np.sqrt(np.einsum("aii->ai", ours.gaussian.covariance)) / sd, 1.0, atol=5e-3)
+def test_linear_maps_of_a_mixture_keep_its_mean_and_covariance():
+    rng = np.random.default_rng(8)
+    root, rows = rng.standard_normal((5, 4, 3, 3)), rng.standard_normal((2, 3))
+    weight = rng.uniform(0.1, 1, (5, 4))
+    weight[1, 2] = 0.0
+    with np.errstate(divide="ignore"):
+        m = GaussianMixture(
+            np.log(weight / weight.sum(axis=1)[:, None]), rng.standard_normal((5, 4, 3)), root @ root.swapaxes(-1, -2)
+        )
+    own, seen = m.gaussian, m.mapped(rows, np.diag([0.5, 2.0]))
+    w = np.exp(m.log_weight)
+    mean = np.einsum("ac,aci->ai", w, m.mean)
+    away = m.mean - mean[:, None]
+    np.testing.assert_allclose(own.mean, mean, atol=1e-12)
+    spread = np.einsum("ac,acij->aij", w, m.covariance) + np.einsum("ac,aci,acj->aij", w, away, away)
+    np.testing.assert_allclose(own.covariance, spread, atol=1e-12)
+    np.testing.assert_allclose(seen.gaussian.mean, mean @ rows.T, atol=1e-12)
+    np.testing.assert_allclose(seen.gaussian.covariance, rows @ spread @ rows.T + np.diag([0.5, 2.0]), atol=1e-12)
 
 
 def merged_once(m):
@@ -509,7 +426,7 @@ def test_components_are_merged_as_pair_by_pair(seed):
 
 def test_a_plant_without_process_noise():
     plant = dataclasses.replace(LIVELY.plant, process_noise=0.0 * LIVELY.plant.process_noise)
-    MixtureFilter(plant, LIVELY.sensor, ProfileUpdater()).warm_up(ProfileUpdater())
+    ProfileFilter(plant, LIVELY.sensor).warm_up()
     rig = dataclasses.replace(LIVELY, plant=plant)
     estimator = make_estimator(rig, "profile")
     for exposure in simulate(rig, 12, seed=2):

@@ -127,12 +127,12 @@ def test_what_is_compiled_comes_from_the_sources_that_the_name_follows_from():
 FIRST_SESSION = """
 import dataclasses, sys
 from aolink.estimation import make_estimator
-from aolink.estimation.compiled import joint, mixtures, modes, pixels, small, windowed
+from aolink.estimation.compiled import joint, mixtures, modes, pixels, small, windows
 from aolink.rig import load_rig
 from aolink.simulation.model import simulate
 
 def overloads():
-    loaded = small, pixels, modes, mixtures, joint, windowed
+    loaded = small, pixels, modes, mixtures, joint, windows
     each = [value for module in loaded for value in vars(module).values()]
     return sum(len(value.signatures) for value in each if hasattr(value, "signatures"))
 

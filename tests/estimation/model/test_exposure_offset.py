@@ -9,13 +9,16 @@ from scipy import linalg
 
 from aolink.errors import RigError
 from aolink.estimation import exposure_model, run, score
+from aolink.estimation.compiled.windows import Path
+from aolink.estimation.frames.frame_data import Profile
+from aolink.estimation.kalman.gaussian import Gaussian
 from aolink.estimation.kalman.path_moments import predicted_moments
 from aolink.estimation.model.quadrature import equal_parts, quadrature_paths
+from aolink.estimation.moments.windowed import WindowedMoments, windows_of
 from aolink.optics.frame import frame_density
 from aolink.optics.kernel import exposure_density
 from aolink.rig import Plant, Rig, load_rig, parse_rig
 from aolink.simulation.model import RigPhysics, simulate
-from tests.estimation.moments.plain import PlainMoments
 from tests.kinds import line_of, truth_of
 
 LIVELY = load_rig("section-vi-lively")
@@ -105,13 +108,13 @@ def test_windowed_moments_expect_what_finer_steps_show():
     z = np.zeros(model.n_coefficients)
     z[:2] = 0.1, 20.0
     path = nodes.basis[0] @ z
-    observation = PlainMoments(line_of(rig))
-    W = observation.window_weights(path[None], np.zeros((1, len(path))), np.ones((1, 40), bool))
-    zero = np.zeros((1, len(path), len(path)))
-    expected = observation.regression(W, path[None], zero, nodes.basis[0], nodes.weights).expected[0]
     samples = np.append(model.basis[0] @ z, (rig.plant.C @ model.end_rows @ z)[0])
     density = exposure_density(rig.sensor.kernel, line_of(rig).edges, held(samples, offset, 8))
-    np.testing.assert_allclose(expected, W[0] @ density * rig.sensor.pixel_width, atol=1e-12)
+    measured = Profile(density=density.reshape(1, 40), mask=np.ones((1, 40), bool))
+    still = Path(np.zeros((1, 1, len(path))), path[None, None], nodes.weights)
+    nothing = Gaussian(np.zeros((1, 1)), np.zeros((1, 1, 1)))
+    fit = WindowedMoments(rig.sensor, 1).regression(windows_of(measured), still, nothing)
+    np.testing.assert_allclose(fit.expected, fit.value, atol=1e-10)
 
 
 @pytest.mark.slow

@@ -1,22 +1,26 @@
 """The plain twins, in NumPy, of what compiled code does for pixels: of a line sensor, and of spots on a plane."""
 
-import math
-
 import numpy as np
 
-from aolink.estimation import Profile
-from aolink.estimation.pixels import importance, modes
-from aolink.estimation.pixels.constants import PROFILE
-from aolink.estimation.pixels.gaussian_mixture import GaussianMixture, log_sum
+from aolink.estimation.moments.windowed import WindowedMoments
+from aolink.estimation.pixels import modes
 from aolink.estimation.pixels.levenberg_marquardt import Place, minimise
 from aolink.estimation.pixels.likelihood import PixelView
-from aolink.estimation.pixels.modes import whitened
 from aolink.numerics import batched
 from aolink.numerics.covariance import cholesky
 from aolink.optics.kernel import pixel_masses
 from aolink.optics.plane import mehler_series
-from tests.estimation.moments.plain import PlainMoments
-from tests.kinds import must_be
+
+
+def whitened(prior, t):
+    """Coordinates of points t (axes, k, n) in which the prior is N(0, I)."""
+    return np.linalg.solve(cholesky(prior.covariance), batched.transpose(t - prior.mean[:, None])).swapaxes(-1, -2)
+
+
+def by_moments(view, prior):
+    """The posterior of windowed moments, from which searches start."""
+    moments = WindowedMoments(view.sensor, view.outputs)
+    return moments.updated(view.dynamics, view.moment_nodes, prior, view.measured).posterior
 
 
 class PlainView(PixelView):
@@ -30,18 +34,6 @@ class PlainView(PixelView):
         twin = cls.__new__(cls)
         twin.__dict__.update(vars(view), on_line=False, sees_line=view.on_line)
         return twin
-
-    @property
-    def work(self):
-        """That of the view, which decides on the number of points."""
-        twin = PixelView.__new__(PixelView)
-        twin.__dict__.update(vars(self), on_line=self.sees_line)
-        return twin.work
-
-    def moments(self, about):
-        if not self.sees_line:
-            return super().moments(about)
-        return PlainMoments(self.sensor.profile).look(self.nodes, about, must_be(Profile, self.measured))
 
     def predicted(self, t):
         """Densities of the pixels without noise, (axes, k, pixels)."""
@@ -83,9 +75,6 @@ class PlainView(PixelView):
             slopes = slopes + c * (by_x + by_y)
         return light.reshape(*lead, -1) / D, slopes.reshape(*lead, -1, size) / D
 
-    def log_likelihoods(self, t):
-        return self.log_likelihood(self.predicted(t))
-
     def paths(self, t):
         """Outputs at the nodes, (axes, k, n_outputs, nodes)."""
         flat = batched.long_matmul(t, self.rows.T)
@@ -119,14 +108,6 @@ class PlainView(PixelView):
         return self.read_noise + self.gain * np.maximum(f, 0.0)
 
 
-def with_noise(prior, t):
-    """Log-densities of t = (start state, standard normal noise coefficients), (axes, points, n) -> (axes, points)."""
-    states = prior.mean.shape[2]
-    rest = t[..., states:]
-    constant = -0.5 * rest.shape[-1] * math.log(2 * math.pi)
-    return prior.log_density(t[..., :states]) - 0.5 * np.add.reduce(rest * rest, axis=-1) + constant
-
-
 def find_modes(view, prior, starts):
     """The mode that each start, in whitened coordinates, (axes, starts, n), leads to, with this prior of each axis."""
     axes, count, n = starts.shape
@@ -138,7 +119,7 @@ def find_modes(view, prior, starts):
         return lambda s: _at(*seen, s[None])
 
     each = [
-        minimise(at(slice(k, k + 1)), start, PROFILE.passes, PROFILE.converged)
+        minimise(at(slice(k, k + 1)), start, modes.PASSES, modes.CONVERGED)
         for k, start in enumerate(starts.reshape(-1, n))
     ]
     s, objective, _, hessian = (np.array(values) for values in list(zip(*each, strict=True))[:4])
@@ -160,7 +141,7 @@ def modes_of(view, prior, wide, at_length):
     (`spread_starts`). After their modes come those that the best mode's reversal and mirror images lead to.
     """
     starts, squares = spread_starts(view, prior, wide)
-    many = at_length & (squares[:, 0] > PROFILE.wide_path * view.kernel_variance)
+    many = at_length & (squares[:, 0] > modes.WIDE_PATH * view.kernel_variance)
     found = find_modes(view, prior, starts[:, :1])
     for which, some in ((at_length, starts[:, 1:3]), (many, starts[:, 3:])):
         if len(rows := np.flatnonzero(which)):
@@ -194,7 +175,7 @@ def spread_starts(view, prior, wide):
     L = cholesky(wide.covariance)
     values, V = np.linalg.eigh(batched.symmetric(batched.matmul(batched.transpose(L), batched.matmul(view.gram, L))))
     V = batched.transpose(V[:, :, ::-1])
-    along = batched.matmul(V[:, : PROFILE.directions], batched.transpose(L)) * PROFILE.start_reach
+    along = batched.matmul(V[:, : modes.DIRECTIONS], batched.transpose(L)) * modes.START_REACH
     mean = wide.mean[:, None]
     pairs = np.stack([mean + along, mean - along], axis=2).reshape(axes, -1, n)
     return whitened(prior, np.concatenate([mean, pairs], axis=1)), values[:, ::-1]
@@ -243,7 +224,7 @@ def innovations(view, prior, t, k):
     values, V = np.maximum(values[:, ::-1][:, :k], 0.0), V[:, :, ::-1][:, :, :k]
     S = np.sqrt(values)
     # The innovation is zero in a direction about which the pixels have no information.
-    tells = values > PROFILE.no_information * values[:, :1]
+    tells = values > modes.NO_INFORMATION * values[:, :1]
     pull = batched.matvec(batched.transpose(batched.matmul(A, V)), e)
     u = np.where(tells, pull / np.where(tells, S, 1.0), 0.0) + S * batched.matvec(batched.transpose(V), s)
     return u, values, np.add.reduce(u * u / (1 + values), axis=1), batched.dot(e, e)
@@ -256,76 +237,3 @@ def settled_modes(view, prior, starts):
     for _ in range(4):
         found = search(view, prior, whitened(prior, found.mean))
     return found
-
-
-def importance_corrected(view, prior, proposal, share, enough):
-    """The twin of `importance.importance_corrected`."""
-    n = view.reduced.size
-    points = importance.points_of_round(view, share)
-    proposals = list[GaussianMixture]()
-    t = np.zeros((len(prior.mean), 0, n))
-    target, effective = np.zeros(t.shape[:2]), np.zeros(len(t))
-    fit, going_on = proposal, np.ones(len(t), dtype=bool)
-    for k in range(PROFILE.rounds):
-        new = _drawn(proposal, points, k)
-        proposals.append(proposal)
-        t = np.concatenate([t, new], axis=1)
-        target = np.concatenate([target, with_noise(prior, new) + view.log_likelihoods(new)], axis=1)
-        log_weight = target - log_sum(np.stack([q.log_density(t) for q in proposals], axis=1), axis=1)
-        log_weight -= log_sum(log_weight, axis=1)[:, None]
-        effective = np.where(going_on, np.exp(-log_sum(2 * log_weight, axis=1)), effective)
-        tempered = _tempered(log_weight, PROFILE.least_effective)
-        scale = PROFILE.loosened if k else PROFILE.tightened
-        scaled = proposal._replace(covariance=proposal.covariance * scale)
-        last = _refitted(proposal, t, tempered, scaled, n * PROFILE.last_prior_points)
-        some = np.flatnonzero(going_on)
-        fit = fit.replaced(some, last.part(some))
-        going_on &= effective < enough
-        if not going_on.any():
-            break
-        proposal = _refitted(proposal, t, tempered, proposal, n * PROFILE.prior_points)
-    return fit, effective
-
-
-def _tempered(log_weight, least):
-    """Weights raised to the largest power up to one at which the effective sample size is ``least``, or half of all."""
-    least = min(least, log_weight.shape[1] / 2)
-    low, high = np.zeros(len(log_weight)), np.ones(len(log_weight))
-    power = high
-    for _ in range(PROFILE.halvings):
-        w = power[:, None] * log_weight
-        enough = -log_sum(2 * (w - log_sum(w, axis=1)[:, None]), axis=1) >= math.log(least)
-        low, high = np.where(enough, power, low), np.where(enough, high, power)
-        power = (low + high) / 2
-        power = np.where(low == 1, 1.0, power)
-    w = np.where(low == 1, 1.0, low)[:, None] * log_weight
-    return w - log_sum(w, axis=1)[:, None]
-
-
-def _drawn(proposal, count, number):
-    """Points of a mixture, (axes, count, n); those of each round have a number."""
-    axes, _, n = proposal.mean.shape
-    u, e = importance.quasi_random(count, n, number)
-    total = np.cumsum(np.exp(proposal.log_weight), axis=1)
-    component = np.minimum((total[:, None] < u[:, None] * total[:, -1:, None]).sum(axis=2), total.shape[1] - 1)
-    rows = np.arange(axes)[:, None]
-    root = cholesky(proposal.covariance)[rows, component]
-    return np.asarray(proposal.mean[rows, component] + np.add.reduce(root * e[:, None], axis=-1))
-
-
-def _refitted(mixture, points, log_weight, beside, prior_points):
-    """One EM step with weighted points; the covariances of ``beside`` count as ``prior_points`` more."""
-    logs = mixture.component_log_densities(points)
-    share = np.exp(logs - log_sum(logs, axis=1)[:, None] + log_weight[:, None])  # (axes, components, points)
-    mass = np.add.reduce(share, axis=2)
-    effective = mass**2 / np.maximum(np.add.reduce(share * share, axis=2), 1e-300)
-    safe = np.maximum(mass, 1e-300)[..., None]
-    mean = batched.long_matmul(share, points) / safe
-    mean = np.where(mass[..., None] > 1e-9, mean, mixture.mean)
-    away = points[:, None] - mean[:, :, None]
-    spread = batched.long_matmul(batched.transpose(away * share[..., None]), away) / safe[..., None]
-    trust = (effective / (effective + prior_points))[..., None, None]
-    covariance = batched.symmetric(trust * spread + (1 - trust) * beside.covariance)
-    mass = np.where(mass > PROFILE.negligible * np.add.reduce(mass, axis=1)[:, None], mass, 0.0)
-    with np.errstate(divide="ignore"):
-        return GaussianMixture(np.log(mass / np.add.reduce(mass, axis=1)[:, None]), mean, covariance)

@@ -21,18 +21,17 @@ from aolink.estimation.model.dense import DenseModel
 from aolink.estimation.model.factored import FactoredModel
 from aolink.estimation.model.joint_paths import JointPaths
 from aolink.estimation.model.quadrature import quadrature_paths
+from aolink.estimation.moments import windowed
 from aolink.estimation.moments.joint_moments import JointMoments, by_spot
-from aolink.estimation.moments.spots import WindowedSpots
-from aolink.estimation.moments.windowed import Regression
+from aolink.estimation.moments.windowed import WindowedMoments
 from aolink.estimation.pixels import joint_pixels
 from aolink.estimation.pixels.joint_pixels import JointPixels, find_mode
 from aolink.estimation.pixels.likelihood import PixelView, Reduction
-from aolink.estimation.pixels.modes import whitened
 from aolink.exposure import Exposure
 from aolink.optics.sensor import Kernel
 from aolink.rig import Rig, load_rig, parse_rig
 from aolink.simulation.model import simulate
-from tests.estimation.pixels.plain import PlainView, settled_modes
+from tests.estimation.pixels.plain import PlainView, settled_modes, whitened
 from tests.kinds import must_be, spots_of, truth_of
 
 NAMES = ("o1", "o3", "moments", "profile")
@@ -81,6 +80,7 @@ def dense_view(rig: Rig, frame: Frame, paths: JointPaths) -> PlainView:
     reduced = Reduction(
         expand=np.eye(model.n_coefficients)[:, :size], left_out=np.zeros((0, 0)), end_rows=model.end_rows[:, :size],
         end_remainder=model.end_remainder, widening=paths.widening, resolution=paths.resolution,
+        least_blur=1.0,
     )  # fmt: skip
     (level,) = paths.resolution.of(frame.response.path).tolist()
     view: PlainView = PlainView.of(PixelView(rig.sensor, model, frame.response, frame.windows, reduced, level))
@@ -197,34 +197,27 @@ def test_o3_is_the_dense_filter_in_every_step(small_membrane):
         np.testing.assert_allclose(found.innovation_covariance, variances, rtol=1e-8)
 
 
-def test_moments_are_the_dense_ones_but_for_errors_that_spots_share(rig, frame):
+def test_moments_are_the_dense_ones_but_for_errors_that_spots_share(rig, frame, monkeypatch):
     """All coefficients, the same nodes, and no errors shared: then both are the same least squares."""
     paths = JointPaths(frame.model, rig.sensor, left_out=1e-4)
     assert paths.size == frame.model.n_coefficients
     spots = rig.plant.n_outputs // 2
     nodes = quadrature_paths(frame.model, frame.response, paths.resolution.levels[0])
 
-    class Apart(WindowedSpots):
-        """At these nodes, and without errors that spots share."""
+    monkeypatch.setattr(windowed, "MOST_INFLATION", 1.0)
+    monkeypatch.setattr(JointMoments, "left_out", 1e-4)
 
-        most_memory = 1.0
-
-        def look(self, _, about, measured):
-            return super().look(nodes, about, measured)
+    class Apart(WindowedMoments):
+        """Without errors that spots share."""
 
         def regression(self, *arguments):
             fit = super().regression(*arguments)
-            size = fit.remainder.shape[1] // spots
-            own = np.kron(np.eye(spots), np.ones((size, size)))
-            return Regression(fit.expected, fit.slope, fit.remainder * own)
-
-    class Joint(JointMoments):
-        most_memory, left_out = 1.0, 1e-4
+            return fit._replace(remainder=fit.remainder * np.kron(np.eye(spots), np.ones((8, 8))))
 
     before = whole_prior(frame, paths.size)
-    dense = Apart(rig.sensor, spots)
-    expected = dense.update(frame.model, frame.response, before, frame.windows)
-    found = Joint(rig.sensor, rig.plant.n_outputs).update(frame.model, frame.response, before, frame.windows)
+    dense = Apart(rig.sensor, rig.plant.n_outputs)
+    expected = dense.updated(frame.model.dynamics, nodes, before, frame.windows)
+    found = JointMoments(rig.sensor, rig.plant.n_outputs).update(frame.model, frame.response, before, frame.windows)
     sd = np.sqrt(np.diag(expected.posterior.covariance[0]))
     np.testing.assert_allclose(found.posterior.mean[0] / sd, expected.posterior.mean[0] / sd, atol=1e-6)
     ours, dense = (each.posterior.covariance[0] / sd / sd[:, None] for each in (found, expected))

@@ -9,8 +9,7 @@ from scipy import linalg
 from aolink.estimation import Profile, SpotWindows, exposure_model, run
 from aolink.estimation.frames.measure import measure
 from aolink.estimation.kalman.gaussian import Gaussian
-from aolink.estimation.moments.lines import WindowedMoments
-from aolink.estimation.moments.spots import WindowedSpots
+from aolink.estimation.moments.windowed import WindowedMoments
 from aolink.estimation.pixels import likelihood
 from aolink.optics.kernel import exposure_density
 from aolink.optics.plane import exposure_density_2d
@@ -46,12 +45,10 @@ def rig_of(kind):
 def view_of(rig, *, photoelectrons=0.0, seed=1, all_steps=False, **how):
     rig = dataclasses.replace(rig, sensor=dataclasses.replace(rig.sensor, photoelectrons=photoelectrons))
     (exposure,) = simulate(rig, 1, seed=seed)
-    spots = rig.plant.n_outputs // 2
-    looks = WindowedSpots(rig.sensor, spots) if spots else WindowedMoments(rig.sensor)
-    measured, _ = measure(rig, exposure, looks.needs)
+    measured, _ = measure(rig, exposure, WindowedMoments(rig.sensor, rig.plant.n_outputs).needs)
     model = exposure_model(rig.plant, exposure.n_steps)
     reduced = likelihood.reduction(model, rig.sensor, **how)
-    assert isinstance(measured, SpotWindows if spots else Profile)
+    assert isinstance(measured, SpotWindows if rig.plant.n_outputs > 1 else Profile)
     level = len(reduced.resolution.levels) - 1 if all_steps else 0
     view = likelihood.PixelView(rig.sensor, model, model.response(exposure.inputs), measured, reduced, level)
     assert not all_steps or view.whole_nodes == exposure.n_steps

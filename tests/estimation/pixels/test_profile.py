@@ -6,28 +6,24 @@ import numpy as np
 import pytest
 from scipy.linalg import expm, solve_discrete_lyapunov
 
-from aolink.errors import EstimatorError
-from aolink.estimation import Status, exposure_model, make_estimator, run, score
-from aolink.estimation.frames.frame_data import Profile
+from aolink.estimation import Status, exposure_model, run, score
+from aolink.estimation.frames.frame_data import Needs, Profile
 from aolink.estimation.frames.measure import measure
 from aolink.estimation.kalman.gaussian import Gaussian
-from aolink.estimation.moments.lines import WindowedMoments
 from aolink.estimation.pixels import likelihood
-from aolink.estimation.pixels.filter import MixtureFilter
 from aolink.estimation.pixels.gaussian_mixture import GaussianMixture, single
-from aolink.estimation.pixels.importance import importance_corrected
-from aolink.estimation.pixels.modes import broad, whitened
-from aolink.estimation.pixels.profile import ProfileUpdater, explored
+from aolink.estimation.pixels.profile import ProfileFilter
 from aolink.numerics.covariance import cholesky
+from aolink.optics.camera import to_counts
 from aolink.optics.kernel import exposure_density
 from aolink.rig import load_rig
 from aolink.simulation.model import simulate
-from tests.estimation.pixels.plain import PlainView, settled_modes
-from tests.estimation.vibrating import vibrating
+from tests.estimation.pixels.plain import PlainView, by_moments, settled_modes, whitened
 from tests.kinds import line_of, must_be, truth_of
 
 RIG = load_rig("section-vi-lively")
-PROFILE = ProfileUpdater()
+FILTER = ProfileFilter(RIG.plant, RIG.sensor)
+PIXELS = Needs(what="profile")
 
 
 def quiet(rig, V):
@@ -37,7 +33,7 @@ def quiet(rig, V):
 def seen(rig=RIG, *, width=1.0, seed=3):
     """One exposure, with a prior of its start state so many times as wide as the plant's own, about the truth."""
     (exposure,) = simulate(rig, 1, seed=seed)
-    measured = must_be(Profile, measure(rig, exposure, WindowedMoments(rig.sensor).needs)[0])
+    measured = must_be(Profile, measure(rig, exposure, PIXELS)[0])
     model = exposure_model(rig.plant, exposure.n_steps)
     reduced = likelihood.reduction(model, rig.sensor)
     view = likelihood.PixelView(rig.sensor, model, model.response(exposure.inputs), measured, reduced)
@@ -72,7 +68,7 @@ def assert_near(ours, mean, covariance, means, sds):
 def test_the_gradient_is_zero_at_a_mode():
     view, state = seen(quiet(RIG, 0.001), width=0.3)
     prior = view.reduced.prior(state)
-    start = whitened(prior, broad(view, prior).mean[:, None])
+    start = whitened(prior, by_moments(view, prior).mean[:, None])
     view = PlainView.of(view)  # its error function is exact; what is compiled has a test of its own
     modes = settled_modes(view, prior, start)
     inverse = np.linalg.inv(prior.covariance[0])
@@ -99,52 +95,17 @@ def test_posterior_is_that_of_importance_sampling(photoelectrons):
     view, state = seen(rig)
     mean, covariance, effective = by_importance(view, state)
     assert effective > 300
-    update = PROFILE.update(view, single(state), state)
-    assert_near(update.coefficients, mean, covariance, 0.25, 0.15)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", [3, 4])
-def test_mixture_is_the_posterior_of_importance_sampling_where_it_is_bent(seed):
-    view, state = seen(quiet(RIG, 0.01), width=0.5, seed=seed)
-    mean, covariance, effective = by_importance(view, state)
-    assert effective > 100
-    _, proposal = explored(view, single(state))
-    after, points = importance_corrected(view, single(state), proposal, 1.0, np.array([100.0]))
-    assert points[0] > 40
-    assert_near(after.gaussian, mean, covariance, 0.3, 0.25)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", [10, 11])
-def test_profile_is_the_mean_of_the_posterior_where_it_has_several_modes(seed):
-    """Gaussians about the modes alone are up to 0.7 standard deviations off."""
-    view, state = seen(quiet(RIG, 0.003), width=0.5, seed=seed)
-    mean, covariance, effective = by_importance(view, state)
-    assert effective > 200
-    update = PROFILE.update(view, single(state), state)
-    assert update.several[0]
-    assert_near(update.coefficients, mean, covariance, 0.45, 0.35)
-
-
-def test_profile_carries_as_many_gaussians_as_it_takes():
-    """One of a posterior that is Gaussian; of one with two readings more, whose density is that of the points."""
-    one, state = seen(quiet(load_rig("section-vi"), 0.005))
-    assert PROFILE.update(one, single(state), state).end.mean.shape[1] == 1
-    view, state = seen(quiet(RIG, 0.003), width=0.5, seed=10)
-    end = PROFILE.update(view, single(state), state).end
-    assert 1 < end.mean.shape[1] <= 3
-    whole = single(end.gaussian)
-    points = np.concatenate([end.mean[0], whole.mean[0]])[None]
-    assert np.abs(end.log_density(points) - whole.log_density(points)).max() > 0.05
+    assert_near(
+        ProfileFilter(rig.plant, rig.sensor).found(view, single(state)).posterior.gaussian, mean, covariance, 0.25, 0.15
+    )
 
 
 def test_evidence_of_a_mode_has_the_weight_of_its_prior():
     view, state = seen(quiet(RIG, 0.01), width=0.3)
     apart = state.mean[:, None] + np.array([[0.0, 0.0], [0.1, 3.0]])
     both = np.repeat(state.covariance[:, None], 2, axis=1) / 4
-    weights = np.log([[0.5, 0.5], [0.9, 0.1]])
-    each = [explored(view, GaussianMixture(log_weight[None], apart, both))[0] for log_weight in weights]
+    weights, wide = np.log([[0.5, 0.5], [0.9, 0.1]]), by_moments(view, view.reduced.prior(state))
+    each = [FILTER._modes(view, GaussianMixture(log_weight[None], apart, both), wide) for log_weight in weights]
     assert len({modes.mean.shape for modes in each}) == 1
     # Whose prior led to a mode: those are told apart by what the other weight made of it.
     change = np.sort(each[1].log_evidence[0] - each[0].log_evidence[0])
@@ -152,15 +113,6 @@ def test_evidence_of_a_mode_has_the_weight_of_its_prior():
     assert change[0] == pytest.approx(np.log(0.1 / 0.5), abs=1e-9)
     assert change[-1] == pytest.approx(np.log(0.9 / 0.5), abs=1e-9)
     assert np.all(np.isclose(change, change[0]) | np.isclose(change, change[-1]))
-
-
-def test_points_are_drawn_from_the_wide_gaussian_too():
-    view, state = seen(quiet(RIG, 0.01), width=0.5)
-    _, proposal = explored(view, single(state))
-    prior = view.reduced.prior(state)
-    wide = broad(view, prior)
-    same = np.abs(proposal.mean[0] - wide.mean[0]).max(axis=1) < 1e-12
-    assert np.exp(proposal.log_weight[0, same]).sum() == pytest.approx(0.3)
 
 
 def test_a_path_and_its_reversal_are_two_readings():
@@ -175,9 +127,8 @@ def test_a_path_and_its_reversal_are_two_readings():
     view = likelihood.PixelView(rig.sensor, model, model.response(np.zeros((200, 1))), measured, reduced)
     P = np.diag([0.04, 25.0])
     state = Gaussian(np.zeros((1, 2)), P[None])
-    update = PROFILE.update(view, single(state), state)
-    assert update.several[0]
-    modes, _ = explored(view, single(state))
+    assert FILTER.found(view, single(state)).is_multimodal[0]
+    modes = FILTER._modes(view, single(state), by_moments(view, view.reduced.prior(state)))
     there = np.isfinite(modes.log_evidence[0])
     ends = PlainView.of(view).paths(modes.mean)[0, there][:, 0, [0, -1]]
     evidence = modes.log_evidence[0, there]
@@ -212,33 +163,51 @@ def test_better_than_o1_and_right_about_it(V):
     assert {e.status for e in found["profile"]} == {Status.OK}
 
 
-@pytest.mark.slow
-def test_intervals_are_honest_about_a_phase_that_no_pixel_tells():
-    """A whole swing in each exposure: the blur tells how far the spot swings, and nothing of when.
-
-    The spot is so bright that a path which leaves out too little to be seen would make a phase of the rest.
-    """
-    turn, decay, sd = 2 * np.pi / 12, np.exp(-1 / 600), 0.09
-    A = decay * np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
-    plant = dataclasses.replace(
-        RIG.plant, A=A, B=np.zeros((2, 1)), B_w=np.eye(2), process_noise=sd**2 * (1 - decay**2) * np.eye(2),
-        initial_covariance=sd**2 * np.eye(2),
-    )  # fmt: skip
-    kernel = dataclasses.replace(RIG.sensor.kernel, sigma=0.16)
-    sensor = dataclasses.replace(
-        RIG.sensor, noise_density=3e-4, kernel=kernel, counts_per_density=8000.0, black_level=1000.0
-    )
-    timing = dataclasses.replace(RIG.timing, exposure_steps=12, frame_period_steps=12)
-    rig = dataclasses.replace(RIG, plant=plant, timing=timing, sensor=sensor)
-    inside = []
-    for seed in range(30, 54):
-        exposures = simulate(rig, 12, seed=seed, inputs=np.zeros((144, 1)))
-        found = list(zip(exposures, run(rig, exposures, ["profile"])["profile"], strict=True))
-        inside += [np.abs(e.path - truth_of(x).path) < 1.96 * e.path_sd for x, e in found[4:]]
-    assert 0.87 < np.mean(inside) < 0.99
+def test_frames_in_another_order_ruin_the_estimate():
+    """Frames fed in another order must ruin the estimate: it is the frames that it lives by."""
+    exposures = simulate(RIG, 24, seed=9)
+    order = np.random.default_rng(1).permutation(24)
+    shuffled = [dataclasses.replace(e, pixels=exposures[k].pixels) for e, k in zip(exposures, order, strict=True)]
+    right, wrong = (squared(exposures, run(RIG, each, ["profile"])["profile"]).mean() for each in (exposures, shuffled))
+    assert wrong > 9 * right
 
 
 # Trust
+
+
+def test_missing_and_saturated_pixels_are_left_out():
+    exposures = simulate(RIG, 24, seed=5)
+    holed = []
+    for e in exposures:
+        pixels_, mask = e.pixels.copy(), e.mask.copy()
+        pixels_[0, 17], pixels_[0, 25] = 0, 65535
+        mask[0, 17] = False
+        holed.append(dataclasses.replace(e, pixels=pixels_, mask=mask))
+    whole, given = (run(RIG, series, ["profile"])["profile"] for series in (exposures, holed))
+    assert {e.status for e in given} == {Status.OK}
+    assert "left out" in given[0].reason
+    assert squared(exposures, given).mean() < 1.5 * squared(exposures, whole).mean()
+
+
+def test_a_spot_that_is_not_where_it_should_be_is_lost_and_found():
+    exposures = simulate(RIG, 24, seed=6)
+    moved = exposures[:10]
+    for e in exposures[10:]:
+        path = np.clip(truth_of(e).path - 0.8 * np.sign(truth_of(e).path.mean()), -0.9, 0.9)
+        noise = np.random.default_rng(e.frame_id).standard_normal((1, 40)) * np.sqrt(0.01 / 0.05)
+        moved.append(
+            dataclasses.replace(
+                e, pixels=to_counts(RIG.sensor, exposure_density(RIG.sensor.kernel, line_of(RIG).edges, path) + noise)
+            )
+        )
+    estimates = run(RIG, moved, ["profile"])["profile"]
+    statuses = [e.status for e in estimates]
+    assert set(statuses[:10]) == {Status.OK}
+    assert statuses[10] == Status.GATED
+    assert {Status.DIVERGED, Status.REINITIALISED} & set(statuses[10:])
+    for estimate in estimates:
+        assert np.isfinite(estimate.path).all()
+        assert np.linalg.eigvalsh(estimate.coefficient_covariance[0]).min() > -1e-12
 
 
 @pytest.mark.parametrize("axes", [1, 7])
@@ -249,7 +218,7 @@ def test_an_axis_does_not_depend_on_those_beside_it(axes):
 
     def estimates(rows):
         plant = dataclasses.replace(RIG.plant, axes=len(range(*rows.indices(40))))
-        own = MixtureFilter(plant, RIG.sensor, PROFILE)
+        own = ProfileFilter(plant, RIG.sensor)
         model = exposure_model(plant, 200)
         response = model.response(np.zeros((200, plant.axes)))
         return [own.step(model, response, Profile(density=d[rows], mask=np.ones(d[rows].shape, bool))) for d in density]
@@ -272,7 +241,7 @@ def test_the_quadrature_of_an_axis_does_not_depend_on_those_beside_it():
 
     def estimates(rows):
         plant = dataclasses.replace(RIG.plant, axes=len(range(*rows.indices(3))))
-        own, model = MixtureFilter(plant, RIG.sensor, PROFILE), exposure_model(plant, 200)
+        own, model = ProfileFilter(plant, RIG.sensor), exposure_model(plant, 200)
         measured = Profile(density=density[rows], mask=np.ones(density[rows].shape, bool))
         return own.step(model, model.response(jump[:, rows]), measured)
 
@@ -309,15 +278,15 @@ def test_what_commands_left_in_the_state_is_foreseen():
 def test_a_lost_mode_is_found_again():
     """Two exposures after a filter was made sure of the opposite; without doubt it takes four."""
     rig = load_rig("jitter")
-    how, found = WindowedMoments(line_of(rig)).needs, []
+    found = []
     for seed in range(1, 13):
-        filter_, errors = MixtureFilter(rig.plant, rig.sensor, PROFILE), []
+        filter_, errors = ProfileFilter(rig.plant, rig.sensor), []
         for k, exposure in enumerate(simulate(rig, 9, seed=seed)):
             if k == 5:
                 h = filter_.prior
                 filter_.prior = GaussianMixture(h.log_weight, -h.mean, 0.3 * h.covariance)
             model = exposure_model(rig.plant, exposure.n_steps)
-            measured = must_be(Profile, measure(rig, exposure, how)[0])
+            measured = must_be(Profile, measure(rig, exposure, PIXELS)[0])
             response = model.response(exposure.inputs)
             posterior = filter_.step(model, response, measured)
             path = model.path(posterior.coefficients.mean, response.path)
@@ -337,15 +306,15 @@ def test_the_posterior_of_a_single_coefficient_is_an_integral_over_a_line():
     view, state = seen(dataclasses.replace(RIG, plant=plant), width=0.5)
     assert view.reduced.size == 1
     t = np.linspace(-3, 3, 60_001)
-    log = PlainView.of(view).log_likelihoods(t[None, :, None])[0] - 0.5 * t**2 / state.covariance[0, 0, 0]
+    plain = PlainView.of(view)
+    log = plain.log_likelihood(plain.predicted(t[None, :, None]))[0] - 0.5 * t**2 / state.covariance[0, 0, 0]
     w = np.exp(log - log.max())
     w /= w.sum()
     mean = w @ t
     sd = np.sqrt(w @ (t - mean) ** 2)
-    update = PROFILE.update(view, single(state), state)
-    assert not update.poor[0]
-    assert abs(update.coefficients.mean[0, 0] - mean) < 0.2 * sd
-    assert np.sqrt(update.coefficients.covariance[0, 0, 0]) == pytest.approx(sd, rel=0.25)
+    posterior = ProfileFilter(plant, RIG.sensor).found(view, single(state)).posterior.gaussian
+    assert abs(posterior.mean[0, 0] - mean) < 0.2 * sd
+    assert np.sqrt(posterior.covariance[0, 0, 0]) == pytest.approx(sd, rel=0.25)
 
 
 @pytest.mark.slow
@@ -359,57 +328,10 @@ def test_an_unstable_plant_does_not_end_in_infinity():
     model = exposure_model(plant, 200)
     density = exposure_density(rig.sensor.kernel, line_of(rig).edges, np.zeros((1, 200)))
     centred = Profile(density=density, mask=np.ones_like(density, dtype=bool))
-    filter_ = MixtureFilter(plant, rig.sensor, PROFILE)
+    filter_ = ProfileFilter(plant, rig.sensor)
     # A posterior mean is trusted however unstable the plant is, and what would be without a camera is a number.
     for _ in range(150):
         last = filter_.step(model, model.response(np.zeros((200, 1))), centred)
         assert (last.status == Status.OK).all()
     assert np.isfinite(filter_.prior.mean).all()
     assert np.isfinite(filter_._unseen.covariance).all()
-
-
-def test_few_points_are_reported_but_not_where_the_frame_cannot_be_believed():
-    rig = vibrating(1)
-    view, state = seen(rig, seed=1)
-    lie = view.part(slice(None))
-    lie.y = np.roll(np.abs(lie.y), 15, axis=1) + 3.0
-    of_a_lie = PROFILE.update(lie, single(state), state)
-    assert not of_a_lie.innovation.within_gate[0]
-    assert not of_a_lie.poor[0]
-    assert PROFILE.update(view, single(state), state).poor[0]
-    (exposure,) = simulate(rig, 1, seed=1, inputs=np.zeros((rig.timing.exposure_steps, 1)))
-    reason = make_estimator(rig, "profile").step(exposure).reason
-    assert reason.endswith("too few of the paths tried fit the blur: the estimate is wider for it")
-
-
-def test_a_part_of_the_exposures_gets_the_random_numbers_of_the_whole():
-    """A filter that is given the state of another goes on as that one does, however many exposures came before."""
-    exposures = simulate(RIG, 4, seed=2)
-    whole, part = (make_estimator(RIG, "profile") for _ in range(2))
-    whole.step(exposures[0])
-    ours, theirs = (must_be(MixtureFilter, each.filter) for each in (part, whole))
-    ours.prior, ours._unseen = theirs.prior, theirs._unseen
-    for exposure in exposures[1:3]:
-        assert whole.step(exposure).path.tobytes() == part.step(exposure).path.tobytes()
-
-
-def log_evidence(estimator):
-    return float(must_be(np.ndarray, estimator.posterior.log_evidence).sum())
-
-
-def test_few_draws_find_the_same_motion_and_nearly_the_same_evidence():
-    rig = load_rig("jitter")
-    usual, few = make_estimator(rig, "profile"), make_estimator(rig, "profile:draws=5")
-    apart, evidence = [], []
-    for exposure in list(simulate(rig, 8, seed=4))[2:]:
-        one, other = usual.step(exposure), few.step(exposure)
-        apart.append(np.sqrt(np.mean((one.path - other.path) ** 2) / np.mean(one.path_sd**2)))
-        evidence.append([log_evidence(each) for each in (usual, few)])
-    assert 0 < np.median(apart) < 0.5
-    assert np.abs(np.diff(np.sum(evidence, axis=0))) < 10
-
-
-@pytest.mark.parametrize("draws", [0, 401])
-def test_a_share_of_the_draws_that_makes_no_sense_is_refused(draws):
-    with pytest.raises(EstimatorError, match=f"draws = {draws}: use 1 to 400 per cent of the usual points"):
-        make_estimator(RIG, "profile", draws=draws)
