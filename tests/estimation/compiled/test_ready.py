@@ -166,7 +166,7 @@ def test_nothing_is_compiled_in_a_session():
 @pytest.mark.slow
 def test_nothing_is_compiled_in_a_session_of_moments():
     before, after, _ = first_session("section-vi-lively", "moments", 0.003, 4)
-    assert before == after > 1
+    assert before == after >= 1
 
 
 @pytest.mark.slow
