@@ -3,11 +3,10 @@ plant.
 
 Whole-array calls for thousands of axes run through memory again and again; these loops keep one axis in the
 processor's cache (rows `moments_of_many_axes`, `profile_of_many_axes` and `membrane_in_real_time` of
-tools/bench). Each loop for line sensors and for spots has a twin in NumPy that tests compare
-it with, in `plain.py` of `tests/estimation/pixels` and `tests/estimation/moments`; the Kalman filter's is
-`kalman.filter.BlurFilter`. The loops for many spots of one plant are tested against
-the dense view of the same pixels. They hold no lock, so axes are shared among threads; the result for one axis does
-not depend on how many others there are, bit for bit.
+tools/bench). Tests compare the loops for pixels with a twin in NumPy, `tests/estimation/pixels/plain.py`, those of
+moments with samples, those for many spots of one plant with the dense view of the same pixels, and the Kalman filter's
+with `kalman.filter.BlurFilter`. They hold no lock, so axes are shared among threads; the result for one axis does not
+depend on how many others there are, bit for bit.
 
 Machine code is made by group, when an estimator that needs the group is first made, and kept beside the source or in
 the user's cache, in a folder whose name follows from what the sources contain (`kept`).
