@@ -115,7 +115,8 @@ class ProfileFilter(Filter):
     def step(self, model: ExposureModel, response: InputResponse, measured: Profile | SpotWindows | None) -> Posterior:
         axes, reduced = self.plant.axes, reduction(model, self.sensor)
         lost = self._missed >= PATIENCE
-        prior = self.prior.replaced(np.flatnonzero(lost), single(self._unseen.part(lost)))
+        again = np.flatnonzero(lost)
+        prior = self.prior.replaced(again, single(self._unseen.part(again)))
         predicted = reduced.prior(Gaussian(prior.mean, prior.covariance))
         posterior = GaussianMixture(prior.log_weight, predicted.mean, predicted.covariance)
         status = np.full(axes, int(Status.INPUT_INVALID), dtype=np.int64)
@@ -133,9 +134,8 @@ class ProfileFilter(Filter):
                 log_evidence -= 0.5 * pixels * math.log(effective_noise_density(self.sensor) / self.sensor.pixel_size)
                 trusted = new.within_gate[seen] | (not self._gate)
                 status[seen], self._missed[seen] = gate_status(trusted, lost[seen], self._missed[seen])
-                posterior = posterior.replaced(
-                    seen[trusted], GaussianMixture.stacked([each.posterior for each in done]).part(trusted)
-                )
+                new_posterior = GaussianMixture.stacked([each.posterior for each in done])
+                posterior = posterior.replaced(seen[trusted], new_posterior.part(np.flatnonzero(trusted)))
                 is_multimodal[seen] = trusted & np.concatenate([each.is_multimodal for each in done])
         after = posterior.mapped(reduced.end_rows, reduced.end_remainder).moved(response.end)
         self.prior = after.reduced(CARRIED, FREE)
