@@ -173,7 +173,7 @@ def test_a_state_that_stays_but_is_known_does_not_count():
     """A constant beside a vibration changes nothing of how long the vibration's errors last."""
     turn, decay = 1.3, 0.8
     A = decay * np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
-    both = linalg.block_diag(A, 1.0)
+    both = linalg.block_diag(A, np.eye(1))
     known = np.diag([0.04, 0.04, 1e-8])[None]
     alone = Inflation(Dynamics(A, A, np.eye(2)), Gaussian(np.zeros((1, 2)), known[:, :2, :2]))
     beside = Inflation(Dynamics(both, both, np.eye(3)), Gaussian(np.zeros((1, 3)), known))
