@@ -144,7 +144,7 @@ def test_a_ratio_is_over_pairs_of_scenes() -> None:
 
 
 @pytest.mark.rare
-@pytest.mark.parametrize("what", ["family", "shake", "limit", "rolling", "skew", "verdict", "look", "identify"])
+@pytest.mark.parametrize("what", ["family", "shake", "rolling", "skew", "verdict", "look", "identify"])
 def test_each_judgement_makes_a_table_and_goes_on_where_it_was(what: str, tmp_path: Path) -> None:
     command = ("--scenes", "1", "--runs", "1", "--json", tmp_path / "rows.jsonl")
     made = run(TOOLS / "judge", what, *command)

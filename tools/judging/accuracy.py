@@ -10,8 +10,8 @@ from functools import partial
 import numpy as np
 from scipy import stats
 
+from aolink.estimation import make_estimator
 from judging.rows import BEYOND_95, Given, Judge, Line, Row, grouped, ratio
-from judging.sampled import estimator as estimator_named
 from judging.scenes import Draw, draw, exposures_of
 
 SKIPPED = 4
@@ -24,7 +24,7 @@ def rows(seed: int, given: Given, *, kind: Draw) -> Iterator[Row]:
     scene = draw(seed, kind)
     rig, exposures = exposures_of(scene, given.runs)
     for name in given.estimators:
-        estimator = estimator_named(rig, name)
+        estimator = make_estimator(rig, name)
         path, inside, nees = [], [], []
         start = time.process_time()
         estimates = [estimator.step(exposure) for exposure in exposures]
@@ -45,7 +45,7 @@ def rows(seed: int, given: Given, *, kind: Draw) -> Iterator[Row]:
 def table(rows: Sequence[Row]) -> tuple[Line, Iterable[Line]]:
     """A line for each estimator."""
     heads = (
-        "estimator", "scenes", "error over open-loop", "over o1", "over sampled", "coverage: 5 %", "median",
+        "estimator", "scenes", "error over open-loop", "over o1", "over moments", "coverage: 5 %", "median",
         f"in {SCENE_INSIDE[0]:.2f} to {SCENE_INSIDE[1]:.2f}", "NEES a state", "in bounds", "ms",
     )  # fmt: skip
     by_name = {name: {row["seed"]: row for row in each} for name, each in grouped(rows).items()}
@@ -56,7 +56,7 @@ def _line(name: str, by_name: dict[str, dict[int, Row]]) -> Line:
     ours = by_name[name]
     over = [
         ratio([(ours[seed]["path"], theirs[seed]["path"]) for seed in sorted(ours.keys() & theirs.keys())])
-        for theirs in (by_name.get(each, {}) for each in ("open-loop", "o1", "sampled"))
+        for theirs in (by_name.get(each, {}) for each in ("open-loop", "o1", "moments"))
     ]
     inside = np.array([np.mean(row["inside"]) for row in ours.values()])
     low, middle = np.quantile(inside, [0.05, 0.5])
@@ -86,9 +86,4 @@ FAMILY = Judge(
 SHAKE = Judge(
     summary="estimators on lines at exact ratios to the frame rate, beside a state that stays",
     rows=partial(rows, kind="exact"), table=table, estimators=FAST, scenes=60, runs=5,
-)  # fmt: skip
-LIMIT = Judge(
-    summary="their distance from the reference, `sampled`",
-    rows=partial(rows, kind="random"), table=table, scenes=12, runs=3,
-    estimators=("o1", "moments", "profile", "sampled"),
 )  # fmt: skip

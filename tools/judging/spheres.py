@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from aolink.estimation import smooth
+from aolink.estimation import make_estimator, smooth
 from aolink.exposure import Exposure
 from aolink.numerics.arrays import BoolArray, FloatArray
 from aolink.optics.camera import to_counts, to_density
@@ -25,7 +25,6 @@ from aolink.optics.sensor import SpotSensor
 from aolink.rig import Rig, parse_rig
 from aolink.simulation.model import simulate
 from judging.rows import BEYOND_95, Given, Judge, Line, Row, grouped, ratio
-from judging.sampled import estimator as estimator_named
 
 FILE = Path(__file__).parents[2] / "tests" / "data" / "diffusing_spheres.npz"
 LENGTHS = (8, 12, 24)
@@ -135,7 +134,7 @@ def rows(seed: int, given: Given) -> Iterator[Row]:
 
     yield row("centroid, held", centroids(rig, exposures), math.nan)
     for name in given.estimators:
-        estimator = estimator_named(rig, name)
+        estimator = make_estimator(rig, name)
         filtered = [estimator.step(exposure) for exposure in exposures]
         for what, each in ((name, filtered), (f"{name}, smoothed", smooth(rig.plant, exposures, filtered))):
             paths, sd = (np.array([getattr(e, key) for e in each]) for key in ("path", "path_sd"))
