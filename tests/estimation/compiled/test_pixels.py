@@ -351,26 +351,6 @@ def test_the_modes_of_a_spot_on_a_plane_are_those_of_the_twin(kind):
     np.testing.assert_allclose(found, expected, atol=0.2)
 
 
-def test_linear_maps_of_a_mixture_keep_its_mean_and_covariance():
-    rng = np.random.default_rng(8)
-    root, rows = rng.standard_normal((5, 4, 3, 3)), rng.standard_normal((2, 3))
-    weight = rng.uniform(0.1, 1, (5, 4))
-    weight[1, 2] = 0.0
-    with np.errstate(divide="ignore"):
-        m = GaussianMixture(
-            np.log(weight / weight.sum(axis=1)[:, None]), rng.standard_normal((5, 4, 3)), root @ root.swapaxes(-1, -2)
-        )
-    own, seen = m.gaussian, m.mapped(rows, np.diag([0.5, 2.0]))
-    w = np.exp(m.log_weight)
-    mean = np.einsum("ac,aci->ai", w, m.mean)
-    away = m.mean - mean[:, None]
-    np.testing.assert_allclose(own.mean, mean, atol=1e-12)
-    spread = np.einsum("ac,acij->aij", w, m.covariance) + np.einsum("ac,aci,acj->aij", w, away, away)
-    np.testing.assert_allclose(own.covariance, spread, atol=1e-12)
-    np.testing.assert_allclose(seen.gaussian.mean, mean @ rows.T, atol=1e-12)
-    np.testing.assert_allclose(seen.gaussian.covariance, rows @ spread @ rows.T + np.diag([0.5, 2.0]), atol=1e-12)
-
-
 def merged_once(m):
     """The two components whose merger costs least are one, in each axis."""
     axes, count = m.log_weight.shape

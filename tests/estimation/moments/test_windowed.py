@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import linalg
 
-from aolink.estimation import Status, exposure_model, make_estimator, run, score
+from aolink.estimation import Status, exposure_model, run, score
 from aolink.estimation.compiled.windows import Path
 from aolink.estimation.frames.frame_data import Profile
 from aolink.estimation.kalman.filter import BlurFilter
@@ -15,11 +15,11 @@ from aolink.estimation.model.base import Dynamics
 from aolink.estimation.model.quadrature import equal_parts, quadrature_paths
 from aolink.estimation.moments.windowed import Inflation, WindowedMoments, inflation, path_of, windows_of
 from aolink.numerics.covariance import psd_root
-from aolink.optics.camera import pixel_noise_sd, shot_gain, to_counts
+from aolink.optics.camera import pixel_noise_sd, shot_gain
 from aolink.optics.kernel import exposure_density, pixel_mass
 from aolink.rig import Rig, load_rig
 from aolink.simulation.model import simulate
-from tests.kinds import line_of, truth_of
+from tests.kinds import line_of
 
 RIG = load_rig("section-vi-lively")
 SENSOR = line_of(RIG)
@@ -215,55 +215,6 @@ def test_a_blur_that_has_several_readings_is_not_believed_in_one(resonance_hz):
 
 
 # Trust
-
-
-def test_missing_and_saturated_pixels_are_left_out():
-    exposures = simulate(RIG, 110, seed=5)
-    holed = []
-    for e in exposures:
-        pixels, mask = e.pixels.copy(), e.mask.copy()
-        pixels[0, 17], pixels[0, 25] = 0, 65535  # one never came, one is stuck
-        mask[0, 17] = False
-        holed.append(dataclasses.replace(e, pixels=pixels, mask=mask))
-    whole, given = (run(RIG, series, ["moments"])["moments"] for series in (exposures, holed))
-    assert {e.status for e in given} == {Status.OK}
-    assert "left out" in given[0].reason
-    assert score(exposures, given, 10).path_rmse < 1.3 * score(exposures, whole, 10).path_rmse
-
-
-def test_half_a_frame_is_not_enough():
-    (exposure,) = simulate(RIG, 1)
-    mask = exposure.mask.copy()
-    mask[0, :30] = False
-    given = make_estimator(RIG, "moments").step(dataclasses.replace(exposure, mask=mask))
-    assert given.status == Status.INPUT_INVALID
-
-
-def test_a_spot_that_is_not_where_it_should_be_is_lost_and_found():
-    exposures = simulate(RIG, 40, seed=6)
-    moved = exposures[:15]
-    for e in exposures[15:]:
-        path = np.clip(truth_of(e).path - 0.8 * np.sign(truth_of(e).path.mean()), -0.9, 0.9)
-        noise = np.random.default_rng(e.frame_id).standard_normal((1, 40)) * np.sqrt(0.01 / 0.05)
-        counts = to_counts(SENSOR, exposure_density(SENSOR.kernel, SENSOR.edges, path) + noise)
-        moved.append(dataclasses.replace(e, pixels=counts))
-    statuses = [e.status for e in run(RIG, moved, ["moments"])["moments"]]
-    assert set(statuses[:15]) == {Status.OK}
-    assert statuses[15] == Status.GATED
-    assert Status.DIVERGED in statuses[15:]
-    for estimate in run(RIG, moved, ["moments"])["moments"]:
-        assert np.isfinite(estimate.path).all()
-        assert np.linalg.eigvalsh(estimate.coefficient_covariance[0]).min() > -1e-12
-
-
-def test_a_frame_without_a_spot_is_refused():
-    exposures = simulate(RIG, 2)
-    noise = np.random.default_rng(1).standard_normal((1, 40)) * np.sqrt(0.01 / 0.05)
-    estimator = make_estimator(RIG, "moments")
-    estimator.step(exposures[0])
-    dark = estimator.step(dataclasses.replace(exposures[1], pixels=to_counts(SENSOR, noise)))
-    assert dark.status == Status.INPUT_INVALID
-    assert "no spot" in dark.reason
 
 
 @pytest.mark.slow

@@ -28,6 +28,10 @@ def test_moments_are_those_of_samples():
     )
     np.testing.assert_allclose(m.gaussian.mean[0], drawn.mean(axis=0), atol=0.03)
     np.testing.assert_allclose(m.gaussian.covariance[0], np.cov(drawn.T), rtol=0.05, atol=0.1)
+    rows, rest = rng.standard_normal((2, 3)), np.diag([0.5, 2.0])
+    seen = m.mapped(rows, rest).gaussian
+    np.testing.assert_allclose(seen.mean[0], rows @ m.gaussian.mean[0])
+    np.testing.assert_allclose(seen.covariance[0], rows @ m.gaussian.covariance[0] @ rows.T + rest)
 
 
 @settings(max_examples=25)
