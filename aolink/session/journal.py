@@ -21,7 +21,7 @@ from aolink.session.report import Report
 _COUNTS = {each.name for each in pb.ConnectionStatistics.DESCRIPTOR.fields} - {"device"}
 """What a device may count."""
 _NUMBER = re.compile(r"(?<![\w.:=-])[-+]?\d[\d.e+-]*")
-"""A number, but not one that is part of a name, as in ``o3`` or ``profile:draws=50``."""
+"""A number, but not one that is part of a name, as in ``o3`` or ``theirs:order=10``."""
 _DISK_S = 2.0
 """Of a disk that takes longer over one write, a warning says how long."""
 _AT_ONCE = 5

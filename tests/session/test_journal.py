@@ -58,7 +58,7 @@ def test_warnings_of_one_kind_are_limited_in_their_rate_and_the_others_counted(t
         journal = Journal(writer, report, time)
         for frame in range(512):
             journal.warn(f"the model no longer fits (frame {frame}): NIS {frame / 7:.2f}, correlation {frame / 9:+.2g}")
-        for name in ("o1", "o3", "profile:draws=10", "profile:draws=20"):
+        for name in ("o1", "o3", "theirs:order=10", "theirs:order=20"):
             journal.warn(f"the estimator {name} failed: after {len(name)} s")
         time.now += 3_600_000_000_000
         journal.warn("the model no longer fits (frame 9999): NIS 3.10, correlation +2")
