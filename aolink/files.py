@@ -236,16 +236,15 @@ def create(target: Path, *, overwrite: bool = False, error: type[AolinkError] = 
 
 
 def write_csv(file: TextIO, columns: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> None:
-    """Write rows by the names of their columns; a value that a row lacks is empty.
-
-    A name or a text that a spreadsheet would take for a formula gets an apostrophe before it: some come from others.
-    """
+    """Write rows by the names of their columns; a value that a row lacks is empty."""
     writer = csv.writer(file)
-    writer.writerow(map(_no_formula, columns))
-    writer.writerows([_no_formula(row.get(column, "")) for column in columns] for row in rows)
+    writer.writerow(map(no_formula, columns))
+    writer.writerows([no_formula(row.get(column, "")) for column in columns] for row in rows)
 
 
-def _no_formula(cell: Any) -> Any:
+def no_formula(cell: Any) -> Any:
+    """A cell of a table. A text that a spreadsheet would take for a formula gets an apostrophe before it: some come
+    from others."""
     return f"'{cell}" if isinstance(cell, str) and _FORMULA.match(cell) else cell
 
 

@@ -206,7 +206,7 @@ class Series(Sequence[Exposure]):
     def to_pandas(self, estimators: Sequence[str] | None = None, *, paths: bool = False) -> pd.DataFrame:
         """A table with a row for each exposure and axis, indexed by time (UTC).
 
-        The columns are those of `aolink.exporting.table`, for all estimators or for those that are named. With
+        The columns are those of `aolink.exporting.table.rows`, for all estimators or for those that are named. With
         ``paths``, a long table of the paths instead: a row for each fast step, axis and name (``truth`` or an
         estimator), with ``value`` and ``sd`` in slope units.
 

@@ -213,7 +213,7 @@ def _check_size(series: Series, n_estimators: int) -> None:
     if size > most:
         raise ExportError(
             f"{series.path} would take {size / 2**30:.0f} GiB of memory, at most {most / 2**30:.1f} are allowed here:"
-            " take fewer estimators or a part of it (`aolink copy`), or a table (.csv, .parquet), written row by row"
+            " take fewer estimators or a part of it (`aolink copy`)"
         )
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -12,13 +11,10 @@ import numpy as np
 from aolink.errors import ExportError
 from aolink.exporting.arrays import arrays, to_xarray
 from aolink.exporting.common import Progress, facts, needed, no_progress
-from aolink.exporting.table import columns, rows
+from aolink.exporting.table import to_pandas
 from aolink.exporting.telemetry import write_fits
-from aolink.files import check_target, write_csv, writing
+from aolink.files import check_target, no_formula, writing
 from aolink.series import Series
-
-_ROWS_AT_ONCE = 4096
-"""Rows of a Parquet file that are in memory together."""
 
 
 def export(
@@ -28,9 +24,9 @@ def export(
     """Write exposures and their estimates into a file of another program's format, which its suffix selects.
 
     ``.npz``, ``.nc`` (NetCDF) and ``.fits`` (AOT telemetry) hold everything of `arrays`; ``.parquet`` and ``.csv`` the
-    table of `aolink.exporting.table`, the former with inputs and paths as lists. Raises `RecordingError` where there
-    are no estimates of such a name; `ExportError` where the suffix is not known, a package is missing, the file exists
-    and not ``overwrite``, or cannot be written; there is no exposure, or the format cannot hold them (`arrays`).
+    table of `Series.to_pandas`. Raises `RecordingError` where there are no estimates of such a name; `ExportError`
+    where the suffix is not known, a package is missing, the file exists and not ``overwrite``, or cannot be written;
+    there is no exposure, or the format cannot hold them (`arrays`).
 
     Parameters
     ----------
@@ -66,28 +62,14 @@ def _write_netcdf(series: Series, names: Sequence[str], path: Path, progress: Pr
 
 
 def _write_csv(series: Series, names: Sequence[str], path: Path, progress: Progress) -> None:
-    known = [column.name for column in columns(series, names)]
-    found = (
-        row | {"time": np.datetime_as_string(np.datetime64(row["time"], "ns"), timezone="UTC")}
-        for row in rows(series, names, progress=progress)
-    )
-    with path.open("w", encoding="utf-8", newline="") as file:
-        write_csv(file, known, found)
+    to_pandas(series, names, progress).rename(columns=no_formula).map(no_formula).to_csv(path)
 
 
 def _write_parquet(series: Series, names: Sequence[str], path: Path, progress: Progress) -> None:
-    pyarrow = needed("pyarrow", "parquet", "Parquet (.parquet)")
-    parquet = needed("pyarrow.parquet", "parquet", "Parquet (.parquet)")
-    types = {
-        "text": pyarrow.string(), "integer": pyarrow.int64(), "number": pyarrow.float64(),
-        "time": pyarrow.timestamp("ns", "UTC"), "numbers": pyarrow.list_(pyarrow.float64()),
-    }  # fmt: skip
-    known = [(column.name, types[column.kind]) for column in columns(series, names, lists=True)]
-    schema = pyarrow.schema(known, metadata=facts(series) | {"rig_toml": series.rig.toml})
-    left = rows(series, names, lists=True, progress=progress)
-    with parquet.ParquetWriter(path, schema) as writer:
-        while some := list(islice(left, _ROWS_AT_ONCE)):
-            writer.write_table(pyarrow.Table.from_pylist(some, schema=schema))
+    needed("pyarrow", "tables", "Parquet (.parquet)")
+    table = to_pandas(series, names, progress)
+    table.attrs = {**facts(series), "rig_toml": series.rig.toml}
+    table.to_parquet(path, engine="pyarrow")
 
 
 WRITERS: dict[str, Callable[[Series, Sequence[str], Path, Progress], None]] = {

@@ -22,7 +22,7 @@ from aolink.plotting.exposure import draw_exposure, step_of
 from aolink.plotting.overview import Overview, overview
 from aolink.plotting.session import plot_errors, plot_nis
 from aolink.plotting.style import new_figure, paper
-from aolink.recording.answers import Answers
+from aolink.recording.account import STEPS, Commands
 from aolink.recording.facts import Counted, recording_facts
 from aolink.recording.reader import Recording
 from aolink.recording.side_files import check_stands_alone
@@ -114,8 +114,8 @@ def _facts(recording: Recording, facts: Mapping[str, Any]) -> dict[str, str]:
         "size": with_unit(facts["bytes"], "B"),
         **recording.facts(),
         "gaps": f"{facts['gaps']['count']}, the longest {facts['gaps']['longest_steps']} fast steps",
-        "steps": _counts(facts["commands"]) or "no counts of commanded steps",
-        "answers": "; ".join(Answers.of(facts["answers"]).lines()),
+        "steps": _counts({name: facts["commands"][name] for name in STEPS}) or "no counts of commanded steps",
+        "answers": "; ".join(Commands.of(facts["commands"]).lines()),
         "losses": _counts(facts["losses"]) or "none counted",
         "damage": facts["damage"],
         **{key: str(session[key]) for key in ("note", "camera", "mirror", "seed") if session.get(key)},

@@ -14,13 +14,13 @@ from foxglove_schemas_protobuf.Log_pb2 import Log
 from aolink.estimation import Status
 from aolink.estimation.score import UnusedCounter
 from aolink.recording import topics
-from aolink.recording.answers import AnswerCounter, Answers
+from aolink.recording.account import STEPS, Account, Commands
 from aolink.recording.convert import verdict_of
 from aolink.recording.messages import RecordedMessage
 from aolink.recording.reader import Recording
 from aolink.recording.schemas_pb2 import CommandAnswer, ExposureInfo
 from aolink.recording.schemas_pb2 import Estimate as EstimateMessage
-from aolink.wire.messages_pb2 import Applied
+from aolink.wire.messages_pb2 import Applied, CommandBlock
 
 _LOSSES = (
     "frames_lost", "frames_incomplete", "scenes_lost", "scenes_incomplete", "connection_sequence_gaps",
@@ -29,12 +29,10 @@ _LOSSES = (
     "control_open_exposures", "control_late_exposures", "control_fall_back_exposures",
 )  # fmt: skip
 """A session's counts of losses and faults."""
-_ENDS = ("commanded", "applied", "superseded", "late", "refused", "not_reported")
-"""Steps that a session commanded, and how they ended: the first is the sum of the others."""
 
 
 class Counted:
-    """What a pass over all messages counts: gaps between frames, estimates, answers of the mirror."""
+    """What a pass over all messages counts: gaps between frames, estimates, commands."""
 
     def __init__(self, recording: Recording) -> None:
         self._period = recording.rig.timing.frame_period_steps
@@ -43,15 +41,17 @@ class Counted:
         names = recording.estimators
         self._counts, self._unused = dict.fromkeys(names, 0), {name: UnusedCounter() for name in names}
         self._verdicts: dict[str, dict[str, Any]] = {}
-        self._answers = AnswerCounter()
+        self._account = Account()
 
     def see(self, recorded: RecordedMessage) -> None:
         """Take the next message."""
         message: Any = recorded.message
-        if isinstance(message, CommandAnswer):
-            self._answers.answered(message)
+        if isinstance(message, CommandBlock):
+            self._account.commanded(message)
+        elif isinstance(message, CommandAnswer):
+            self._account.answered(message)
         elif isinstance(message, Applied):
-            self._answers.applied(message)
+            self._account.reported(message)
         elif isinstance(message, ExposureInfo) and recorded.topic == topics.EXPOSURE:
             if self._last is not None and message.first_step - self._last != self._period:
                 self._gaps.append(message.first_step - self._last - self._period)
@@ -64,10 +64,9 @@ class Counted:
             with contextlib.suppress(ValueError):  # a status of a later aolink
                 self._unused[name].add(Status(message.status), message.reason, message.frame_id)
 
-    def result(self) -> tuple[dict[str, int], dict[str, Any], Answers]:
+    def result(self) -> tuple[dict[str, int], dict[str, Any], Commands]:
         """Number and longest length of the gaps between the camera's frames, in fast steps; the number of estimates of
-        each estimator, and why some could not use their exposure; what the mirror answered to its commands, and why
-        some had no effect."""
+        each estimator, and why some could not use their exposure; how the commands ended."""
         estimates: dict[str, Any] = {
             name: {
                 "count": count,
@@ -77,7 +76,7 @@ class Counted:
             for name, count in self._counts.items()
         }
         gaps = {"count": len(self._gaps), "longest_steps": max(self._gaps, default=0)}
-        return gaps, estimates, self._answers.result()
+        return gaps, estimates, self._account.close()
 
 
 def recording_facts(recording: Recording, counted: Counted | None = None) -> dict[str, Any]:
@@ -90,7 +89,7 @@ def recording_facts(recording: Recording, counted: Counted | None = None) -> dic
         counted = Counted(recording)
         for recorded in recording.messages():  # all of them, because one that cannot be used is found when it is read
             counted.see(recorded)
-    gaps, estimates, answers = counted.result()
+    gaps, estimates, commands = counted.result()
     return {
         "file": str(recording.path),
         "bytes": recording.size,
@@ -107,10 +106,8 @@ def recording_facts(recording: Recording, counted: Counted | None = None) -> dic
         },
         "gaps": gaps,
         "estimates": estimates,
-        "commands": {
-            end: int(steps) for end in _ENDS if (steps := recording.end_metadata.get(f"steps_{end}", "")).isdigit()
-        },
-        "answers": asdict(answers),
+        "commands": asdict(commands)
+        | {name: int(steps) for name in STEPS if (steps := recording.end_metadata.get(f"steps_{name}", "")).isdigit()},
         "losses": _losses(recording),
         "damaged_parts": [loss.text() for loss in recording.losses],
         "truth": topics.TRUTH in recording.counts,

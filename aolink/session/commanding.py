@@ -16,8 +16,8 @@ from aolink.devices.interfaces import Mirror, Time
 from aolink.estimation import Estimate
 from aolink.exposure import Exposure
 from aolink.recording import topics
+from aolink.recording.account import Account
 from aolink.rig import MirrorDriver, Rig
-from aolink.session.account import Account
 from aolink.session.controlling import MARGIN_S, Controlling
 from aolink.session.journal import Journal
 from aolink.session.report import LatencyBook

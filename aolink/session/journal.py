@@ -14,7 +14,6 @@ from foxglove_schemas_protobuf.Log_pb2 import Log
 from aolink.devices.interfaces import Camera, ClockSampled, CommandAnswered, Device, Mirror, Time
 from aolink.recording import schemas_pb2 as pb
 from aolink.recording import topics
-from aolink.recording.answers import AnswerCounter
 from aolink.recording.writer import RecordingWriter
 from aolink.session.report import Report
 
@@ -48,7 +47,6 @@ class Journal:
         self.report = report
         self.record, self._writer = writer.write, writer
         self._time = time
-        self.answers = AnswerCounter()
         self._said: dict[str, _Said] = {}
         """The warnings by their kind."""
 
@@ -97,22 +95,6 @@ class Journal:
                 f" in the {period_s:.3f} s from {sampled.step.after_ns} ns on may be off by as much"
             )
 
-    def answer(self, mirror: Mirror, answered: CommandAnswered, receive_ns: int) -> None:
-        """Record the mirror's answer to a command block, or that none came."""
-        block, ack, kind = answered.block, answered.ack, pb.CommandAnswer
-        message = kind(
-            block_id=block.block_id, first_step=block.first_step, n_steps=block.n_steps, answer=kind.NONE,
-            tries=answered.tries, times_full=answered.times_full, sent_ns=answered.sent_ns,
-        )  # fmt: skip
-        if ack is not None:
-            message.answer = cast(pb.CommandAnswer.Answer, ack.code)
-            message.text, message.answered_ns = ack.text, receive_ns
-            message.late_steps, message.superseded_steps = ack.late_steps, ack.superseded_steps
-            message.queue_end_step = ack.queue_end_step
-            message.device_ns = mirror.clock.device_ns(receive_ns)[0] if mirror.clock.ready else 0
-        self.record(topics.ANSWER, message, receive_ns)
-        self.answers.answered(message)
-
     def disk(self) -> None:
         """Warn of a disk that is held up: what ends the session is a full queue."""
         if not self._time.virtual and (held_up_s := self._writer.held_up_s) > _DISK_S:
@@ -133,3 +115,19 @@ class Journal:
                     self.warn(text)
             if known := {count: number for count, number in each.items() if count in _COUNTS}:
                 self.record(topics.CONNECTION, pb.ConnectionStatistics(device=name, **known), now)
+
+
+def command_answer(mirror: Mirror, answered: CommandAnswered, receive_ns: int) -> pb.CommandAnswer:
+    """The mirror's answer to a command block as it is recorded, or that none came."""
+    block, ack, kind = answered.block, answered.ack, pb.CommandAnswer
+    message = kind(
+        block_id=block.block_id, first_step=block.first_step, n_steps=block.n_steps, answer=kind.NONE,
+        tries=answered.tries, times_full=answered.times_full, sent_ns=answered.sent_ns,
+    )  # fmt: skip
+    if ack is not None:
+        message.answer = cast(pb.CommandAnswer.Answer, ack.code)
+        message.text, message.answered_ns = ack.text, receive_ns
+        message.late_steps, message.superseded_steps = ack.late_steps, ack.superseded_steps
+        message.queue_end_step = ack.queue_end_step
+        message.device_ns = mirror.clock.device_ns(receive_ns)[0] if mirror.clock.ready else 0
+    return message

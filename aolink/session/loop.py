@@ -18,13 +18,13 @@ from aolink.devices.interfaces import Camera, ClockSampled, CommandAnswered, Dev
 from aolink.errors import DeviceError, PortError
 from aolink.estimation import Driver
 from aolink.recording import topics
+from aolink.recording.account import REFUSALS, Account
 from aolink.recording.writer import RecordingWriter
 from aolink.rig import Rig
-from aolink.session.account import REFUSALS, Account
 from aolink.session.commanding import Commanding, Inputs, lead_steps
 from aolink.session.controlling import Controlling
 from aolink.session.estimating import Estimating, InTheLoop
-from aolink.session.journal import Journal
+from aolink.session.journal import Journal, command_answer
 from aolink.session.live import LiveExposures, Show
 from aolink.session.received import ReceivedFrames
 from aolink.session.report import EstimatorReport, LatencyBook, Report
@@ -88,7 +88,7 @@ class SessionLoop:
         """Devices whose port has vanished, until the session goes on with them."""
         self._returned: list[Device] = []
         """Vanished devices that have been identified again; their clocks are being queried."""
-        self._account = Account(self.report)
+        self._account = Account(self.report.commands)
         self._journal = Journal(writer, self.report, time)
         self._latencies = LatencyBook(self.report, self._journal.latency, commanded=mirror.commanded)
         self._frames = ReceivedFrames(rig, time, camera, mirror, self._journal, self._latencies)
@@ -143,16 +143,16 @@ class SessionLoop:
 
     def close_account(self) -> None:
         """End each commanded step that is still open: no more answers and reports of the mirror will come."""
-        last_answers, now = self._mirror.last_answers(), self._time.now_ns()
+        now = self._time.now_ns()
+        last_answers = [command_answer(self._mirror, each, now) for each in self._mirror.last_answers()]
         for each in last_answers:
-            self._account.answered(each.block.block_id, each.ack)
+            self._account.answered(each)
         if self._parked_from is not None:
             self._account.parked_from(self._parked_from)
         self._account.close()
         self._count_tries()
         for each in last_answers:  # the recording may be what has failed
-            self._journal.answer(self._mirror, each, now)
-        self.report.answers = self._journal.answers.result()
+            self._journal.record(topics.ANSWER, each, now)
 
     def finish_estimates(self, patience_s: float = ESTIMATES_S) -> None:
         """Wait for the estimates under way, and record exposures without an estimate as skipped."""
@@ -417,9 +417,7 @@ class SessionLoop:
 
     def _take_applied(self, applied: wire.Applied, receive_ns: int) -> None:
         self._journal.record(topics.APPLIED, applied, receive_ns)
-        self._journal.answers.applied(applied)
-        if applied.source != wire.Applied.AWAITED:
-            self._account.reported(applied)
+        self._account.reported(applied)
         if self._controlling is not None:
             self._controlling.applied(applied)
         is_report = applied.source not in (wire.Applied.AWAITED, wire.Applied.NOT_REPORTED)
@@ -435,9 +433,9 @@ class SessionLoop:
         self._live.take(self._assembler.add_applied(applied), receive_ns)
 
     def _take_answer(self, answer: CommandAnswered, receive_ns: int) -> None:
-        ack = answer.ack
-        self._account.answered(answer.block.block_id, ack)
-        self._journal.answer(self._mirror, answer, receive_ns)
+        ack, message = answer.ack, command_answer(self._mirror, answer, receive_ns)
+        self._account.answered(message)
+        self._journal.record(topics.ANSWER, message, receive_ns)
         if ack is None:
             return
         self._latencies.acknowledged(ack.block_id, receive_ns)

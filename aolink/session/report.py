@@ -10,7 +10,7 @@ from typing import Any
 
 from aolink.control import Act, State
 from aolink.recording import schemas_pb2 as pb
-from aolink.recording.answers import Answers
+from aolink.recording.account import STEPS, Commands
 from aolink.recording.topics import CONNECTION_FAULTS
 from aolink.session.estimating import Outcome
 from aolink.wire import messages_pb2 as wire
@@ -117,23 +117,10 @@ class Report:
     """What went wrong on the connections to the devices, by the names of `CONNECTION_FAULTS`; both devices together."""
     chunks_refused: int = 0
     """Invalid chunks of frames."""
-    steps_commanded: int = 0
-    """Steps of all command blocks; at the end of the session they are the sum of the five counts that follow."""
-    steps_applied: int = 0
-    steps_superseded: int = 0
-    """Steps that were queued, and replaced by a later command, or dropped when the mirror parked."""
-    steps_late: int = 0
-    """Steps that had gone by when their block came, or whose block was never answered and another input was applied."""
-    steps_refused: int = 0
-    steps_not_reported: int = 0
-    """Steps in which the mirror held an unknown input: the reports did not come, although they were requested again."""
-    steps_clipped: int = 0
-    """Applied steps whose input the device's own protection had changed."""
+    commands: Commands = field(default_factory=Commands)
+    """How the commands ended; complete once the session has ended."""
     steps_parked: int = 0
     """Fast steps of the session in which the mirror held its safe input, however the commands for them ended."""
-    answers: Answers = field(default_factory=Answers)
-    """What the mirror answered to the command blocks, once the session has ended; `aolink info` finds the same in the
-    recording."""
     blocks_retransmitted: int = 0
     reports_asked: int = 0
     """How often missing reports of the mirror were requested again."""
@@ -170,7 +157,7 @@ class Report:
         newest = self.latencies[-1] if self.latencies else None
         known = {
             "frames_lost": self.frames_lost,
-            "frames_incomplete": self.frames_incomplete, "steps_late": self.steps_late,
+            "frames_incomplete": self.frames_incomplete, "steps_late": self.commands.late,
             "skipped": self.exposures_skipped,
             "latency_ms": newest and {
                 name.removesuffix("_ns"): (at - newest.exposure_end_ns) / 1e6
@@ -193,9 +180,12 @@ class Report:
 
     def counts(self) -> dict[str, str]:
         """All counts without the latencies, as text, for the recording's metadata."""
-        facts = asdict(replace(self, control=None))
-        for name in ("latencies", "warnings", "files", "estimation", "unwatched", "control", "answers"):
-            del facts[name]
+        facts: dict[str, Any] = {}
+        for name, value in asdict(replace(self, control=None)).items():
+            if name == "commands":
+                facts |= {f"steps_{end}": value[end] for end in STEPS}
+            elif name not in ("latencies", "warnings", "files", "estimation", "unwatched", "control"):
+                facts[name] = value
         facts |= {f"connection_{name}": count for name, count in facts.pop("connection_faults").items()}
         for name, each in self.estimation.items():
             facts[f"skipped_{name}"] = each.skipped

@@ -12,8 +12,13 @@ from tests.conftest import Session
 
 def test_no_frame_is_lost_and_no_step_late_with_a_queue(recorded: Session) -> None:
     report = recorded.report
-    assert (report.frames_lost, report.steps_late, report.steps_refused, report.steps_not_reported) == (0, 0, 0, 0)
-    assert report.steps_applied > 0
+    assert (report.frames_lost, report.commands.late, report.commands.refused, report.commands.not_reported) == (
+        0,
+        0,
+        0,
+        0,
+    )
+    assert report.commands.applied > 0
 
 
 @pytest.mark.parametrize(("name", "measurements"), [("o1", 1), ("o3", 2), ("moments", 4)])

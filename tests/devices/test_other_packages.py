@@ -16,12 +16,12 @@ from aolink import estimate as estimate_exposures
 from aolink import extensions
 from aolink.errors import DeviceError
 from aolink.recording import topics
+from aolink.recording.account import Commands
 from aolink.recording.reader import Recording
 from aolink.rig import load_rig
 from aolink.session import Report, record
 from aolink.wire.messages_pb2 import Applied
 from tests.commands import simulated_rig
-from tests.devices.mirrors.bench import steps_ended
 from tests.kinds import messages_of
 from tests.packages import package
 
@@ -53,10 +53,9 @@ def test_a_session_with_devices_of_another_package(aolink: Run, installed: dict[
     assert done.returncode == 0, done.stderr
     report = json.loads(done.stdout)
     assert (report["ended"], report["frames_received"], report["frames_lost"]) == ("complete", 6, 0)
-    assert report["steps_commanded"] == 1200
-    ends = ("applied", "superseded", "late", "refused", "not_reported")
-    assert sum(report[f"steps_{how}"] for how in ends) == 1200
-    assert report["steps_applied"] > 0
+    commands = Commands.of(report["commands"])
+    assert commands.commanded == commands.ended == 1200
+    assert commands.applied > 0
 
     recording = Recording(tmp_path / "a.mcap")
     assert (recording.metadata["camera"], recording.metadata["mirror"]) == ("example camera", "example mirror")
@@ -91,10 +90,10 @@ def test_a_camera_of_another_package_beside_a_native_mirror(
     assert done.returncode == 0, done.stderr
     report = json.loads(done.stdout)
     assert (report["ended"], report["frames_received"]) == ("complete", 4)
-    assert report["steps_commanded"] >= 800  # more where the mirror had to be re-armed
+    assert report["commands"]["commanded"] >= 800  # more where the mirror had to be re-armed
     recording = Recording(tmp_path / "a.mcap")
     assert recording.metadata["camera"] == "example camera"
-    assert report["steps_applied"] > 0
+    assert report["commands"]["applied"] > 0
     starts = [exposure.first_step + exposure.start_offset for exposure in recording.exposures()]
     assert np.abs(np.diff(starts) - 200).max() < 1  # as well as the clocks can be compared on a busy machine
     with simulated_rig(rig) as (camera, mirror):
@@ -117,7 +116,7 @@ def test_a_camera_alone_is_recorded(aolink: Run, installed: dict[str, str], tmp_
     done = aolink(*arguments, "--json", env=installed)
     assert done.returncode == 0, done.stderr
     report = json.loads(done.stdout)
-    assert (report["ended"], report["frames_received"], report["steps_commanded"]) == ("complete", 4, 0)
+    assert (report["ended"], report["frames_received"], report["commands"]["commanded"]) == ("complete", 4, 0)
     assert "the rig file's drive is not played" in " ".join(done.stderr.split())
     recording = Recording(tmp_path / "a.mcap")
     assert recording.metadata["mirror"] == "none"
@@ -191,7 +190,7 @@ def test_a_driver_that_fails_ends_the_session_in_good_order(
     calls = sys.modules["failing"].calls
     assert calls[calls.index("park") :] == ["park", "stop", "close"]
     assert Recording(tmp_path / "a.mcap").complete
-    assert steps_ended(report) == report.steps_commanded > 0
+    assert report.commands.ended == report.commands.commanded > 0
 
 
 @pytest.mark.slow

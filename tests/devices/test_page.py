@@ -51,7 +51,7 @@ def test_both_are_recorded_in_a_session(amplifiers: tuple[int, str], tmp_path: P
     device, port = amplifiers
     tables = f'[devices.camera]\ndriver = "page"\nlevel = 900\n[devices.mirror]\ndriver = "page"\nport = "{port}"\n'
     report = record(bench.rig_with(tables), None, None, tmp_path / "a.mcap", exposures=5)
-    assert (report.ended, bench.steps_ended(report)) == ("complete", report.steps_commanded)
+    assert (report.ended, report.commands.ended) == ("complete", report.commands.commanded)
     recording = Recording(tmp_path / "a.mcap")
     assert recording.metadata["camera"] == "noise about 900 counts"
     assert "begin anywhere in a fast step" in recording.metadata["camera_lacks"]
@@ -60,7 +60,7 @@ def test_both_are_recorded_in_a_session(amplifiers: tuple[int, str], tmp_path: P
     *_, before, safe = [np.array(each.split(), dtype=int) for each in os.read(device, 1 << 16).splitlines()]
     assert safe.tolist() == [0, 0]
     assert before.shape == (2,)
-    assert report.steps_applied > 0
+    assert report.commands.applied > 0
 
 
 @pytest.mark.parametrize(

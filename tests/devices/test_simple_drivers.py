@@ -25,10 +25,10 @@ from aolink.devices.opening import open_devices
 from aolink.devices.simple import ClockAnswer, Lacks, SimpleFrame
 from aolink.errors import DeviceError
 from aolink.extensions import installed
+from aolink.recording.account import Account
 from aolink.rig import Rig, load_rig
 from aolink.rig.device_tables import Delay, DeviceTable
-from aolink.session.account import Account
-from aolink.session.report import Report
+from aolink.session.journal import command_answer
 from aolink.wire import messages_pb2 as pb
 from tests.packages import package
 
@@ -167,12 +167,12 @@ def test_each_commanded_step_ends_once(
 ) -> None:  # fmt: skip
     """Late and refused commands, gaps between reports, parking in the middle."""
     mirror = mirror_of(bench := Bench())
-    account, first = Account(report := Report()), 0
+    account, first = Account(), 0
 
     def take(events: Iterable[Event]) -> None:
         for event in events:
             if isinstance(event, CommandAnswered):
-                account.answered(event.block.block_id, event.ack)
+                account.answered(command_answer(mirror, event, 0))
             elif isinstance(event, pb.Applied):
                 account.reported(event)
 
@@ -193,10 +193,9 @@ def test_each_commanded_step_ends_once(
         take(mirror.poll())
     take(mirror.poll())
     account.parked_from(step)
-    account.close()
-    ended = report.steps_applied + report.steps_superseded + report.steps_late + report.steps_refused
-    assert ended + report.steps_not_reported == report.steps_commanded == first
-    assert report.steps_refused == sum(n for n, _, refused in blocks if refused)
+    counts = account.close()
+    assert counts.ended == counts.commanded == first
+    assert counts.refused == sum(n for n, _, refused in blocks if refused)
 
 
 @pytest.fixture

@@ -99,8 +99,8 @@ def test_times_of_recordings_by_other_software(tmp_path: Path, applied: bool) ->
 
 
 def test_what_is_not_there_is_said(lively: Series, tmp_path: Path) -> None:
-    with pytest.raises(RecordingError, match=r"no estimates of o9 \(it has: open-loop, o1, o2, o3, moments\)"):
+    with pytest.raises(RecordingError, match="o9"):
         arrays(lively, ["o9"])
     empty = aolink.read(write_small(tmp_path / "empty.mcap", 0))
-    with pytest.raises(ExportError, match="holds no exposure to export"):
+    with pytest.raises(ExportError, match="no exposure"):
         arrays(empty)

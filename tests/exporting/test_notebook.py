@@ -95,7 +95,7 @@ def test_a_plot_on_axes_of_its_own_or_on_those_given(name: str) -> None:
     assert series[2:5].plot(["o3"], axes=tuple(mine)) == tuple(mine)
     assert {line.get_label() for line in mine[0].get_lines()} == {"truth", "o3"}
     pyplot.close("all")
-    with pytest.raises(ExportError, match=f"there is no output {output + 1}"):
+    with pytest.raises(ExportError, match="output"):
         series.plot(output=output + 1)
 
 
@@ -106,7 +106,7 @@ def test_dark_and_empty_recordings(tmp_path: Path) -> None:
     assert not dark.plot()[1].get_lines()
     empty = aolink.read(write_small(tmp_path / "empty.mcap", 0))
     for give in (empty.to_xarray, empty.to_pandas, empty.plot):
-        with pytest.raises(ExportError, match="holds no exposure"):
+        with pytest.raises(ExportError, match="exposure"):
             give()
-    with pytest.raises(RecordingError, match="no estimates of o3"):
+    with pytest.raises(RecordingError, match="o3"):
         empty.to_pandas(["o3"])

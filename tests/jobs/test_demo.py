@@ -15,6 +15,7 @@ import pytest
 from aolink.cli.tables.sessions import demo_sentence, session
 from aolink.estimation import Score, Scorer
 from aolink.jobs.demo import DemoResult
+from aolink.recording.account import Commands
 from aolink.recording.deblur import RestoredCounts
 from aolink.recording.reader import Recording
 from aolink.session import Report
@@ -141,11 +142,11 @@ def test_counts_are_shown_where_they_are_not_zero() -> None:
         columns = [list(column.cells) for column in session(report).columns]
         return dict(zip(*columns, strict=True))
 
-    good = Report(virtual_time=True, frames_received=40, steps_commanded=80, steps_applied=80)
+    good = Report(virtual_time=True, frames_received=40, commands=Commands(commanded=80, applied=80))
     assert rows(good).keys() == {"frames", "commands", "clock"}
     assert rows(good)["frames"] == "40 received"
     assert rows(good)["commands"] == "80 steps commanded, 80 applied"
-    bad = dataclasses.replace(good, frames_lost=2, steps_late=3, steps_applied=77, rearmed=1)
+    bad = dataclasses.replace(good, frames_lost=2, commands=Commands(commanded=80, applied=77, late=3), rearmed=1)
     bad.connection_faults = good.connection_faults | {"bad_crc": 5}
     assert rows(bad)["frames"] == "40 received, 2 lost whole"
     assert rows(bad)["commands"] == "80 steps commanded, 77 applied, 3 late"

@@ -12,7 +12,7 @@ from google.protobuf.message import Message
 
 from aolink.errors import DeviceError
 from aolink.recording import topics
-from aolink.recording.answers import Answers
+from aolink.recording.account import Commands
 from aolink.recording.editing import cut, merge, recover
 from aolink.recording.facts import recording_facts
 from aolink.recording.mcap_file import WriteOptions
@@ -34,7 +34,7 @@ def lossy(rate: float) -> Rig:
     return parse_rig(f"{RIG.toml}\n[simulation.faults]\npacket_loss_rate = {rate}\ncommand_loss_rate = {rate}\n")
 
 
-def check(run: Run) -> Answers:
+def check(run: Run) -> Commands:
     """Each block has one answer, the tries add up, and blocks of which no effect is known had none, unless the mirror
     could not report it."""
     recording = Recording(run.path)
@@ -48,9 +48,9 @@ def check(run: Run) -> Answers:
         answered = each.answer != CommandAnswer.NONE
         assert bool(each.answered_ns) == bool(each.device_ns) == answered
         assert not answered or 0 < each.sent_ns < each.answered_ns
-    found = run.report.answers
-    assert recording_facts(recording)["answers"] == asdict(found)
-    assert Answers.of(asdict(found)) == found
+    found = run.report.commands
+    assert recording_facts(recording)["commands"] == asdict(found)
+    assert Commands.of(asdict(found)) == found
     effective = {block_id for block_id, _ in run.hub.truth().values()}
     without = {each.block_id for each in blocks} - effective
     certain = [each for each in found.without_effect if "report" not in each.reason]
@@ -122,7 +122,7 @@ def test_what_is_still_queued_when_a_session_is_interrupted_has_no_effect(tmp_pa
     )  # fmt: skip
     (queued,) = check(run).without_effect
     assert queued.reason == "not reported before the session ended, which empties the queue"
-    assert queued.blocks == run.report.steps_superseded // RIG.mirror.block_steps > 0
+    assert queued.blocks == run.report.commands.superseded // RIG.mirror.block_steps > 0
 
 
 def test_a_queue_that_is_full_is_counted(tmp_path: Path) -> None:
@@ -195,4 +195,5 @@ def test_an_answer_of_a_later_aolink_is_no_error(
             if each.topic == topics.ANSWER:
                 change(each.message)
             writer.write(each.topic, each.message, each.log_time_ns)
-    assert recording_facts(Recording(tmp_path / "b.mcap"))["answers"]["blocks"] == whole.counts[topics.ANSWER]
+    facts = recording_facts(Recording(tmp_path / "b.mcap"))
+    assert sum(facts["commands"]["by_answer"].values()) == whole.counts[topics.ANSWER]

@@ -72,7 +72,7 @@ def test_a_slow_estimator_costs_no_frame_and_no_command(loaded: Session) -> None
     report, recording = loaded.report, Recording(loaded.path)
     assert (report.ended, report.exposures, report.frames_received) == ("complete", EXPOSURES, EXPOSURES)
     assert report.frames_lost == report.frames_incomplete == report.connection_faults["sequence_gaps"] == 0
-    assert report.steps_commanded == 50 * EXPOSURES
+    assert report.commands.commanded == 50 * EXPOSURES
     assert recording.complete
     for topic in (topics.IMAGE, topics.EXPOSURE, topics.TRUTH, topics.LATENCY):
         assert recording.counts[topic] == EXPOSURES

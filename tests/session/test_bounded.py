@@ -101,7 +101,7 @@ def test_a_camera_alone(tmp_path: Path) -> None:
 def test_a_mirror_some_of_whose_answers_and_reports_are_lost(tmp_path: Path, controller: str) -> None:
     """Some blocks are never answered: the account lets them go."""
     run = long_session(tmp_path, LOSSY, exposures=300, controller=controller)
-    assert bool(run.report.answers.by_answer.get("NONE")) == bool(controller)
+    assert bool(run.report.commands.by_answer.get("NONE")) == bool(controller)
 
 
 @pytest.mark.rare
@@ -122,7 +122,7 @@ def test_a_mirror_that_reports_nothing(tmp_path: Path, controller: str) -> None:
     run = long_session(tmp_path, RIG, hub, 500, 1000, controller=controller)
     assert run.report.ended == "complete"
     assert {each.inputs_assumed for each in run.exposures} == {20}
-    assert run.report.steps_commanded == run.report.steps_not_reported + run.report.steps_superseded
+    assert run.report.commands.commanded == run.report.commands.not_reported + run.report.commands.superseded
 
 
 def test_without_a_mirror_a_latency_ends_with_its_estimate() -> None:

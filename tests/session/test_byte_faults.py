@@ -34,7 +34,7 @@ def test_damaged_bytes_change_no_pixel_and_no_command_and_are_the_same_again(tmp
     report = reports[0]
     assert report.ended == "complete"
     assert report.blocks_retransmitted > 0
-    assert report.steps_commanded == report.steps_applied + report.steps_not_reported == 8000
+    assert report.commands.commanded == report.commands.applied + report.commands.not_reported == 8000
     good = {exposure.first_step: exposure for exposure in Recording(tmp_path / "good").exposures()}
     exposures = list(Recording(tmp_path / "a").exposures())
     assert 0 < len(exposures) < 40
@@ -49,7 +49,7 @@ def test_damaged_bytes_change_no_pixel_and_no_command_and_are_the_same_again(tmp
 @pytest.mark.parametrize(
     ("fault", "shows"),
     [
-        ("late=0.2", lambda report, exposures: 0 < report.steps_late < 2000),
+        ("late=0.2", lambda report, exposures: 0 < report.commands.late < 2000),
         ("missing=0.3", lambda report, exposures: 0 < len(exposures) < 20),
         ("saturated=0.01", lambda report, exposures: any((each.pixels == 65535).any() for each in exposures)),
         ("dark=1", lambda report, exposures: max(abs(each.pixels.mean() - 20_000) for each in exposures) < 1500),

@@ -146,10 +146,7 @@ def test_a_line_that_comes_back_is_told_to_go_on_and_the_gap_is_recorded(rig_fil
         report, error = recorded(rig, camera, line, tmp_path / "a.mcap", 20, cut_after=3)
     assert report is not None, error
     assert (report.ended, report.rearmed) == ("complete", 1)
-    assert report.steps_commanded == (
-        report.steps_applied + report.steps_superseded + report.steps_late + report.steps_refused
-        + report.steps_not_reported
-    )  # fmt: skip
+    assert report.commands.commanded == report.commands.ended
     recording = Recording(tmp_path / "a.mcap")
     held = messages_of(pb.Applied, recording, topics.APPLIED)
     assert any(m.source == pb.Applied.WATCHDOG for m in held)

@@ -71,7 +71,7 @@ def test_a_mirror_that_does_not_hear_it_is_asked_again(tmp_path: Path, lost: int
     assert (run.error, run.report.ended, run.report.warnings) == (None, "interrupted", [])
     assert is_parked(hub)
     assert len(hub.parks) == lost + 1
-    assert run.report.steps_superseded > 1000
+    assert run.report.commands.superseded > 1000
 
 
 @pytest.mark.slow

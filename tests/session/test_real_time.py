@@ -38,8 +38,8 @@ def test_a_session_has_latencies_and_accounts_for_every_step(serve: Ports, tmp_p
     assert report.state()["latency_ms"]["estimated"] > 0
     assert "estimated after" in report.note()
     assert (report.ended, report.exposures, report.virtual_time) == ("complete", 4, False)
-    assert report.steps_commanded == report.steps_applied + report.steps_parked == 800
-    assert report.steps_late == report.steps_parked
+    assert report.commands.commanded == report.commands.applied + report.steps_parked == 800
+    assert report.commands.late == report.steps_parked
     assert len(report.latencies) == 4
     for latency in report.latencies:
         assert 0 < latency.first_byte_ns <= latency.complete_ns <= latency.estimated_ns
@@ -103,12 +103,12 @@ def test_a_host_that_is_held_up_has_every_step_accounted_for(serve: Ports, tmp_p
     report = stopped_host(serve, tmp_path / "a.mcap", seconds)
     assert report.ended == "complete"
     assert report.frames_received + report.frames_lost == 8
-    assert report.steps_applied + report.steps_parked == 1600
+    assert report.commands.applied + report.steps_parked == 1600
     assert report.steps_parked > 0
-    assert report.steps_superseded == report.steps_not_reported == 0
-    assert report.steps_commanded == report.steps_applied + report.steps_late + report.steps_refused
+    assert report.commands.superseded == report.commands.not_reported == 0
+    assert report.commands.commanded == report.commands.applied + report.commands.late + report.commands.refused
     if not report.rearmed:  # otherwise the watchdog had parked the mirror by then: it refused what came until told
-        assert report.steps_late == report.steps_parked
+        assert report.commands.late == report.steps_parked
 
 
 @pytest.mark.slow
@@ -139,4 +139,4 @@ def test_a_silent_host_leaves_the_mirror_latched_and_the_next_session_rearms_it(
         with open_native(RIG, *ports) as (_, _, mirror):
             assert (mirror.identity.mirror.parked, mirror.identity.mirror.latched) == (True, True)
         report = record(RIG, *ports, tmp_path / "a.mcap", exposures=3)
-    assert (report.ended, report.exposures, report.steps_applied) == ("complete", 3, 600)
+    assert (report.ended, report.exposures, report.commands.applied) == ("complete", 3, 600)

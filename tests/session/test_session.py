@@ -36,8 +36,8 @@ def test_everything_is_received_and_recorded(recorded: Session) -> None:
     assert (report.ended, report.exposures, report.frames_received) == ("complete", EXPOSURES, EXPOSURES)
     assert report.frames_lost == report.frames_incomplete == report.blocks_retransmitted == 0
     assert not any(report.connection_faults.values())
-    assert report.steps_commanded == report.steps_applied == 200 * EXPOSURES
-    assert report.steps_late == report.steps_parked == 0
+    assert report.commands.commanded == report.commands.applied == 200 * EXPOSURES
+    assert report.commands.late == report.steps_parked == 0
     assert recording.complete
     for topic in (topics.IMAGE, topics.EXPOSURE, topics.TRUTH, *map(topics.estimate_topic, ESTIMATORS)):
         assert recording.counts[topic] == EXPOSURES
@@ -199,7 +199,7 @@ def test_a_bad_link_loses_frames_and_nothing_else(tmp_path: Path) -> None:
     assert said["connection_sequence_gaps"] == report.connection_faults["sequence_gaps"]
     assert report.blocks_retransmitted > 0
     # Every step was commanded and applied, and what was not reported was asked for again.
-    assert report.steps_commanded == report.steps_applied == 60 * 200
+    assert report.commands.commanded == report.commands.applied == 60 * 200
     assert report.reports_asked > 0
     exposures = list(Recording(paths[0]).exposures())
     for before, exposure in itertools.pairwise(exposures):

@@ -144,7 +144,7 @@ def test_a_row_of_inputs_may_be_longer_than_a_packet(tmp_path: Path, faults: str
     with simulated_rig(rig_file) as (camera, mirror):
         report = record(rig, camera, mirror, path, estimators=["o3"], exposures=4)
     assert report.ended == "complete"
-    assert (report.steps_commanded, report.steps_applied, report.steps_parked) == (240, 240, 0)
+    assert (report.commands.commanded, report.commands.applied, report.steps_parked) == (240, 240, 0)
     assert (report.blocks_retransmitted > 0) == (report.reports_asked > 0) == bool(faults)
     recording = Recording(path)
     simulated = {e.first_step: e for e in aolink.simulate(recording.rig, 4)}

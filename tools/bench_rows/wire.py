@@ -111,10 +111,10 @@ def commands_at_1_khz(effort: Effort) -> Row:
     rig = load_rig("single-lenslet")
     with tempfile.TemporaryDirectory() as folder, simulated_rig(rig.name, "--real-time") as ports:
         report = record(rig, *ports, Path(folder) / "a.mcap", estimators=["o3"], exposures=effort.of(_MINUTE_EXPOSURES))
-    lost = report.steps_commanded - report.steps_applied
-    figure = f"commands at 1 kHz, {report.steps_commanded / 1000:.0f} s, in blocks of {rig.mirror.block_steps}"
-    good = not (report.steps_late or lost or report.frames_lost)
-    return Row(figure, f"{report.steps_late} steps late, {lost} lost", "limit 0", float(good), 1.0)
+    lost = report.commands.commanded - report.commands.applied
+    figure = f"commands at 1 kHz, {report.commands.commanded / 1000:.0f} s, in blocks of {rig.mirror.block_steps}"
+    good = not (report.commands.late or lost or report.frames_lost)
+    return Row(figure, f"{report.commands.late} steps late, {lost} lost", "limit 0", float(good), 1.0)
 
 
 def slow_estimator(effort: Effort) -> Row:
@@ -128,7 +128,7 @@ def slow_estimator(effort: Effort) -> Row:
                 path = Path(folder) / f"{len(names)}.mcap"
                 reports.append(record(rig, *ports, path, estimators=names, exposures=count))
     lost, with_slow = (
-        each.frames_lost + each.frames_incomplete + each.steps_commanded - each.steps_applied for each in reports
+        each.frames_lost + each.frames_incomplete + each.commands.commanded - each.commands.applied for each in reports
     )
     counted = reports[1].estimation["profile"]
     return Row(
@@ -294,13 +294,14 @@ def bit_errors(effort: Effort) -> list[Row]:
                     wrong |= not np.array_equal(each.truth.path, sound.truth.path)
                 if wrong or not (each.inputs_assumed or np.array_equal(each.inputs, sound.inputs)):
                     raise WrongError(f"exposure {each.frame_id} has wrong pixels, steps or inputs")
-            if report.steps_commanded != report.steps_applied + report.steps_late + report.steps_not_reported:
+            commands = report.commands
+            if commands.commanded != commands.ended or commands.refused or commands.superseded:
                 raise WrongError("steps were lost, taken twice or refused")
             whole = (report.frames_received - report.frames_incomplete) / exposures
-            late = report.steps_late / report.steps_commanded
+            late = commands.late / commands.commanded
             rows.append(Row(
                 f"section-vi, {exposures / 5:.0f} s at a bit error rate of {rate:g}: frames whole; none wrong,"
-                f" {report.steps_late} of {report.steps_commanded} steps late",
+                f" {commands.late} of {commands.commanded} steps late",
                 f"{100 * whole:.2f} %", f"goal {100 * share:g} %",
                 min(whole / share if share else 1.0, 1e-3 / late if late else 1.0), 1.0,
             ))  # fmt: skip

@@ -11,7 +11,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from aolink.estimation.score import Unused
-from aolink.recording.answers import Answers
+from aolink.recording.account import STEPS, Commands
 from aolink.units import duration, with_unit
 
 if TYPE_CHECKING:
@@ -35,7 +35,6 @@ def summary(values: Mapping[str, Any]) -> Table:
     begun = (values["start_utc"] or f"{values['start_ns']} ns since 1970").replace("T", " ").replace("+00:00", " UTC")
     virtual = ", the rig's own time" if session.get("virtual_time") is True else ""
     devices = [f"{kind} {session[kind]}" for kind in _DEVICES if session.get(kind)]
-    steps = ", ".join(f"{name.replace('_', ' ')} {count}" for name, count in values["commands"].items() if count)
     losses = [f"{name.replace('_', ' ')} {count}" for name, count in values["losses"].items()]
     if gaps["count"]:
         losses.append(f"{gaps['count']} gaps between frames, the longest of {gaps['longest_steps']} fast steps")
@@ -48,8 +47,8 @@ def summary(values: Mapping[str, Any]) -> Table:
         "lacks": "; ".join(f"{kind}: {session[f'{kind}_lacks']}" for kind in _DEVICES if session.get(f"{kind}_lacks")),
         "exposures": f"{counts.get('/camera/image', 0)}{', with their truth' if values['truth'] else ''}",
         "lost": ", ".join(losses) or "nothing",
-        "steps": steps,
-        "answers": "; ".join(Answers.of(values["answers"]).lines()),
+        "steps": _steps(values["commands"]),
+        "answers": "; ".join(Commands.of(values["commands"]).lines()),
         "estimates": ", ".join(f"{name} {each['count']}" for name, each in values["estimates"].items()) or "none",
         "unused": "\n".join(_unused(values["estimates"])),
         "damage": values["damage"],
@@ -62,6 +61,10 @@ def summary(values: Mapping[str, Any]) -> Table:
         if text:
             table.add_row(name, escape(text))
     return table
+
+
+def _steps(commands: Mapping[str, Any]) -> str:
+    return ", ".join(f"{name.replace('_', ' ')} {count}" for name in STEPS if (count := commands[name]))
 
 
 def _unused(estimates: Mapping[str, Any]) -> list[str]:

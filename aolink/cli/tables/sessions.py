@@ -58,9 +58,10 @@ def session(report: Report) -> Table:
         (faults["bad_payload"], "discarded for their content"), (faults["duplicates"], "duplicates"),
         (faults["sequence_gaps"], "missing by their sequence numbers"),
     )  # fmt: skip
+    steps = report.commands
     commands = (
-        (report.steps_clipped, "of these clipped"), (report.steps_superseded, "superseded"),
-        (report.steps_late, "late"), (report.steps_refused, "refused"), (report.steps_not_reported, "not reported"),
+        (steps.clipped, "of these clipped"), (steps.superseded, "superseded"), (steps.late, "late"),
+        (steps.refused, "refused"), (steps.not_reported, "not reported"),
     )  # fmt: skip
     mirror = (
         (report.steps_parked, "steps of the session parked"), (report.rearmed, "times re-armed after its watchdog"),
@@ -69,15 +70,13 @@ def session(report: Report) -> Table:
     counts = {
         "frames": [f"{report.frames_received} received", *_counted(frames)],
         "connections": _counted(connections),
-        "commands": [
-            f"{report.steps_commanded} steps commanded", f"{report.steps_applied} applied", *_counted(commands)
-        ],
+        "commands": [f"{steps.commanded} steps commanded", f"{steps.applied} applied", *_counted(commands)],
         "mirror": _counted(mirror),
     }  # fmt: skip
     for name, parts in counts.items():
         if parts:
             table.add_row(name, ", ".join(parts))
-    for line in report.answers.lines():
+    for line in steps.lines():
         table.add_row("answers", line)
     if report.ports_vanished:
         gone = f"vanished {report.ports_vanished} times, and {report.away_s:.2f} s until all had returned"

@@ -46,7 +46,7 @@ def test_a_session_is_recorded_estimated_and_replayed(
     frames = packed(np.array([each.pixels for each in truth]), PIXEL_FORMATS["Mono12p"])
     with gige_camera(tmp_path, frames, codes("Mono12p"), Faults(loss=0.05, seed=1, edges_hz=10.0, clock_fast=60e-6)):
         report = record(rig, None, None, tmp_path / "a.mcap", estimators=["o3"], exposures=12)
-    assert (report.ended, report.steps_commanded, report.estimation["o3"].failed) == ("complete", 0, "")
+    assert (report.ended, report.commands.commanded, report.estimation["o3"].failed) == ("complete", 0, "")
     recording = Recording(tmp_path / "a.mcap")
     assert recording.metadata["camera"].startswith("Aravis Fake, serial number GV01")
     assert recording.metadata["camera_lacks"] == lacks

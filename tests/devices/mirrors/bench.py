@@ -79,8 +79,8 @@ def seen(
 def check_session(report: Report, path: Path, mirror: str) -> None:
     """Ten exposures with a mirror whose description begins so: complete, each step accounted for, well estimated."""
     assert (report.ended, report.frames_received) == ("complete", 10)
-    ends = (report.steps_applied, report.steps_late, report.steps_superseded, report.steps_not_reported)
-    assert (sum(ends), report.steps_clipped) == (report.steps_commanded, 0)
+    ends = (report.commands.applied, report.commands.late, report.commands.superseded, report.commands.not_reported)
+    assert (sum(ends), report.commands.clipped) == (report.commands.commanded, 0)
     recording = Recording(path)
     assert recording.metadata["mirror"].startswith(mirror)
     exposures = list(recording)
@@ -141,9 +141,3 @@ def undisturbed(measured: Callable[[], Measured]) -> Measured:
         finally:
             outages.close()
     pytest.skip("the machine has held this process up each time")
-
-
-def steps_ended(report: Report) -> int:
-    """How many commanded steps ended in one way or another."""
-    return sum((report.steps_applied, report.steps_late, report.steps_superseded, report.steps_refused,
-                report.steps_not_reported))  # fmt: skip

@@ -107,7 +107,7 @@ def test_a_whole_session(tmp_path: Path) -> None:
     assert (report.ended, report.exposures) == ("complete", 10)
     assert WatchedMirror.latest.is_shut_down
     assert WatchedMirror.latest.held[-1][1] == (0.5, 0.5)
-    assert bench.steps_ended(report) == report.steps_commanded == 100
+    assert report.commands.ended == report.commands.commanded == 100
     recording = Recording(tmp_path / "a.mcap")
     assert recording.metadata["mirror"].startswith(DEVICE)
     # The drive moves the spot by 0.3.

@@ -43,11 +43,11 @@ def test_answers_that_are_late_or_come_in_pieces_are_borne(faults: Faults, sessi
         with MIRRORS[name].make(faults=faults) as device:
             path = session(name, device, report := Report(), exposures=4)
             assert MIRRORS[name].is_parked(device)
-        assert (report.ended, report.steps_clipped) == ("complete", 0)
-        assert bench.steps_ended(report) == report.steps_commanded
+        assert (report.ended, report.commands.clipped) == ("complete", 0)
+        assert report.commands.ended == report.commands.commanded
         recording = Recording(path)
         if faults.after_moves and "queues no inputs" in recording.metadata["mirror_lacks"]:
-            assert report.steps_late > 0
+            assert report.commands.late > 0
         assert max(np.abs(each.inputs - PARK).max() for each in recording.exposures()) > 0.2
 
     with_each(check)
@@ -78,7 +78,7 @@ def test_a_unit_whose_power_failed_for_a_moment_is_seen_not_to_follow(session: S
         with MIRRORS[name].make(faults=Faults(reset_at=4, after_moves=UNDER_WAY)) as device:
             path = session(name, device, report := Report(), exposures=8)
             rest = MIRRORS[name].inputs(np.array(device.now()))
-        assert (report.ended, report.steps_clipped > 10) == ("complete", True)
+        assert (report.ended, report.commands.clipped > 10) == ("complete", True)
         last = list(Recording(path).exposures())[-1]
         np.testing.assert_allclose(last.inputs, np.tile(rest, (len(last.inputs), 1)), atol=1e-3)
 
@@ -108,7 +108,7 @@ def test_a_line_that_fails_ends_the_session_with_the_mirror_parked_where_it_hear
                 session(name, device, report := Report())
             assert "\n" not in str(raised.value)
             assert "lost" in what or MIRRORS[name].is_parked(device)
-        assert bench.steps_ended(report) == report.steps_commanded > 0
+        assert report.commands.ended == report.commands.commanded > 0
         bench.check_ended(report, tmp_path / f"{name}.mcap")
 
     # The piezo's line is the aligner's, and has twice as many answers to wait for.

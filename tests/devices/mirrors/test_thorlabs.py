@@ -163,4 +163,4 @@ def test_a_unit_that_is_unplugged_ends_the_session_with_a_whole_recording(
             record(session_rig([x.port, y.port]), None, None, tmp_path / "a.mcap", report=(report := Report()))
         assert x.now() == pytest.approx((35,), abs=2e-3)  # the other one is parked
     assert Recording(tmp_path / "a.mcap").complete
-    assert bench.steps_ended(report) == report.steps_commanded > 0
+    assert report.commands.ended == report.commands.commanded > 0
