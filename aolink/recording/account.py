@@ -226,8 +226,10 @@ class Account:
     def _count_without_effect(self, block: _Block) -> None:
         reason = block.instead or "not reported before the session ended, which empties the queue"
         if (answer := block.answer) is not None:
-            code = answer.answer or (CommandAnswer.TOO_LATE if answer.late_steps >= answer.n_steps else 0)
-            if code:
+            code = answer.answer
+            if code == CommandAnswer.OK and answer.late_steps >= answer.n_steps:
+                code = CommandAnswer.TOO_LATE
+            if code != CommandAnswer.OK:
                 refused = f"refused as {_NAMES.get(code, code)}: {answer.text}".removesuffix(": ")
                 reason = _WITHOUT_WORDS.get(code, refused)
         found = self._without.setdefault(

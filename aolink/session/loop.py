@@ -439,7 +439,7 @@ class SessionLoop:
         if ack is None:
             return
         self._latencies.acknowledged(ack.block_id, receive_ns)
-        if ack.code in REFUSALS and ack.code != wire.LATCHED:
+        if message.answer in REFUSALS and ack.code != wire.LATCHED:
             raise DeviceError(
                 f"the mirror refused command block {ack.block_id} from fast step {answer.block.first_step}:"
                 f" {ack.text or wire.Code.Name(ack.code)}"

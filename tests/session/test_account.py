@@ -322,7 +322,7 @@ def test_the_account_agrees_with_the_device_whatever_it_is_told(
                     account.answered(
                         CommandAnswer(
                             block_id=message.block_id, n_steps=len(blocks[message.block_id]), tries=1,
-                            late_steps=message.late_steps, answer=message.code,
+                            late_steps=message.late_steps, answer=pb.Code.Name(message.code),
                         )
                     )  # fmt: skip
             elif isinstance(message, pb.Applied) and not lost:
