@@ -16,7 +16,6 @@ without such locks two commands still cannot damage the target: each puts a whol
 
 from __future__ import annotations
 
-import csv
 import errno
 import fcntl
 import os
@@ -26,10 +25,9 @@ import secrets
 import shutil
 import stat
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any, TextIO
 
 from aolink.errors import AolinkError
 
@@ -43,8 +41,6 @@ _UNFINISHED = re.compile(r"[0-9a-f]{16}\.partial")
 """The ending of the names of unfinished files."""
 _NO_LINKS = {errno.EPERM, errno.EOPNOTSUPP, errno.ENOTSUP, errno.ENOSYS, errno.EMLINK}
 """Errors of a file system that has no hard links."""
-_FORMULA = re.compile(r"\s*[=@+\-\uff1d\uff20\uff0b\uff0d]")
-"""The beginning of a text that a spreadsheet runs, in the wide forms too that it reads as the plain ones."""
 _KINDS = {
     stat.S_IFDIR: "a folder: give the name of a file in it",
     stat.S_IFIFO: "a named pipe, and only plain files are written: give another name",
@@ -233,19 +229,6 @@ def create(target: Path, *, overwrite: bool = False, error: type[AolinkError] = 
     except OSError as problem:
         raise error(f"cannot create {target}: {why_not(problem)}") from None
     return NewFile(target, target, descriptor, error)
-
-
-def write_csv(file: TextIO, columns: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> None:
-    """Write rows by the names of their columns; a value that a row lacks is empty."""
-    writer = csv.writer(file)
-    writer.writerow(map(no_formula, columns))
-    writer.writerows([no_formula(row.get(column, "")) for column in columns] for row in rows)
-
-
-def no_formula(cell: Any) -> Any:
-    """A cell of a table. A text that a spreadsheet would take for a formula gets an apostrophe before it: some come
-    from others."""
-    return f"'{cell}" if isinstance(cell, str) and _FORMULA.match(cell) else cell
 
 
 def open_unfinished(partial: Path) -> int:

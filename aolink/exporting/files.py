@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -13,8 +14,11 @@ from aolink.exporting.arrays import arrays, to_xarray
 from aolink.exporting.common import Progress, facts, needed, no_progress
 from aolink.exporting.table import to_pandas
 from aolink.exporting.telemetry import write_fits
-from aolink.files import check_target, no_formula, writing
+from aolink.files import check_target, writing
 from aolink.series import Series
+
+_FORMULA = re.compile(r"\s*[=@+\-\uff1d\uff20\uff0b\uff0d]")
+"""The beginning of a text that a spreadsheet runs, in the wide forms too that it reads as the plain ones."""
 
 
 def export(
@@ -59,6 +63,12 @@ def _write_netcdf(series: Series, names: Sequence[str], path: Path, progress: Pr
     dataset = to_xarray(series, names, progress)
     with path.open("r+b") as file:  # given the name, HDF5 would lock the file, which is locked already
         dataset.to_netcdf(file, engine="h5netcdf")
+
+
+def no_formula(cell: Any) -> Any:
+    """A cell of a table. A text that a spreadsheet would take for a formula gets an apostrophe before it: some come
+    from others."""
+    return f"'{cell}" if isinstance(cell, str) and _FORMULA.match(cell) else cell
 
 
 def _write_csv(series: Series, names: Sequence[str], path: Path, progress: Progress) -> None:

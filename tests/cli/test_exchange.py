@@ -27,7 +27,12 @@ def lively() -> Recording:
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("module", "suffix", "extra"),
-    [("pyarrow", ".parquet", "parquet"), ("h5py", ".nc", "tables"), ("aotpy", ".fits", "aot")],
+    [
+        ("pandas", ".csv", "tables"),
+        ("pyarrow", ".parquet", "tables"),
+        ("h5py", ".nc", "tables"),
+        ("aotpy", ".fits", "aot"),
+    ],
 )
 def test_a_package_that_is_missing_is_named_with_its_extra(
     lively: Recording, tmp_path: Path, module: str, suffix: str, extra: str

@@ -15,8 +15,7 @@ from mcap_protobuf.writer import Writer
 import aolink
 from aolink.errors import ExportError
 from aolink.exporting.arrays import arrays
-from aolink.exporting.files import WRITERS, export
-from aolink.files import write_csv
+from aolink.exporting.files import WRITERS, export, no_formula
 from aolink.recording import topics
 from aolink.recording.editing import RecordingCopy
 from aolink.recording.reader import Recording
@@ -62,14 +61,9 @@ def test_a_spreadsheet_runs_nothing_of_a_table(tmp_path: Path) -> None:
         table = list(csv.DictReader(file))
     assert {row["recording"] for row in table} == {"'=1+1.mcap"}
     assert any(float(row["truth_end_x2"]) < 0 for row in table)
-    names = ["=a", "@b", "+c", "-d", "\t=e", "\uff1df", "g=1", "'h"]
-    with (tmp_path / "all.csv").open("w+", newline="") as file:
-        write_csv(file, names, [dict.fromkeys(names, -1.5), {"g=1": "-2+3"}])
-        file.seek(0)
-        head, numbers, texts = csv.reader(file)
-    assert head == ["'=a", "'@b", "'+c", "'-d", "'\t=e", "'\uff1df", "g=1", "'h"]
-    assert numbers == ["-1.5"] * len(names)
-    assert texts == ["", "", "", "", "", "", "'-2+3", ""]
+    assert [no_formula(each) for each in ("=a", "@b", "+c", "-d", "\t=e", "\uff1df", "g=1", "'h", -1.5)] == [
+        "'=a", "'@b", "'+c", "'-d", "'\t=e", "'\uff1df", "g=1", "'h", -1.5,
+    ]  # fmt: skip
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".parquet"])
