@@ -23,6 +23,7 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap.records import Chunk, Message
 from mcap.stream_reader import StreamReader
+from mcap.summary import Summary
 from mcap.writer import IndexType, Writer
 
 from aolink.errors import AolinkError, RecordingError
@@ -38,11 +39,19 @@ from aolink.recording.writer import begin_recording
 from aolink.rig import load_rig
 from aolink.wire import messages_pb2 as wire
 from tests.conftest import Session
+from tests.kinds import must_be
 from tests.recording.small import write_small
+
+Chunks = tuple[bytes, list[tuple[int, int]]]
+
+
+def summary_of(path: Path) -> Summary:
+    with path.open("rb") as file:
+        return must_be(Summary, make_reader(file).get_summary())
 
 
 @pytest.fixture(scope="module")
-def many_chunks(recorded: Session, tmp_path_factory: pytest.TempPathFactory) -> tuple[bytes, list[tuple[int, int]]]:
+def many_chunks(recorded: Session, tmp_path_factory: pytest.TempPathFactory) -> Chunks:
     """A recording in many small chunks, and where each chunk is: first byte, byte after the last."""
     recording = Recording(recorded.path)
     path = tmp_path_factory.mktemp("chunks") / "a.mcap"
@@ -51,9 +60,7 @@ def many_chunks(recorded: Session, tmp_path_factory: pytest.TempPathFactory) -> 
     for raw in recording.raw_messages():
         file.add(raw.topic, schema_of(topics.SCHEMAS[raw.schema]), raw.data, raw.log_time_ns, raw.sequence)
     file.finish()
-    with path.open("rb") as opened:
-        summary = make_reader(opened).get_summary()
-    assert summary is not None
+    summary = summary_of(path)
     chunks = [(each.chunk_start_offset, each.chunk_start_offset + each.chunk_length) for each in summary.chunk_indexes]
     return path.read_bytes(), sorted(chunks)
 
@@ -64,26 +71,18 @@ def sequences(path: Path) -> set[int]:
 
 def by_chunk(data: bytes, chunks: list[tuple[int, int]]) -> list[set[int]]:
     """The messages of each chunk, by the stock reader."""
-    from io import BytesIO
-
     found = []
     for start, end in chunks:
-        records = StreamReader(BytesIO(data[start:end]), skip_magic=True).records
+        records = StreamReader(io.BytesIO(data[start:end]), skip_magic=True).records
         messages = set[int]()
-        try:
-            for record in records:
-                if isinstance(record, Message):
-                    messages.add(record.sequence)
-        except Exception:  # the stream ends after its chunk
-            pass
+        with contextlib.suppress(Exception):  # the stream ends after its chunk
+            messages.update(record.sequence for record in records if isinstance(record, Message))
         found.append(messages)
     return found
 
 
 @pytest.mark.slow
-def test_cut_off_at_any_byte_all_whole_chunks_come_back(
-    many_chunks: tuple[bytes, list[tuple[int, int]]], tmp_path: Path
-) -> None:
+def test_cut_off_at_any_byte_all_whole_chunks_come_back(many_chunks: Chunks, tmp_path: Path) -> None:
     data, chunks = many_chunks
     messages = by_chunk(data, chunks)
     assert len(chunks) > 30
@@ -100,9 +99,7 @@ def test_cut_off_at_any_byte_all_whole_chunks_come_back(
 
 
 @pytest.mark.parametrize("bit", [27, 31, 40, 63])
-def test_an_impossible_size_of_a_chunk_costs_no_other_one(
-    many_chunks: tuple[bytes, list[tuple[int, int]]], tmp_path: Path, bit: int
-) -> None:
+def test_an_impossible_size_of_a_chunk_costs_no_other_one(many_chunks: Chunks, tmp_path: Path, bit: int) -> None:
     """Its size without compression is not believed, and not held against the file."""
     data, chunks = many_chunks
     damaged = bytearray(data)
@@ -113,9 +110,7 @@ def test_an_impossible_size_of_a_chunk_costs_no_other_one(
 
 
 @pytest.mark.slow
-def test_flipped_bits_cost_no_more_than_their_chunks(
-    many_chunks: tuple[bytes, list[tuple[int, int]]], tmp_path: Path
-) -> None:
+def test_flipped_bits_cost_no_more_than_their_chunks(many_chunks: Chunks, tmp_path: Path) -> None:
     """Anywhere behind the first 16 bytes: lengths, checksums, attachments, index."""
     data, chunks = many_chunks
     messages = by_chunk(data, chunks)
@@ -142,7 +137,7 @@ def test_flipped_bits_cost_no_more_than_their_chunks(
 @settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.data())
 def test_garbage_anywhere_is_one_error_or_less_to_read(
-    many_chunks: tuple[bytes, list[tuple[int, int]]], tmp_path: Path, choice: st.DataObject
+    many_chunks: Chunks, tmp_path: Path, choice: st.DataObject
 ) -> None:
     data = bytearray(many_chunks[0])
     for _ in range(choice.draw(st.integers(1, 4))):
@@ -158,7 +153,7 @@ def test_garbage_anywhere_is_one_error_or_less_to_read(
 
 @pytest.mark.parametrize("length", [1 << 63, (1 << 64) - 1])
 def test_a_chunk_that_says_it_holds_more_than_can_be_costs_itself(
-    many_chunks: tuple[bytes, list[tuple[int, int]]], tmp_path: Path, length: int
+    many_chunks: Chunks, tmp_path: Path, length: int
 ) -> None:
     data, chunks = bytearray(many_chunks[0]), many_chunks[1]
     start = chunks[2][0]
@@ -178,18 +173,14 @@ def test_a_file_of_another_kind_with_private_records_is_refused_with_one_error(t
         channel = writer.register_channel("/x", "json", schema)
         writer.add_message(channel, 1, b"{}", 1)
         writer.finish()
-    with pytest.raises(RecordingError, match="not a recording of aolink"):
+    with pytest.raises(RecordingError, match="aolink"):
         Recording(path)
 
 
 def test_an_index_that_lies_costs_no_memory(recorded: Session, tmp_path: Path) -> None:
     """Chunks that point at themselves, at the end, at other records."""
     data = bytearray(recorded.path.read_bytes())
-    with recorded.path.open("rb") as file:
-        from mcap.reader import make_reader
-
-        summary = make_reader(file).get_summary()
-    assert summary is not None
+    summary = summary_of(recorded.path)
     rng = np.random.default_rng(3)
     for each in summary.chunk_indexes:
         known = (each.message_start_time, each.message_end_time, each.chunk_start_offset)
@@ -209,16 +200,12 @@ def test_an_index_that_lies_costs_no_memory(recorded: Session, tmp_path: Path) -
     assert "its index is damaged" in Recording(path, check=True).damage
 
 
-def test_only_the_chunks_of_the_asked_time_and_topics_are_read(
-    many_chunks: tuple[bytes, list[tuple[int, int]]], tmp_path: Path
-) -> None:
+def test_only_the_chunks_of_the_asked_time_and_topics_are_read(many_chunks: Chunks, tmp_path: Path) -> None:
     """All others are made unreadable: whoever looks at them loses them."""
     data, chunks = bytearray(many_chunks[0]), many_chunks[1]
     (path := tmp_path / "a.mcap").write_bytes(data)
     everything = [(each.log_time_ns, each.sequence) for each in Recording(path).messages()]
-    with path.open("rb") as file:
-        summary = make_reader(file).get_summary()
-    assert summary is not None
+    summary = summary_of(path)
     middle = summary.chunk_indexes[len(summary.chunk_indexes) // 2].message_start_time
     for index in summary.chunk_indexes:
         if index.message_start_time >= middle:
@@ -237,11 +224,7 @@ def test_only_the_chunks_of_the_asked_time_and_topics_are_read(
 def test_a_channel_whose_chunk_is_lost_is_known_from_elsewhere(recorded: Session, tmp_path: Path) -> None:
     """The recording is of a killed session, without the index at the end: the first chunk names all the channels."""
     data = bytearray(recorded.path.read_bytes())
-    with recorded.path.open("rb") as file:
-        from mcap.reader import make_reader
-
-        summary = make_reader(file).get_summary()
-    assert summary is not None
+    summary = summary_of(recorded.path)
     first, last = (sorted(each.chunk_start_offset for each in summary.chunk_indexes)[k] for k in (0, -1))
     data[first + 80] ^= 1
     (path := tmp_path / "killed.mcap").write_bytes(data[:last])
@@ -254,7 +237,7 @@ def test_a_channel_whose_chunk_is_lost_is_known_from_elsewhere(recorded: Session
 def test_a_pipe_is_refused_and_not_waited_for(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe.mcap")
     for path in (tmp_path / "pipe.mcap", Path("/dev/zero")):
-        with pytest.raises(RecordingError, match="is a pipe or a device"):
+        with pytest.raises(RecordingError, match="pipe"):
             Recording(path)
 
 

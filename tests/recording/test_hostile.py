@@ -103,6 +103,20 @@ def rig_only(path: Path, text: str = "", add: Callable[[Writer], None] = lambda 
     return path
 
 
+def zstd_chunk(data: bytes) -> bytes:
+    """A record of a chunk that holds these bytes, compressed."""
+    packed = zstandard.compress(data)
+    chunk = struct.pack("<QQQII", 1, 1, len(data), 0, 4) + b"zstd" + struct.pack("<Q", len(packed)) + packed
+    return struct.pack("<BQ", Opcode.CHUNK, len(chunk)) + chunk
+
+
+def with_records(path: Path, records: bytes) -> Path:
+    """A recording with a rig file, and these records before the end of its data."""
+    whole, end = in_place_of_the_end(rig_only(path))
+    path.write_bytes(whole[:end] + records)
+    return path
+
+
 def in_place_of_the_end(path: Path) -> tuple[bytes, int]:
     data = path.read_bytes()
     return data, data.rindex(struct.pack("<BQ", Opcode.DATA_END, 4))
@@ -112,10 +126,7 @@ def in_place_of_the_end(path: Path) -> tuple[bytes, int]:
 def test_a_small_file_with_millions_of_messages_is_refused_at_once(aolink: Run, tmp_path: Path) -> None:
     message = struct.pack("<BQHIQQ", Opcode.MESSAGE, 22, 1, 1, 1, 1)
     data = message * ((16 << 20) // len(message))
-    packed = zstandard.compress(data)
-    chunk = struct.pack("<QQQII", 1, 1, len(data), 0, 4) + b"zstd" + struct.pack("<Q", len(packed)) + packed
-    whole, end = in_place_of_the_end(rig_only(path := tmp_path / "a.mcap"))
-    path.write_bytes(whole[:end] + struct.pack("<BQ", Opcode.CHUNK, len(chunk)) + chunk)
+    path = with_records(tmp_path / "a.mcap", zstd_chunk(data))
     for command in (["info", path], ["copy", path, "-o", tmp_path / "b.mcap"]):
         done = aolink(*command)
         assert done.returncode == 5
@@ -127,41 +138,34 @@ def test_a_small_file_with_millions_of_messages_is_refused_at_once(aolink: Run, 
 def test_chunks_that_grow_without_end_are_refused(tmp_path: Path) -> None:
     """Twenty chunks of one message of zeros: together more than what is free, and than LZ4 could come to."""
     data = struct.pack("<BQHIQQ", Opcode.MESSAGE, 127 << 20, 1, 1, 1, 1) + bytes((127 << 20) - 22)
-    packed = zstandard.compress(data)
-    chunk = struct.pack("<QQQII", 1, 1, len(data), 0, 4) + b"zstd" + struct.pack("<Q", len(packed)) + packed
-    whole, end = in_place_of_the_end(rig_only(path := tmp_path / "a.mcap"))
-    path.write_bytes(whole[:end] + 20 * (struct.pack("<BQ", Opcode.CHUNK, len(chunk)) + chunk))
-    with pytest.raises(RecordingError, match="without compression"):
-        Recording(path)
+    with pytest.raises(RecordingError, match="compression"):
+        Recording(with_records(tmp_path / "a.mcap", 20 * zstd_chunk(data)))
+
+
+def add_holes(path: Path, count: int, opcode: int, head: Callable[[int], bytes], size: int, tail: int = 0) -> None:
+    """Records of zeros that take no room on the disk, before the end of a recording's data."""
+    _, end = in_place_of_the_end(rig_only(path))
+    with path.open("r+b") as file:
+        file.truncate(end)
+        for k in range(count):
+            file.seek(0, os.SEEK_END)
+            file.write(struct.pack("<BQ", opcode, len(head(k)) + size + tail) + head(k))
+            file.truncate(file.tell() + size + tail)
 
 
 @pytest.mark.slow
-def test_attachments_that_are_holes_are_refused(tmp_path: Path) -> None:
-    """Twelve gigabytes that take no room on the disk."""
-    _, end = in_place_of_the_end(rig_only(path := tmp_path / "a.mcap"))
-    with path.open("r+b") as file:
-        file.truncate(end)
-        for k in range(60):
-            head = struct.pack("<QQI2sI1sQ", 0, 0, 2, b"%02d" % k, 1, b"x", 200 << 20)
-            file.seek(0, os.SEEK_END)
-            file.write(struct.pack("<BQ", Opcode.ATTACHMENT, len(head) + (200 << 20) + 4) + head)
-            file.truncate(file.tell() + (200 << 20) + 4)
+def test_attachments_and_metadata_that_are_holes_are_refused(tmp_path: Path) -> None:
+    """Each record is below the limit for one; all would be kept in memory."""
+    path, size = tmp_path / "a.mcap", 200 << 20
+    add_holes(
+        path, 60, Opcode.ATTACHMENT, lambda k: struct.pack("<QQI2sI1sQ", 0, 0, 2, b"%02d" % k, 1, b"x", size), size, 4
+    )
     assert path.stat().st_size > 12e9
-    with pytest.raises(RecordingError, match="attachments of"):
+    with pytest.raises(RecordingError, match="attachments"):
         Recording(path)
-
-
-def test_metadata_that_are_holes_are_refused(tmp_path: Path) -> None:
-    """Each is below the limit for one record, and takes no room on the disk; all would be kept in memory."""
-    _, end = in_place_of_the_end(rig_only(path := tmp_path / "a.mcap"))
-    with path.open("r+b") as file:
-        file.truncate(end)
-        for k in range(4):
-            head = struct.pack("<I1sII1sI", 1, b"%d" % k, 9 + (20 << 20), 1, b"k", 20 << 20)
-            file.seek(0, os.SEEK_END)
-            file.write(struct.pack("<BQ", Opcode.METADATA, len(head) + (20 << 20)) + head)
-            file.truncate(file.tell() + (20 << 20))
-    with pytest.raises(RecordingError, match="very long metadata"):
+    path, size = tmp_path / "b.mcap", 20 << 20
+    add_holes(path, 4, Opcode.METADATA, lambda k: struct.pack("<I1sII1sI", 1, b"%d" % k, 9 + size, 1, b"k", size), size)
+    with pytest.raises(RecordingError, match="metadata"):
         Recording(path)
 
 
@@ -169,14 +173,8 @@ def test_metadata_that_are_holes_are_refused(tmp_path: Path) -> None:
 def test_very_many_channels_are_refused(tmp_path: Path, in_chunk: bool) -> None:
     head = struct.pack("<HHI1sI4sI", 1, 0, 1, b"t", 4, b"json", 0)
     data = 20_000 * (struct.pack("<BQ", Opcode.CHANNEL, len(head)) + head)
-    if in_chunk:
-        packed = zstandard.compress(data)
-        chunk = struct.pack("<QQQII", 1, 1, len(data), 0, 4) + b"zstd" + struct.pack("<Q", len(packed)) + packed
-        data = struct.pack("<BQ", Opcode.CHUNK, len(chunk)) + chunk
-    whole, end = in_place_of_the_end(rig_only(path := tmp_path / "a.mcap"))
-    path.write_bytes(whole[:end] + data)
-    with pytest.raises(RecordingError, match="very many tiny records"):
-        Recording(path)
+    with pytest.raises(RecordingError, match="tiny"):
+        Recording(with_records(tmp_path / "a.mcap", zstd_chunk(data) if in_chunk else data))
 
 
 def header(shape: str, descr: str = "<f8") -> bytes:
@@ -190,7 +188,7 @@ def test_a_true_scene_that_is_none_is_one_error(tmp_path: Path, data: bytes) -> 
     path = rig_only(
         tmp_path / "a.mcap", text, lambda to: to.add_attachment(0, 0, topics.TRUE_SCENE_ATTACHMENT, "", data)
     )
-    with pytest.raises(RecordingError, match="is not the rig's scene"):
+    with pytest.raises(RecordingError, match="scene"):
         _ = Recording(path).true_scene
 
 
@@ -198,7 +196,7 @@ def test_a_true_scene_that_is_none_is_one_error(tmp_path: Path, data: bytes) -> 
     "text", ["a = " + "[" * 10_000 + "]" * 10_000, ".".join("a" * 10_000) + " = 1", " . ".join("a" * 10_000) + " = 1"]
 )
 def test_a_rig_file_of_ten_thousand_levels_is_one_error(tmp_path: Path, text: str) -> None:
-    with pytest.raises(RecordingError, match=r"not valid TOML|it is longer"):
+    with pytest.raises(RecordingError, match=r"TOML|longer"):
         Recording(rig_only(tmp_path / "a.mcap", text))
 
 
@@ -209,7 +207,7 @@ def test_a_rig_file_out_of_a_recording_names_no_file(tmp_path: Path, monkeypatch
     for name in ("moving-scene.npy", str(tmp_path / "moving-scene.npy"), "../rigs/moving-scene.png"):
         text = load_rig("moving-scene").toml.replace("moving-scene.png", name)
         recording = Recording(rig_only(tmp_path / "a.mcap", text))
-        with pytest.raises(RigError, match="out of a recording"):
+        with pytest.raises(RigError, match=r"scene\.picture"):
             SceneCamera(recording.rig, random)
     SceneCamera(parse_rig(load_rig("moving-scene").toml), random)  # the picture that comes with aolink
 

@@ -23,9 +23,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from google.protobuf.message import Message
-from typer.testing import CliRunner
 
-from aolink.cli.common import app
 from aolink.devices.interfaces import CommandAnswered
 from aolink.errors import DeviceError, PortError, RecordingError
 from aolink.polling import wait_readable
@@ -86,15 +84,12 @@ def fake_device(answer: Callable[[Packet], bytes]) -> Iterator[str]:
         os.close(slave)
 
 
-def test_a_port_that_is_not_there_is_refused(aolink: Run) -> None:
-    result = aolink(*record_arguments("/dev/nowhere", "/dev/nowhere-else"))
-    assert_refused(result, 3, "there is no port /dev/nowhere: `aolink devices` lists those of this machine")
-
-
-@pytest.mark.slow
-def test_one_port_for_both_is_refused(aolink: Run) -> None:
-    result = aolink("record", "--camera", "/dev/ttyX", "--mirror", "/dev/ttyX", "--rig", "section-vi", "-o", "a.mcap")
-    assert_refused(result, 3, "camera and mirror are both at /dev/ttyX: each has a port of its own")
+@pytest.mark.parametrize(
+    ("camera", "mirror", "why"),
+    [("/dev/nowhere", "/dev/nowhere-else", "no port /dev/nowhere"), ("/dev/ttyX", "/dev/ttyX", "both at /dev/ttyX")],
+)
+def test_a_port_that_is_not_there_and_one_for_both_are_refused(aolink: Run, camera: str, mirror: str, why: str) -> None:
+    assert_refused(aolink(*record_arguments(camera, mirror)), 3, why)
 
 
 def test_a_port_in_use_is_refused(aolink: Run) -> None:
@@ -102,57 +97,43 @@ def test_a_port_in_use_is_refused(aolink: Run) -> None:
         held = SerialPort(camera)
         result = aolink(*record_arguments(camera, mirror, "--exposures", "2"))
         held.close()
-    assert_refused(result, 3, f"port {camera} is in use by another program")
+    assert_refused(result, 3, f"{camera} is in use")
 
 
 def test_swapped_ports_are_refused_and_named(aolink: Run) -> None:
     with simulated_rig("section-vi") as (camera, mirror):
         result = aolink(*record_arguments(mirror, camera, "--exposures", "2"))
-    assert_refused(
-        result, 4, r"the camera port is a mirror \(section-vi\), expected a camera: are the two ports swapped"
-    )
+    assert_refused(result, 4, "swapped")
 
 
-def test_a_port_where_nobody_answers(aolink: Run) -> None:
-    with fake_device(lambda packet: b"") as port:
-        result = aolink("devices", port)
-    assert result.returncode == 4
-    assert "no device answers on the given" in result.stderr
-    assert "nothing came" in result.stderr
+def of_another_schema(packet: Packet) -> bytes:
+    nonce = pb.Identify.FromString(packet.payload).nonce
+    return encode_message(pb.Identity(nonce=nonce, protocol_version=1, schema_hash=b"otherone"), 0)
 
 
-def test_a_device_that_is_not_ours(aolink: Run) -> None:
-    with fake_device(lambda packet: b"+++ OK\r\n") as port:
-        result = aolink("devices", port)
-    assert result.returncode == 4
-    assert "24 bytes came that are not aolink packets" in result.stderr
-
-
-def test_another_protocol_version_is_refused(aolink: Run) -> None:
-    with fake_device(lambda packet: encode_packet(Packet(3, 2, packet.sequence, b"\x08\x01"))) as port:
-        result = aolink("devices", port)
-    assert result.returncode == 4
-    assert "speaks protocol version 3, this aolink speaks 1: update the host" in result.stderr
-
-
-def test_another_schema_is_refused(aolink: Run) -> None:
-    def answer(packet: Packet) -> bytes:
-        nonce = pb.Identify.FromString(packet.payload).nonce
-        return encode_message(pb.Identity(nonce=nonce, protocol_version=1, schema_hash=b"otherone"), 0)
-
+@pytest.mark.parametrize(
+    ("answer", "said"),
+    [
+        (lambda packet: b"", "nothing came"),
+        (lambda packet: b"+++ OK\r\n", "24 bytes came that are not aolink packets"),
+        (lambda packet: encode_packet(Packet(3, 2, packet.sequence, b"\x08\x01")), "protocol version 3"),
+        (of_another_schema, f"6f746865726f6e65, here {schema_hash().hex()}"),
+    ],
+)
+def test_a_device_that_is_none_of_ours(aolink: Run, answer: Callable[[Packet], bytes], said: str) -> None:
     with fake_device(answer) as port:
         result = aolink("devices", port)
     assert result.returncode == 4
-    assert f"built with another messages.proto (6f746865726f6e65, here {schema_hash().hex()})" in result.stderr
+    assert said in result.stderr
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("old", "new", "pattern"),
     [
-        ("pixels = 40", "pixels = 64", r"sensor shape .* is \(1, 64\) in the file, \(1, 40\) on the device"),
-        ("exposure_steps = 200", "exposure_steps = 100", "timing.exposure_steps is 100 in the file, 200 on the device"),
-        ("input_max = 0.05", "input_max = 0.06", r"mirror.input_max is \[0.06\] in the file, \[0.05\] on the device"),
+        ("pixels = 40", "pixels = 64", r"sensor shape .* \(1, 64\) in the file, \(1, 40\)"),
+        ("exposure_steps = 200", "exposure_steps = 100", "timing.exposure_steps is 100 in the file, 200"),
+        ("input_max = 0.05", "input_max = 0.06", r"mirror.input_max is \[0.06\] in the file, \[0.05\]"),
     ],
 )
 def test_a_rig_file_of_another_device(aolink: Run, tmp_path: Path, old: str, new: str, pattern: str) -> None:
@@ -161,14 +142,14 @@ def test_a_rig_file_of_another_device(aolink: Run, tmp_path: Path, old: str, new
     (tmp_path / "other.toml").write_text(text.replace(old, new))
     with simulated_rig("section-vi") as (camera, mirror):
         result = aolink(*record_arguments(camera, mirror, rig="other.toml"))
-    assert_refused(result, 4, f"the rig file section-vi does not match the device: {pattern}; give the rig file")
+    assert_refused(result, 4, pattern)
 
 
 @pytest.mark.slow
 def test_ports_of_two_rigs_are_refused(aolink: Run) -> None:
     with simulated_rig("section-vi") as (camera, _), simulated_rig("section-vi", "--seed", "9") as (_, mirror):
         result = aolink(*record_arguments(camera, mirror))
-    assert_refused(result, 4, "do not belong to the same rig")
+    assert_refused(result, 4, "same rig")
 
 
 @pytest.mark.slow
@@ -176,30 +157,28 @@ def test_an_existing_target_is_kept(aolink: Run, tmp_path: Path) -> None:
     (tmp_path / "a.mcap").write_text("precious")
     with simulated_rig("section-vi") as (camera, mirror):
         arguments = record_arguments(camera, mirror, "--exposures", "2")
-        assert_refused(aolink(*arguments), 5, "a.mcap exists and is not overwritten")
+        assert_refused(aolink(*arguments), 5, "a.mcap exists")
         assert (tmp_path / "a.mcap").read_text() == "precious"
         assert aolink(*arguments, "--overwrite").returncode == 0
     assert Recording(tmp_path / "a.mcap").counts["/camera/image"] == 2
     for name in ("b.mcap", "b.rrd"):
         (tmp_path / name).write_text("precious")
     for command in (["estimate", "a.mcap", "-o", "b.mcap"], ["view", "a.mcap", "-o", "b.rrd"]):
-        assert "exists and is not overwritten" in aolink(*command).stderr
+        assert "exists" in aolink(*command).stderr
 
 
 @pytest.mark.slow
 def test_a_folder_that_does_not_exist(aolink: Run) -> None:
     with simulated_rig("section-vi") as (camera, mirror):
         result = aolink(*record_arguments(camera, mirror, output="no/such/a.mcap"))
-    assert_refused(result, 5, "cannot write no/such/a.mcap: there is no folder no/such; make it first")
+    assert_refused(result, 5, "no folder no/such")
 
 
 @pytest.mark.slow
 def test_an_unknown_estimator_is_refused_with_those_there_are(aolink: Run) -> None:
     with simulated_rig("section-vi") as (camera, mirror):
         result = aolink(*record_arguments(camera, mirror, "--estimator", "o7"))
-    assert result.returncode == 6
-    assert "o7" in result.stderr
-    assert "open-loop" in result.stderr
+    assert_refused(result, 6, "o7.*open-loop")
 
 
 @pytest.mark.slow
@@ -211,7 +190,7 @@ def test_a_full_disk_ends_the_session_and_leaves_what_was_recorded(aolink: Run, 
             *record_arguments(camera, mirror, "--estimator", "o3"),
             preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit)),
         )
-        assert_refused(result, 5, "lets a file be; what was recorded until then is in it")
+        assert_refused(result, 5, "what was recorded until then")
         parked = aolink("devices", mirror).stdout
     assert "parked" in parked
     recording = Recording(tmp_path / "a.mcap")
@@ -221,16 +200,14 @@ def test_a_full_disk_ends_the_session_and_leaves_what_was_recorded(aolink: Run, 
     assert [e.frame_id for e in exposures] == list(range(1, len(exposures) + 1))
     info = aolink("info", "a.mcap")
     assert "damage" in info.stdout
-    assert "aolink: warning: a.mcap: it was cut off" in info.stderr
+    assert "warning: a.mcap" in info.stderr
 
 
 def test_a_disk_without_any_space_is_one_clear_error(tmp_path: Path) -> None:
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (100, before[1]))
     try:
-        with pytest.raises(
-            RecordingError, match=r"cannot write .*a\.mcap: it would be larger than the disk or a limit"
-        ):
+        with pytest.raises(RecordingError, match="larger"):
             RecordingWriter(tmp_path / "a.mcap", load_rig("section-vi"), {}, 0)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
@@ -238,8 +215,21 @@ def test_a_disk_without_any_space_is_one_clear_error(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["/dev/full", "/dev/null"])
 def test_a_device_is_no_target(name: str) -> None:
-    with pytest.raises(RecordingError, match=f"{name} is a device, and only plain files are written"):
+    with pytest.raises(RecordingError, match="device"):
         RecordingWriter(name, load_rig("section-vi"), {}, 0, overwrite=True)
+
+
+@contextmanager
+def rig_process(start_aolink: Start, *arguments: str) -> Iterator[tuple[subprocess.Popen[str], list[str]]]:
+    """A simulated rig as a process of its own, which may be stopped or killed; and its ports."""
+    rig = start_aolink("sim", *arguments, "--json")
+    assert rig.stdout is not None
+    ports = json.loads(rig.stdout.readline())
+    try:
+        yield rig, [ports["camera"], ports["mirror"]]
+    finally:
+        rig.kill()
+        rig.communicate()
 
 
 def wait_for_size(path: Path, size: int, process: subprocess.Popen[str]) -> None:
@@ -275,25 +265,18 @@ def test_ctrl_c_keeps_the_recording_whole_and_parks_the_mirror(
 
 @pytest.mark.slow
 def test_a_rig_killed_in_the_middle(start_aolink: Start, tmp_path: Path) -> None:
-    rig = start_aolink("sim", "section-vi", "--json")
-    assert rig.stdout is not None
-    ports = json.loads(rig.stdout.readline())
-    process = start_aolink(*record_arguments(ports["camera"], ports["mirror"], "--estimator", "o3"))
-    wait_for_size(tmp_path / "a.mcap", 100_000, process)
-    rig.kill()
-    rig.communicate()
-    _, errors = process.communicate(timeout=30)
+    with rig_process(start_aolink, "section-vi") as (rig, ports):
+        process = start_aolink(*record_arguments(*ports, "--estimator", "o3"))
+        wait_for_size(tmp_path / "a.mcap", 100_000, process)
+        rig.kill()
+        _, errors = process.communicate(timeout=30)
     assert process.returncode == 3
-    match = re.fullmatch(
-        r"aolink: lost /dev/pts/\d+: .*; is the device still there\?;"
-        r" the (\d+) exposure\(s\) that had come by then are saved in a.mcap\n",
-        errors,
-    )
+    match = re.search(r"lost /dev/pts/.*; the (\d+) exposure\(s\) .* saved in a.mcap", errors)
     assert match, errors
     recording = Recording(tmp_path / "a.mcap")
     assert len(list(recording.exposures())) == int(match[1])
     assert recording.complete
-    assert recording.metadata["ended"].startswith("error: lost /dev/pts/")
+    assert recording.metadata["ended"].startswith("error: lost")
     assert len(recording.estimates("o3")) > 0
 
 
@@ -338,7 +321,7 @@ def test_a_command_beyond_the_limits_is_refused_by_the_host_and_by_the_device() 
     with simulated_rig("section-vi") as ports, open_native(rig, *ports) as (hub, _, mirror):
         for value in (0.06, float("nan")):
             u = np.array([[0.0], [value]])
-            with pytest.raises(DeviceError, match=r"input 0 at fast step 1 is .*, beyond the mirror's limits"):
+            with pytest.raises(DeviceError, match="limits"):
                 mirror.send_block(0, u, 0, hub.now_ns())
         rig.mirror.input_max[0] = 1.0  # a host that believes in other limits
         mirror.send_block(0, np.array([[0.06]]), 0, hub.now_ns())
@@ -346,25 +329,21 @@ def test_a_command_beyond_the_limits_is_refused_by_the_host_and_by_the_device() 
         (answered,) = mirror.handle(refusal)
         assert isinstance(answered, CommandAnswered)
         assert answered.ack
-        assert (answered.ack.code, answered.ack.text) == (pb.OUT_OF_RANGE, "an input is beyond the limits")
+        assert answered.ack.code == pb.OUT_OF_RANGE
         assert mirror.in_flight == 0
 
 
 @pytest.mark.slow
 def test_ctrl_c_while_the_rig_is_held_up(start_aolink: Start, tmp_path: Path) -> None:
     """Nobody answers any more; the session ends all the same, as interrupted, and says what it could not do."""
-    rig = start_aolink("sim", "section-vi", "--json")
-    assert rig.stdout is not None
-    ports = json.loads(rig.stdout.readline())
-    process = start_aolink(*record_arguments(ports["camera"], ports["mirror"], "--estimator", "o3"))
-    wait_for_size(tmp_path / "a.mcap", 100_000, process)
-    rig.send_signal(signal.SIGSTOP)
-    process.send_signal(signal.SIGINT)
-    _, errors = process.communicate(timeout=60)
-    rig.kill()
-    rig.communicate()
+    with rig_process(start_aolink, "section-vi") as (rig, ports):
+        process = start_aolink(*record_arguments(*ports, "--estimator", "o3"))
+        wait_for_size(tmp_path / "a.mcap", 100_000, process)
+        rig.send_signal(signal.SIGSTOP)
+        process.send_signal(signal.SIGINT)
+        _, errors = process.communicate(timeout=60)
     assert process.returncode == 130
-    assert "warning: the rig on virtual time has said nothing" in errors
+    assert "has said nothing" in errors
     assert Recording(tmp_path / "a.mcap").metadata["ended"] == "interrupted"
 
 
@@ -376,10 +355,10 @@ def test_a_camera_that_dies_ends_an_unlimited_session(tmp_path: Path) -> None:
 
     with (
         lying_rig(load_rig("section-vi"), camera=without_frames, real_time=True) as ports,
-        pytest.raises(DeviceError, match=r"the camera has sent no frame for .* s: is it still connected"),
+        pytest.raises(DeviceError, match="no frame"),
     ):
         record(load_rig("section-vi"), *ports, tmp_path / "a.mcap")
-    assert Recording(tmp_path / "a.mcap").metadata["ended"].startswith("error: the camera has sent no frame")
+    assert Recording(tmp_path / "a.mcap").metadata["ended"].startswith("error: ")
 
 
 @pytest.mark.slow
@@ -387,17 +366,13 @@ def test_a_device_held_up_for_two_seconds_does_not_end_the_session(start_aolink:
     """As long as twice its watchdog is longer than that."""
     text = load_rig("section-vi").toml.replace("block_steps = 50", "block_steps = 50\nwatchdog_s = 3")
     (tmp_path / "rig.toml").write_text(text)
-    rig = start_aolink("sim", "rig.toml", "--json", "--real-time", "--listen", "127.0.0.1:0")
-    assert rig.stdout is not None
-    ports = json.loads(rig.stdout.readline())
-    process = start_aolink(*record_arguments(ports["camera"], ports["mirror"], "--exposures", "16", rig="rig.toml"))
-    wait_for_size(tmp_path / "a.mcap", 50_000, process)
-    rig.send_signal(signal.SIGSTOP)
-    time.sleep(2.0)  # the fault itself, not a wait for something
-    rig.send_signal(signal.SIGCONT)
-    output, errors = process.communicate(timeout=60)
-    rig.kill()
-    rig.communicate()
+    with rig_process(start_aolink, "rig.toml", "--real-time", "--listen", "127.0.0.1:0") as (rig, ports):
+        process = start_aolink(*record_arguments(*ports, "--exposures", "16", rig="rig.toml"))
+        wait_for_size(tmp_path / "a.mcap", 50_000, process)
+        rig.send_signal(signal.SIGSTOP)
+        time.sleep(2.0)  # the fault itself, not a wait for something
+        rig.send_signal(signal.SIGCONT)
+        output, errors = process.communicate(timeout=60)
     assert (process.returncode, errors) == (0, ""), errors
     assert "exposures, complete" in output
 
@@ -450,45 +425,38 @@ def test_a_port_that_would_write_a_file_is_refused_before_it_does(aolink: Run, t
     assert precious.read_text() == "precious"
     assert result.returncode == (2 if where == "check" else 3)
     said = result.stdout if where == "check" else result.stderr
-    assert f"{port!r} is not a port that aolink opens: a port is a device path" in said
+    assert f"{port!r} is not a port" in said
     assert "Traceback" not in said
 
 
 @pytest.mark.parametrize(
     ("port", "message"),
     [
-        ("socket://127.0.0.1", r"is not an address: expected socket://HOST:PORT with a number from 1 to 65535"),
-        ("socket://", "is not an address: expected socket://HOST:PORT"),
-        ("socket://127.0.0.1:nine", "is not an address: expected socket://HOST:PORT"),
-        ("socket://127.0.0.1:99999", "is not an address: expected socket://HOST:PORT"),
-        ("socket://127.0.0.1:-5", "is not an address: expected socket://HOST:PORT"),
-        ("socket://[::1:5", "is not an address: expected socket://HOST:PORT"),
-        ("socket://127.0.0.1:5?logging=debug", "number from 1 to 65535 and nothing behind it"),
-        ("socket://127.0.0.1:5/debug", "number from 1 to 65535 and nothing behind it"),
-        ("rfc2217://", "is not an address: expected rfc2217://HOST:PORT"),
-        ("rfc2217://127.0.0.1:5?ign_set_control&timeout=9", "number from 1 to 65535 and nothing behind it"),
-        ("RFC2217://127.0.0.1:5#logging", "number from 1 to 65535 and nothing behind it"),
         *(
-            (f"{scheme}://{rest}", "is not a port that aolink opens")
-            for scheme, rest in [
-                ("spy", "loop://?file=a"),
-                ("SPY", "loop://"),
-                (" spy", "loop://"),
-                ("alt", "/dev/null?class=Serial"),
-                ("loop", "?logging=debug"),
-                ("hwgrep", "["),
-                ("cp2110", ""),
-                ("nonsense", "1"),
-                ("", "x"),
-            ]
+            (port, "not an address")
+            for port in (
+                "socket://127.0.0.1", "socket://", "socket://127.0.0.1:nine", "socket://127.0.0.1:99999",
+                "socket://127.0.0.1:-5", "socket://[::1:5", "rfc2217://",
+            )
         ),
-        ("", "there is no port without a name"),
-        ("/dev/null", "/dev/null is a device, but no serial port"),
-        (".", r"\. is a folder"),
-        (__file__, "is a file, not a device"),
-        ("n" * 5000, "file name too long"),
+        *(
+            (port, "nothing behind it")
+            for port in (
+                "socket://127.0.0.1:5?logging=debug", "socket://127.0.0.1:5/debug",
+                "rfc2217://127.0.0.1:5?ign_set_control&timeout=9", "RFC2217://127.0.0.1:5#logging",
+            )
+        ),
+        *(
+            (port, "not a port that aolink opens")
+            for port in (
+                "spy://loop://?file=a", "SPY://loop://", " spy://loop://", "alt:///dev/null?class=Serial",
+                "loop://?logging=debug", "hwgrep://[", "cp2110://", "nonsense://1", "://x",
+            )
+        ),
+        ("", "without a name"), ("/dev/null", "no serial port"), (".", "folder"), (__file__, "a file"),
+        ("n" * 5000, "too long"),
     ],
-)
+)  # fmt: skip
 def test_what_cannot_be_a_port_is_one_clear_error(port: str, message: str) -> None:
     with pytest.raises(PortError, match=message) as caught:
         SerialPort(port)
@@ -497,44 +465,38 @@ def test_what_cannot_be_a_port_is_one_clear_error(port: str, message: str) -> No
         assert word not in str(caught.value)
 
 
-def test_a_port_where_nobody_listens_and_one_without_permission() -> None:
+@contextmanager
+def terminal_as_nobody(mode: int) -> Iterator[int]:
+    """A pseudo terminal's descriptor; root, who may open everything, is somebody else meanwhile."""
+    master, slave = pty.openpty()
+    is_root = os.geteuid() == 0
+    os.fchmod(slave, mode)
+    try:
+        if is_root:
+            os.seteuid(65534)
+        yield slave
+    finally:
+        if is_root:
+            os.seteuid(0)
+        os.close(master)
+        os.close(slave)
+
+
+def test_a_port_where_nobody_listens() -> None:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
-        with pytest.raises(PortError, match=r"nothing listens at socket://127\.0\.0\.1"):
+        with pytest.raises(PortError, match="nothing listens"):
             SerialPort(f"socket://127.0.0.1:{probe.getsockname()[1]}")
-    master, slave = pty.openpty()
-    path = os.ttyname(slave)
-    os.chmod(path, 0)
-    is_root = os.geteuid() == 0
-    try:
-        if is_root:  # root may open everything: nobody may not
-            os.seteuid(65534)
-        with pytest.raises(PortError, match=f"no permission to open {path}: on Debian, add yourself to the group"):
-            SerialPort(path)
-    finally:
-        if is_root:
-            os.seteuid(0)
-        os.close(master)
-        os.close(slave)
 
 
-def test_a_port_that_somebody_else_has_locked() -> None:
+def test_a_port_without_permission_and_one_that_somebody_has_locked() -> None:
     """With the lock of a terminal, which is not pyserial's own."""
-    master, slave = pty.openpty()
-    is_root = os.geteuid() == 0
-    try:
-        os.fchmod(slave, 0o666)
-        name = os.ttyname(slave)
+    with terminal_as_nobody(0o666) as slave:
         fcntl.ioctl(slave, termios.TIOCEXCL)
-        if is_root:  # root is let in all the same
-            os.seteuid(65534)
-        with pytest.raises(PortError, match="is in use by another program: close that one"):
-            SerialPort(name)
-    finally:
-        if is_root:
-            os.seteuid(0)
-        os.close(master)
-        os.close(slave)
+        with pytest.raises(PortError, match="in use"):
+            SerialPort(os.ttyname(slave))
+    with terminal_as_nobody(0) as slave, pytest.raises(PortError, match="permission"):
+        SerialPort(os.ttyname(slave))
 
 
 @pytest.mark.slow
@@ -550,21 +512,13 @@ def test_a_tcp_port_that_another_host_has(aolink: Run) -> None:
 
 
 @pytest.mark.slow
-def test_help_has_an_example_for_every_command() -> None:
-    for command in [each.name or each.callback.__name__ for each in app.registered_commands if each.callback]:
-        result = CliRunner().invoke(app, [command, "--help"])
-        assert result.exit_code == 0
-        assert f"Example: aolink {command}" in result.stdout
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("content", [b"", b"\x89MCAP0\r\n", b"hello, this is a text file, not a recording\n"])
 def test_a_file_that_is_not_a_recording(aolink: Run, tmp_path: Path, content: bytes) -> None:
     (tmp_path / "bad.mcap").write_bytes(content)
     for command in ("info", "estimate", "view"):
         result = aolink(command, "bad.mcap")
         assert_refused(result, 5, "bad.mcap")
-    assert_refused(aolink("info", "missing.mcap"), 5, "cannot read missing.mcap: no such file or directory")
+    assert_refused(aolink("info", "missing.mcap"), 5, "missing.mcap: no such file")
 
 
 @pytest.mark.slow

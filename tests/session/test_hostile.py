@@ -45,18 +45,11 @@ def says(field: str, value: object) -> Callable[[Any], None]:
 
 
 def assert_caught(
-    tmp_path: Path,
-    lies: dict[str, Lie],
-    pattern: str,
-    *,
-    rig: Rig = RIG,
-    exposures: int = 6,
-    real_time: bool = False,
-    tcp: bool = False,
-) -> None:
+    tmp_path: Path, lies: dict[str, Lie], pattern: str, *, rig: Rig = RIG, exposures: int = 6, real_time: bool = False,
+) -> None:  # fmt: skip
     path = tmp_path / "a.mcap"
     with (
-        lying_rig(rig, **lies, real_time=real_time, tcp=tcp) as ports,
+        lying_rig(rig, **lies, real_time=real_time) as ports,
         pytest.raises(DeviceError, match=pattern) as caught,
     ):
         record(rig, *ports, path, exposures=exposures)
@@ -69,85 +62,72 @@ def assert_caught(
             assert np.abs(exposure.inputs).max() <= RIG.mirror.input_max.max()
 
 
-MIRROR = [
-    (pb.Applied, "n_steps", 2**32 - 1),
-    (pb.Applied, "n_steps", 0),
-    (pb.Applied, "n_steps", 49),
-    (pb.Applied, "u", lambda applied: [50.0] * len(applied.u)),
-    (pb.Applied, "u", lambda applied: [*applied.u[1:], float("nan")]),
-    (pb.Applied, "u", lambda applied: [float("inf")] * len(applied.u)),
-    (pb.Applied, "first_step", HUGE),
-    (pb.Applied, "first_step", lambda applied: applied.first_step + 1),
-    (pb.Applied, "block_id", HUGE),
-    (pb.Applied, "block_id", 0),
-    (pb.Applied, "source", 77),
-    (pb.Applied, "device_ns", HUGE),
-    (pb.CommandAck, "block_id", HUGE),
-    (pb.CommandAck, "block_id", 0),
-    (pb.CommandAck, "code", 77),
-    (pb.CommandAck, "code", pb.QUEUE_FULL),
-    (pb.CommandAck, "late_steps", 2**32 - 1),
-    (pb.CommandAck, "superseded_steps", 51),
-    (pb.CommandAck, "queue_end_step", HUGE),
-    (pb.ClockReply, "device_receive_ns", HUGE),
-    (pb.VirtualTime, "host_ns", lambda handed: handed.host_ns + 7_400_000_000_000_000_000),
-    (pb.VirtualTime, "host_ns", lambda handed: handed.host_ns + 1_000_000_000_000),
-    (pb.VirtualTime, "host_ns", 1),
-    (pb.VirtualTime, "host_ns", -1),
-    (pb.VirtualTime, "mirror_bytes", HUGE),
-]
-CAMERA = [
-    (pb.FrameChunk, "frame_id", HUGE),
-    (pb.FrameChunk, "frame_id", lambda chunk: chunk.frame_id + 2 if chunk.frame_id > 1 else 1),
-    (pb.FrameChunk, "plane", 1),
-    (pb.FrameChunk, "width", 41),
-    (pb.FrameChunk, "height", 2),
-    (pb.FrameChunk, "total", 2**32 - 1),
-    (pb.FrameChunk, "offset", 2**32 - 1),
-    (pb.FrameChunk, "data", b""),
-    (pb.FrameChunk, "first_step", lambda chunk: chunk.first_step + 1),
-    (pb.FrameChunk, "last_step", lambda chunk: chunk.first_step),
-    (pb.FrameChunk, "last_step", HUGE),
-    (pb.FrameChunk, "exposure_offset_ns", 2**32 - 1),
-    (pb.FrameChunk, "exposure_start_ns", HUGE),
-    (pb.FrameChunk, "exposure_end_ns", -HUGE),
-    (pb.TruthChunk, "total", 2**32 - 1),
-    (pb.TruthChunk, "offset", 2**32 - 1),
-    (pb.TruthChunk, "data", lambda chunk: b"\xff" * len(chunk.data)),
-    (pb.ClockReply, "device_send_ns", -HUGE),
-]
+MIRROR: dict[type[Message], dict[str, list[object]]] = {
+    pb.Applied: {
+        "n_steps": [2**32 - 1, 0, 49],
+        "u": [
+            lambda applied: [50.0] * len(applied.u),
+            lambda applied: [*applied.u[1:], float("nan")],
+            lambda applied: [float("inf")] * len(applied.u),
+        ],
+        "first_step": [HUGE, lambda applied: applied.first_step + 1],
+        "block_id": [HUGE, 0], "source": [77], "device_ns": [HUGE],
+    },
+    pb.CommandAck: {
+        "block_id": [HUGE, 0], "code": [77, pb.QUEUE_FULL], "late_steps": [2**32 - 1], "superseded_steps": [51],
+        "queue_end_step": [HUGE],
+    },
+    pb.ClockReply: {"device_receive_ns": [HUGE]},
+    pb.VirtualTime: {
+        "host_ns": [
+            lambda handed: handed.host_ns + 7_400_000_000_000_000_000,
+            lambda handed: handed.host_ns + 1_000_000_000_000, 1, -1,
+        ],
+        "mirror_bytes": [HUGE],
+    },
+}  # fmt: skip
+CAMERA: dict[type[Message], dict[str, list[object]]] = {
+    pb.FrameChunk: {
+        "frame_id": [HUGE, lambda chunk: chunk.frame_id + 2 if chunk.frame_id > 1 else 1],
+        "plane": [1], "width": [41], "height": [2], "total": [2**32 - 1], "offset": [2**32 - 1], "data": [b""],
+        "first_step": [lambda chunk: chunk.first_step + 1], "last_step": [lambda chunk: chunk.first_step, HUGE],
+        "exposure_offset_ns": [2**32 - 1], "exposure_start_ns": [HUGE], "exposure_end_ns": [-HUGE],
+    },
+    pb.TruthChunk: {
+        "total": [2**32 - 1], "offset": [2**32 - 1], "data": [lambda chunk: b"\xff" * len(chunk.data)],
+    },
+    pb.ClockReply: {"device_send_ns": [-HUGE]},
+}  # fmt: skip
 
 
-@pytest.mark.parametrize(("kind", "field", "value"), MIRROR)
+def rows(table: dict[type[Message], dict[str, list[object]]]) -> list[tuple[type[Message], str, object]]:
+    return [(kind, name, value) for kind, fields in table.items() for name, each in fields.items() for value in each]
+
+
+@pytest.mark.parametrize(("kind", "field", "value"), rows(MIRROR))
 def test_a_mirror_that_lies_ends_the_session_with_the_field(
     tmp_path: Path, kind: type[Message], field: str, value: object
 ) -> None:
     lies = {"mirror": changed(kind, says(field, value), 30 if kind is pb.VirtualTime else 3)}
-    assert_caught(tmp_path, lies, rf"the mirror says {kind.__name__}\.{field}.* = .*, expected ")
+    assert_caught(tmp_path, lies, rf"the mirror says {kind.__name__}\.{field}")
 
 
-@pytest.mark.parametrize(("kind", "field", "value"), CAMERA)
+@pytest.mark.parametrize(("kind", "field", "value"), rows(CAMERA))
 def test_a_camera_that_lies_ends_the_session_with_the_field(
     tmp_path: Path, kind: type[Message], field: str, value: object
 ) -> None:
     # The length of the data is what does not fit where the offset is wrong, the last step where the first one is.
     named = {"offset": "data", "first_step": "last_step"}.get(field, field)
-    assert_caught(
-        tmp_path, {"camera": changed(kind, says(field, value), 2)}, rf"{kind.__name__}\.{named} = .*, expected "
-    )
+    assert_caught(tmp_path, {"camera": changed(kind, says(field, value), 2)}, rf"{kind.__name__}\.{named}")
 
 
 @pytest.mark.parametrize(
     ("field", "value"),
     [
-        ("kind", 7),
-        ("model", "\x1b[2J"),
-        ("serial_number", "x" * 5000),
-        ("fast_step_ns", 0),
-        ("next_step", 2**64 - 1),
+        ("kind", 7), ("model", "\x1b[2J"), ("serial_number", "x" * 5000), ("fast_step_ns", 0), ("next_step", 2**64 - 1),
         ("step_zero_ns", -(2**63)),
     ],
-)
+)  # fmt: skip
 def test_an_identity_that_cannot_be(field: str, value: object) -> None:
     with (
         lying_rig(RIG, camera=changed(pb.Identity, says(field, value))) as (camera, _),
@@ -159,33 +139,25 @@ def test_an_identity_that_cannot_be(field: str, value: object) -> None:
 @pytest.mark.parametrize(("field", "value"), [("queue_steps", 401), ("watchdog_s", 60.0), ("dac_bits", 8)])
 def test_a_mirror_of_another_rig_file(tmp_path: Path, field: str, value: object) -> None:
     lies = {"mirror": changed(pb.Identity, says(f"mirror.{field}", value))}
-    assert_caught(
-        tmp_path, lies, rf"does not match the device: mirror\.{field} is .* in the file, {value} on the device"
-    )
+    assert_caught(tmp_path, lies, rf"mirror\.{field} is .* {value} on the device")
 
 
 def test_counts_beyond_the_converter_end_the_session(tmp_path: Path) -> None:
     rig = replace(RIG, sensor=replace(RIG.sensor, bit_depth=12))
     bright = changed(pb.FrameChunk, says("data", lambda chunk: b"\xff\xff" * (len(chunk.data) // 2)))
-    with (
-        lying_rig(rig, camera=bright) as ports,
-        pytest.raises(DeviceError, match="a pixel of frame 1 = 65535, expected"),
-    ):
-        record(rig, *ports, tmp_path / "a.mcap", exposures=2)
+    assert_caught(tmp_path, {"camera": bright}, "65535", rig=rig, exposures=2)
 
 
 def test_a_code_that_nobody_knows_is_a_refusal(tmp_path: Path) -> None:
     lies = {"camera": changed(pb.Ack, says("code", 77))}
-    assert_caught(tmp_path, lies, "the camera refused to start: code 77")
+    assert_caught(tmp_path, lies, "code 77")
 
 
 def test_a_device_that_says_what_the_other_has_to_say_is_refused(tmp_path: Path) -> None:
     def lie(message: Message) -> Message:
         return pb.CommandAck(block_id=1) if isinstance(message, pb.FrameChunk) else message
 
-    assert_caught(
-        tmp_path, {"camera": lie}, "the camera says a message = CommandAck, expected a message that a camera may send"
-    )
+    assert_caught(tmp_path, {"camera": lie}, "CommandAck")
 
 
 def test_a_real_device_cannot_take_over_the_clock(tmp_path: Path) -> None:
@@ -221,10 +193,9 @@ def flood(after: type[Message], begun: threading.Event) -> Lie:
 @pytest.mark.parametrize("real_time", [False, True])
 def test_a_flood_ends_the_session_before_it_fills_the_memory(tmp_path: Path, real_time: bool) -> None:
     lies = {"camera": flood(pb.Ack, threading.Event())}
-    found = "have sent messages of .* MiB without answering, expected at most"
     # By the clock, a machine that is busy may give the silent camera up before so much has come.
     late = "|did not answer|has sent no frame" if real_time else ""
-    assert_caught(tmp_path, lies, found + late, real_time=real_time)
+    assert_caught(tmp_path, lies, "without answering" + late, real_time=real_time)
 
 
 @pytest.mark.slow
