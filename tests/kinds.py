@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TypeVar
+
+from foxglove_schemas_protobuf.Log_pb2 import Log
 
 from aolink.exposure import Exposure, Truth
 from aolink.optics.sensor import Sensor, SpotSensor
+from aolink.recording import topics
 from aolink.recording.reader import Recording
 from aolink.rig import Rig
 
@@ -21,6 +25,11 @@ def must_be(kind: type[Kind], thing: object) -> Kind:
 def messages_of(kind: type[Kind], recording: Recording, topic: str) -> list[Kind]:
     """The messages of a topic, which are of that kind."""
     return [must_be(kind, each.message) for each in recording.messages(topic)]
+
+
+def log_of(path: Path) -> list[str]:
+    """What a session said while it ran, as its recording has it."""
+    return [each.message for each in messages_of(Log, Recording(path), topics.LOG)]
 
 
 def truth_of(exposure: Exposure) -> Truth:

@@ -1,15 +1,19 @@
-"""Small recordings as other software writes them (pages/recording_format.md): few exposures, dark ones, none at all."""
+"""Small recordings as other software writes them (pages/recording_format.md): few exposures, dark ones, none at all; and copies."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
+from google.protobuf.message import Message
 from mcap_protobuf.writer import Writer
 
+from aolink.recording.reader import Recording
 from aolink.recording.schemas_pb2 import ExposureInfo
+from aolink.recording.writer import RecordingWriter
 from aolink.rig import load_rig
 from aolink.simulation.model import simulate
 from aolink.wire.messages_pb2 import Applied, Truth
@@ -64,3 +68,18 @@ def write_small(
                 writer.write_message(topic, message, now, now, sequence)
         writer.finish()
     return path
+
+
+def copied(
+    source: Path, target: Path, change: Callable[[str, Message], list[Message]] = lambda topic, message: [message],
+    **options: Any,
+) -> list[Path]:  # fmt: skip
+    """A copy whose messages went through ``change``; gives its files, of which there are several if it is split."""
+    recording = Recording(source)
+    with RecordingWriter(
+        target, recording.rig, recording.metadata, recording.start_ns, deterministic=True, **options
+    ) as writer:
+        for each in recording.messages():
+            for message in change(each.topic, each.message):
+                writer.write(each.topic, message, each.log_time_ns)
+    return writer.paths

@@ -26,18 +26,14 @@ from aolink.rig import load_rig
 from aolink.wire.messages_pb2 import Truth
 from tests.conftest import EXPOSURES, Session
 from tests.kinds import messages_of
+from tests.recording.small import copied
 
 Run = Callable[..., subprocess.CompletedProcess[str]]
 
 
 def rewritten(source: Path, target: Path, change: Callable[[str, Message], list[Message]]) -> Recording:
     """A copy whose messages went through ``change``."""
-    recording = Recording(source)
-    with RecordingWriter(target, recording.rig, {}, recording.start_ns, deterministic=True) as writer:
-        for each in recording.messages():
-            for message in change(each.topic, each.message):
-                writer.write(each.topic, message, each.log_time_ns)
-    return Recording(target)
+    return Recording(copied(source, target, change)[0])
 
 
 def test_a_recording_is_the_same_as_itself(recorded: Session) -> None:

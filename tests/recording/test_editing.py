@@ -18,19 +18,9 @@ from aolink.recording.reader import Recording
 from aolink.recording.reestimate import write_reestimated
 from aolink.recording.writer import RecordingWriter
 from tests.conftest import EXPOSURES, Session
+from tests.recording.small import copied
 
 Run = Callable[..., subprocess.CompletedProcess[str]]
-
-
-def in_parts(source: Path, target: Path, options: WriteOptions) -> list[Path]:
-    """What `aolink record` writes when it is told to split, from the messages of a recording."""
-    recording = Recording(source)
-    with RecordingWriter(
-        target, recording.rig, recording.metadata, recording.start_ns, deterministic=True, options=options
-    ) as writer:
-        for each in recording.messages():
-            writer.write(each.topic, each.message, each.log_time_ns)
-    return writer.paths
 
 
 @pytest.mark.parametrize("options", [WriteOptions(split_s=0.5), WriteOptions(split_bytes=20_000, compression="zstd")])
@@ -38,7 +28,7 @@ def test_each_part_can_be_read_by_itself_and_all_together_are_the_session(
     recorded: Session, tmp_path: Path, options: WriteOptions
 ) -> None:
     whole = {each.frame_id: each for each in Recording(recorded.path).exposures()}
-    parts = in_parts(recorded.path, tmp_path / "s.mcap", options)
+    parts = copied(recorded.path, tmp_path / "s.mcap", options=options)
     assert len(parts) > 2
     assert parts[0].name == "s-001.mcap"
     seen = []
@@ -85,7 +75,7 @@ def test_sessions_that_are_not_one_are_not_merged(recorded: Session, tmp_path: P
     other = Recording(recorded.path)
     with RecordingWriter(tmp_path / "other.mcap", other.rig, {"session": "another"}, 0, deterministic=True):
         pass
-    with pytest.raises(RecordingError, match="is not of the same session"):
+    with pytest.raises(RecordingError, match="same session"):
         merge([recorded.path, tmp_path / "other.mcap"], tmp_path / "m.mcap")
     assert not (tmp_path / "m.mcap").exists()
     with pytest.raises(RecordingError, match="give two or more"):
@@ -122,7 +112,7 @@ def test_the_editing_commands_say_what_they_did_and_lost(aolink: Run, recorded: 
     assert aolink("copy", recorded.path, "-o", "copy.mcap").returncode == 0
     again = aolink("copy", recorded.path, "-o", "copy.mcap")
     assert again.returncode == 5
-    assert "overwritten" in again.stderr
+    assert "exists" in again.stderr
     assert aolink("compare", recorded.path, "copy.mcap").returncode == 0
     assert aolink("copy", "copy.mcap", "--start", "1", "--end", "2", "-o", "c1.mcap").returncode == 0
     assert aolink("copy", "copy.mcap", "--start", "1.5", "-o", "c2.mcap").returncode == 0

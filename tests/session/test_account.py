@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from foxglove_schemas_protobuf.Log_pb2 import Log
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -22,7 +21,7 @@ from aolink.recording.schemas_pb2 import CommandAnswer
 from aolink.rig import Rig, load_rig, parse_rig
 from aolink.simulation.devices import SimulatedDevices
 from aolink.wire import messages_pb2 as pb
-from tests.kinds import messages_of
+from tests.kinds import log_of, messages_of
 from tests.session.simulated_time import Run, SimulatedTimeHub, run_session
 
 RIG = load_rig("section-vi")
@@ -56,10 +55,6 @@ def check_account(run: Run) -> None:
 def recorded_steps(run: Run, source: pb.Applied.Source) -> set[int]:
     ends = messages_of(pb.Applied, Recording(run.path), topics.APPLIED)
     return {step for m in ends if m.source == source for step in range(m.first_step, m.first_step + m.n_steps)}
-
-
-def log_of(run: Run) -> list[str]:
-    return [each.message for each in messages_of(Log, Recording(run.path), topics.LOG)]
 
 
 def check_live_is_recorded(run: Run) -> None:
@@ -218,7 +213,7 @@ def test_a_dead_mirror_line_ends_the_session_within_twice_the_watchdog(tmp_path:
     hub.at = [(1_300_000_000, hub.cut)]
     run = run_session(hub, RIG, path, 100, progress=lambda _: ended_ns.append(hub.clock_ns))
     assert isinstance(run.error, DeviceError)
-    assert "the mirror has not acknowledged a command for 2.0 s, more than twice its watchdog" in str(run.error)
+    assert "not acknowledged a command for 2.0 s" in str(run.error)
     assert ended_ns[-1] < 1_300_000_000 + 2.1e9 * RIG.mirror.watchdog_s
     check_account(run)
     assert run.report.commands.not_reported > 0
@@ -231,7 +226,7 @@ def test_a_dead_mirror_line_ends_the_session_within_twice_the_watchdog(tmp_path:
     assert (again.error, again.report.ended, again.report.rearmed) == (None, "complete", 1)
     assert again.mirror.identity.mirror.latched
     assert again.report.commands.applied == 600
-    assert any("parked by its watchdog in a session before: re-armed" in text for text in log_of(again))
+    assert any("parked by its watchdog in a session before: re-armed" in text for text in log_of(again.path))
 
 
 @pytest.mark.slow
@@ -247,7 +242,7 @@ def test_a_mirror_line_that_comes_back_in_time(seconds: float, tmp_path: Path) -
     check_live_is_recorded(run)
     latched = seconds > RIG.mirror.watchdog_s
     assert run.report.rearmed == latched
-    assert any("parked by its watchdog in this session: re-armed" in text for text in log_of(run)) == latched
+    assert any("parked by its watchdog in this session: re-armed" in text for text in log_of(run.path)) == latched
     # The gap is in the recording as it was, though no report came while the line was cut.
     parked = recorded_steps(run, pb.Applied.WATCHDOG)
     assert parked == {step for step, (_, source) in hub.truth().items() if source == pb.Applied.WATCHDOG}

@@ -18,12 +18,12 @@ from aolink.recording.facts import recording_facts
 from aolink.recording.mcap_file import WriteOptions
 from aolink.recording.reader import Recording
 from aolink.recording.schemas_pb2 import CommandAnswer
-from aolink.recording.writer import RecordingWriter
 from aolink.rig import Rig, parse_rig
 from aolink.wire import messages_pb2 as pb
 from tests.conftest import Session
 from tests.control.rigs import DRIFT, small_rig
 from tests.kinds import messages_of
+from tests.recording.small import copied
 from tests.session.simulated_time import Run, SimulatedTimeHub, run_session
 
 RIG = small_rig(DRIFT)
@@ -168,15 +168,9 @@ def test_recovering_keeps_the_answers(session: Path, tmp_path: Path) -> None:
 
 
 def test_the_parts_of_a_session_joined_have_each_answer_once(session: Path, tmp_path: Path) -> None:
-    whole = Recording(session)
-    with RecordingWriter(
-        tmp_path / "p.mcap", whole.rig, {"session": "1"}, whole.start_ns, deterministic=True,
-        options=WriteOptions(split_s=0.4),
-    ) as writer:  # fmt: skip
-        for each in whole.messages():
-            writer.write(each.topic, each.message, each.log_time_ns)
-    assert len(writer.paths) > 2
-    merge(writer.paths, tmp_path / "joined.mcap")
+    paths = copied(session, tmp_path / "p.mcap", options=WriteOptions(split_s=0.4))
+    assert len(paths) > 2
+    merge(paths, tmp_path / "joined.mcap")
     assert answers_in(tmp_path / "joined.mcap") == answers_in(session)
 
 
@@ -189,11 +183,11 @@ def test_an_answer_takes_little_room(session: Path) -> None:
 def test_an_answer_of_a_later_aolink_is_no_error(
     session: Path, tmp_path: Path, change: Callable[[Message], None]
 ) -> None:
-    whole = Recording(session)
-    with RecordingWriter(tmp_path / "b.mcap", whole.rig, {}, whole.start_ns, deterministic=True) as writer:
-        for each in whole.messages():
-            if each.topic == topics.ANSWER:
-                change(each.message)
-            writer.write(each.topic, each.message, each.log_time_ns)
+    def changed(topic: str, message: Message) -> list[Message]:
+        if topic == topics.ANSWER:
+            change(message)
+        return [message]
+
+    copied(session, tmp_path / "b.mcap", changed)
     facts = recording_facts(Recording(tmp_path / "b.mcap"))
-    assert sum(facts["commands"]["by_answer"].values()) == whole.counts[topics.ANSWER]
+    assert sum(facts["commands"]["by_answer"].values()) == Recording(session).counts[topics.ANSWER]

@@ -13,10 +13,11 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from foxglove_schemas_protobuf.Log_pb2 import Log
 
 from aolink.errors import DeviceError
 from aolink.recording import topics
+from aolink.recording.account import Commands
+from aolink.recording.facts import recording_facts
 from aolink.recording.reader import Recording
 from aolink.rig import Rig, load_rig
 from aolink.session import Report, record
@@ -24,7 +25,7 @@ from aolink.wire import messages_pb2 as pb
 from aolink.wire.packet import MessageDecoder, PacketDecoder
 from aolink.wire.port import SerialPort
 from tests.commands import simulated_rig
-from tests.kinds import messages_of
+from tests.kinds import log_of, messages_of
 
 
 class Forwarder:
@@ -125,15 +126,13 @@ def test_a_dead_line_ends_the_session_and_the_mirror_stays_parked_until_it_is_to
         line.mend()
         listed = aolink("devices", line.port).stdout
         again, _ = recorded(rig, camera, line, tmp_path / "b.mcap", 3)
-    assert "the mirror has not acknowledged a command for" in error
-    assert "more than twice its watchdog" in error
+    assert "not acknowledged" in error
     assert "parked by its watchdog" in listed
     recording = Recording(tmp_path / "a.mcap")
     assert recording.complete
-    ends = {name: int(recording.metadata[f"steps_{name}"]) for name in
-            ("commanded", "applied", "superseded", "late", "refused", "not_reported")}  # fmt: skip
-    assert ends.pop("commanded") == sum(ends.values())
-    assert ends["not_reported"] > 0
+    commands = Commands.of(recording_facts(recording)["commands"])
+    assert commands.commanded == commands.ended
+    assert commands.not_reported > 0
     assert again is not None
     assert (again.ended, again.rearmed) == ("complete", 1)
 
@@ -150,5 +149,4 @@ def test_a_line_that_comes_back_is_told_to_go_on_and_the_gap_is_recorded(rig_fil
     recording = Recording(tmp_path / "a.mcap")
     held = messages_of(pb.Applied, recording, topics.APPLIED)
     assert any(m.source == pb.Applied.WATCHDOG for m in held)
-    log = [each.message for each in messages_of(Log, recording, topics.LOG)]
-    assert any("parked by its watchdog in this session: re-armed" in text for text in log)
+    assert any("re-armed" in text for text in log_of(recording.path))

@@ -7,23 +7,21 @@ import subprocess
 from pathlib import Path
 
 import pytest
-from foxglove_schemas_protobuf.Log_pb2 import Log
 from google.protobuf.message import Message
 from hypothesis import given
 from hypothesis import strategies as st
 
 from aolink.devices.frame_count import FrameCount
 from aolink.errors import DeviceError
-from aolink.recording import topics
 from aolink.recording.reader import Recording
 from aolink.rig import load_rig
 from aolink.session import record
 from aolink.wire import messages_pb2 as pb
 from tests.control.rigs import DRIFT, small_rig
-from tests.kinds import messages_of, truth_of
+from tests.kinds import log_of, truth_of
 from tests.needs import missing
 from tests.session.conftest import DEVICE, SANITISED, served_by
-from tests.session.simulated_time import Run, SimulatedTimeHub, run_session
+from tests.session.simulated_time import SimulatedTimeHub, run_session
 
 RIG = small_rig(DRIFT)
 
@@ -47,10 +45,6 @@ def counting(hub: SimulatedTimeHub, first: int, bits: int, lost: range = range(0
     hub.change("camera", wrapped)
 
 
-def log_of(run: Run) -> list[str]:
-    return [each.message for each in messages_of(Log, Recording(run.path), topics.LOG)]
-
-
 @pytest.mark.parametrize(("bits", "first"), [(8, 250), (16, 65_530), (16, 65_535), (32, 2**32 - 4), (24, 0), (16, 1)])
 def test_frames_are_counted_on_where_the_counter_wraps(tmp_path: Path, bits: int, first: int) -> None:
     hub = SimulatedTimeHub(RIG)
@@ -61,7 +55,7 @@ def test_frames_are_counted_on_where_the_counter_wraps(tmp_path: Path, bits: int
     assert [each.frame_id for each in exposures] == list(range(first, first + 12))
     assert all(truth_of(each).path.any() for each in exposures)
     said = f"camera: its counter of frames, of {bits} bits, has begun anew with 0 after {2**bits - 1}: frames are"
-    assert any(text.startswith(said) for text in log_of(run)) == (0 < 2**bits - first < 12)
+    assert any(text.startswith(said) for text in log_of(run.path)) == (0 < 2**bits - first < 12)
 
 
 def test_it_wraps_while_frames_are_lost(tmp_path: Path) -> None:

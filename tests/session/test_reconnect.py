@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from foxglove_schemas_protobuf.Log_pb2 import Log
 from google.protobuf.message import Message
 
 import aolink
@@ -19,7 +18,7 @@ from aolink.rig import load_rig
 from aolink.session import Report, record
 from aolink.wire import messages_pb2 as pb
 from tests.commands import simulated_rig
-from tests.kinds import messages_of
+from tests.kinds import log_of, messages_of
 from tests.session.conftest import Ports
 from tests.session.pulled_line import PulledLine, pulled_line
 
@@ -55,10 +54,6 @@ def pulling(*lines: PulledLine, after: int) -> Callable[[int], None]:
     return progress
 
 
-def logged(path: Path) -> str:
-    return "\n".join(each.message for each in messages_of(Log, Recording(path), topics.LOG))
-
-
 def check_whole(path: Path, report: Report, exposures: int) -> None:
     """Every step and every exposure of a session is accounted for, and estimates are the same offline."""
     assert report.ended == "complete"
@@ -88,7 +83,7 @@ def test_a_mirror_that_is_pulled_out_and_plugged_in_goes_on(serve: Ports, tmp_pa
     assert any(m.source == pb.Applied.WATCHDOG for m in held)
     assert all(each.inputs_assumed == 0 for each in Recording(path).exposures())
     for text in ("the port of the mirror has vanished", "the mirror has returned", "re-armed", "go on from fast step"):
-        assert text in logged(path)
+        assert text in "\n".join(log_of(path))
 
 
 @pytest.mark.slow
