@@ -1,4 +1,4 @@
-"""Small recordings as other software writes them (pages/recording_format.md): few exposures, dark ones, none at all; and copies."""
+"""Small recordings as other software writes them (pages/recording_format.md), and copies with changes."""
 
 from __future__ import annotations
 

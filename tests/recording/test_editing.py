@@ -160,7 +160,7 @@ def test_a_command_that_fails_leaves_the_target_as_it_was(aolink: Run, recorded:
 
 
 def test_parts_and_merged_files_say_what_they_are(recorded: Session, tmp_path: Path) -> None:
-    parts = in_parts(recorded.path, tmp_path / "s.mcap", WriteOptions(split_s=0.9))
+    parts = copied(recorded.path, tmp_path / "s.mcap", options=WriteOptions(split_s=0.9))
     whole = Recording(recorded.path)
     part = Recording(cut(recorded.path, tmp_path / "cut.mcap", 0.0, 1.0).path)
     assert "exposures" in whole.metadata

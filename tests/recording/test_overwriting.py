@@ -80,7 +80,7 @@ def test_the_old_recording_stays_until_the_first_exposure(recorded: Session, old
     writing.write(topics.EXPOSURE)
     assert old.read_bytes() == b"precious"
     assert writing.writer.paths == []
-    with pytest.raises(RecordingError, match="being written"):
+    with pytest.raises(RecordingError, match="another command"):
         create(old, overwrite=True, error=RecordingError)
     writing.write(topics.IMAGE, lambda: old.read_bytes() != b"precious")
     # The exposure is in the file already: whatever happens now, there is something in the place of the old one.
@@ -104,7 +104,7 @@ def test_without_an_exposure_the_old_recording_is_as_it_was(
     try:
         if how == "full":
             resource.setrlimit(resource.RLIMIT_FSIZE, (100, before[1]))
-            with pytest.raises(RecordingError, match=r"would be larger[^;]*$"):
+            with pytest.raises(RecordingError, match=r"larger[^;]*$"):
                 writing.writer.close({"ended": "x" * 1000})
         else:
             writing.writer.close()
@@ -137,7 +137,7 @@ def test_what_another_program_has_put_there_meanwhile_is_not_replaced(
     else:
         exchanged(old if what == "old" else aside, b"theirs")
     writing.write(topics.IMAGE)
-    with pytest.raises(RecordingError, match=r"another program|symbolic link|a folder"):
+    with pytest.raises(RecordingError, match=r"another program|symbolic link|folder"):
         writing.write_on()
     there = old if what != "new" else aside
     assert there.is_symlink() or there.is_dir() or there.read_bytes() == b"theirs"
@@ -198,29 +198,18 @@ def test_parts_go_round_what_is_in_their_way(recorded: Session, tmp_path: Path) 
 
 def test_a_first_part_that_is_another_file_is_refused(recorded: Session, tmp_path: Path) -> None:
     shutil.copy(recorded.path, tmp_path / "s-001.mcap")
-    with pytest.raises(RecordingError, match="no part of"):
+    with pytest.raises(RecordingError, match="no part"):
         Writing(recorded.path, tmp_path / "s.mcap", PARTS)
     assert (tmp_path / "s-001.mcap").read_bytes() == recorded.path.read_bytes()
 
 
-def removed(path: Path) -> None:
-    path.unlink()
-
-
-def renamed(path: Path) -> None:
-    path.rename(path.with_name("b.mcap"))
-
-
-def replaced(path: Path) -> None:
-    exchanged(path, b"theirs")
-
-
-def folder_renamed(path: Path) -> None:
-    path.parent.rename(path.parent.with_name("other"))
-
-
-def folder_removed(path: Path) -> None:
-    shutil.rmtree(path.parent)
+HAPPENS: dict[str, Callable[[Path], object]] = {
+    "removed": Path.unlink,
+    "renamed": lambda path: path.rename(path.with_name("b.mcap")),
+    "replaced": lambda path: exchanged(path, b"theirs"),
+    "folder renamed": lambda path: path.parent.rename(path.parent.with_name("other")),
+    "folder removed": lambda path: shutil.rmtree(path.parent),
+}
 
 
 @pytest.fixture
@@ -234,32 +223,31 @@ def seconds(monkeypatch: pytest.MonkeyPatch) -> list[float]:
 
 
 @pytest.mark.parametrize("at_the_end", [False, True])
-@pytest.mark.parametrize("what", [removed, renamed, replaced, folder_renamed, folder_removed])
+@pytest.mark.parametrize("what", HAPPENS)
 def test_a_file_whose_name_is_no_longer_its_own_ends_the_session_and_is_kept(
-    recorded: Session, tmp_path: Path, seconds: list[float], what: Callable[[Path], None], at_the_end: bool
+    recorded: Session, tmp_path: Path, seconds: list[float], what: str, at_the_end: bool
 ) -> None:
     (folder := tmp_path / "folder").mkdir()
     writing = Writing(recorded.path, folder / "a.mcap")
     writing.write()
-    what(folder / "a.mcap")
+    HAPPENS[what](folder / "a.mcap")
     seconds.append(0.0 if at_the_end else 2.0)
     if not at_the_end:
-        with pytest.raises(RecordingError, match="removed, renamed or replaced"):
+        with pytest.raises(RecordingError, match="renamed"):
             writing.write_on()
     with pytest.raises(RecordingError) as caught:
         writing.writer.close({"ended": "complete"})
     said = str(caught.value)
-    if what is folder_removed:
+    if what == "folder removed":
         assert "is lost" in said
         return
-    place = Path(
-        said.partition("saved as " if what in (removed, replaced) else "the recording is ")[2].split(" now")[0]
-    )
+    before = "saved as " if what in ("removed", "replaced") else "the recording is "
+    place = Path(said.partition(before)[2].split(" now")[0])
     found = Recording(place, check=True)
     assert found.complete
     assert found.metadata["ended"] == "complete"
     assert len(list(found)) == EXPOSURES
-    if what is replaced:
+    if what == "replaced":
         assert (folder / "a.mcap").read_bytes() == b"theirs"
 
 

@@ -241,7 +241,7 @@ def test_a_chunk_that_would_fill_the_memory_is_refused(tmp_path: Path, compressi
             file.write(builder.end())
             writer.finish()
         tracemalloc.start()
-        with pytest.raises(RecordingError, match="holds no rig file"):
+        with pytest.raises(RecordingError, match="no rig file"):
             Recording(path)
         peak = tracemalloc.get_traced_memory()[1]
         tracemalloc.stop()
@@ -254,7 +254,7 @@ def test_a_file_without_text_where_the_rig_should_be(tmp_path: Path) -> None:
         writer.start()
         writer.add_attachment(0, 0, "rig.toml", "application/toml", b"\xff\xfe")
         writer.finish()
-    with pytest.raises(RecordingError, match="not valid TOML"):
+    with pytest.raises(RecordingError, match="TOML"):
         Recording(path)
 
 
@@ -290,10 +290,10 @@ def test_a_disk_that_does_not_answer_is_an_error_when_the_queue_is_full(
         for k in range(1_000_000):
             writer.write(topics.LOG, Log(message=os.urandom(50_000).hex()), k * 200_000_000)
 
-    with pytest.raises(RecordingError, match="is too slow for this session"):
+    with pytest.raises(RecordingError, match="slow"):
         record_much()
     monkeypatch.setattr("aolink.recording.writer._END_S", 0.5)
-    with pytest.raises(RecordingError, match="does not answer"):
+    with pytest.raises(RecordingError, match="answer"):
         writer.close()
     assert writer.held_up_s > 0.5
     os.close(reader)  # lets the thread go

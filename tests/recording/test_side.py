@@ -107,11 +107,11 @@ def test_what_does_not_belong_together_is_one_clear_error(aolink: Run, tmp_path:
         source = write_small(tmp_path / f"{name}.mcap", exposures)
         estimate_file(source, tmp_path / f"{name}.o3.mcap")
     for arguments, expected in (
-        (("view", "a.mcap", "b.o3.mcap", "-o", "x.rrd"), "does not belong to a.mcap"),
-        (("view", "a.mcap", "b.mcap", "-o", "x.rrd"), "no side file"),
-        (("view", "a.o3.mcap", "-o", "x.rrd"), "is a side file"),
-        (("estimate", "a.o3.mcap"), "is a side file"),
-        (("compare", "a.mcap", "b.o3.mcap"), "does not belong to a.mcap"),
+        (("view", "a.mcap", "b.o3.mcap", "-o", "x.rrd"), "b.o3.mcap does not belong to a.mcap: its estimates are"),
+        (("view", "a.mcap", "b.mcap", "-o", "x.rrd"), "b.mcap is a recording of its own and no side file"),
+        (("view", "a.o3.mcap", "-o", "x.rrd"), "a.o3.mcap is a side file with the estimates of a.mcap alone"),
+        (("estimate", "a.o3.mcap"), "a.o3.mcap is a side file with the estimates of a.mcap alone"),
+        (("compare", "a.mcap", "b.o3.mcap"), "b.o3.mcap does not belong to a.mcap"),
     ):
         result = aolink(*arguments)
         assert result.returncode in (2, 5), arguments

@@ -92,7 +92,9 @@ class PulledLine:
         the line is plugged in again.
     """
 
-    def __init__(self, device_port: str, link: Path | None, back: Callable[[Message], bool]) -> None:
+    def __init__(
+        self, device_port: str, link: Path | None, back: Callable[[Message], bool] = lambda message: False
+    ) -> None:
         self._end: _Terminal | _Socket = _Terminal(link) if link else _Socket()
         self.port = self._end.port
         self.device_port = device_port
@@ -114,6 +116,10 @@ class PulledLine:
         self._over.set()
         self._thread.join()
 
+    def to_device(self, data: bytes) -> bytes:
+        """What the device gets of what the host has sent."""
+        return data
+
     def _run(self) -> None:
         while not self._over.is_set():
             device = SerialPort(self.device_port)
@@ -132,7 +138,7 @@ class PulledLine:
             ready, _, _ = select.select([device.fileno(), *([self._end] if in_hand else [])], [], [], 0.02)
             if self._end in ready:
                 with contextlib.suppress(OSError):
-                    device.write(self._end.read())
+                    device.write(self.to_device(self._end.read()))
             if device.fileno() not in ready:
                 continue
             data = device.read_some()

@@ -300,10 +300,7 @@ def test_the_watchdog_parks_the_mirror_while_commands_are_queued(tmp_path: Path)
     text = load_rig("section-vi").toml.replace("block_steps = 50", "queue_steps = 5000\nwatchdog_s = 0.1")
     (tmp_path / "rig.toml").write_text(text)
     rig = load_rig(tmp_path / "rig.toml")
-    with (
-        simulated_rig(tmp_path / "rig.toml", "--real-time") as ports,
-        open_native(rig, *ports) as (hub, _, mirror),
-    ):
+    with simulated_rig(tmp_path / "rig.toml", "--real-time") as ports, open_native(rig, *ports) as (hub, _, mirror):
         for k in range(0, 4000, 50):
             mirror.send_block(mirror.identity.next_step + 100 + k, np.full((50, 1), 0.01), 0, hub.now_ns())
         events: list[str] = []

@@ -284,10 +284,7 @@ def test_a_controller_that_does_not_pay_is_left_and_the_recording_says_so(tmp_pa
 
 @pytest.mark.parametrize(
     ("controller", "rig", "message"),
-    [
-        ("pid", small_rig(), "'pid'"),
-        ("integrator", small_rig(control="gain = 4.0"), "unstable"),
-    ],
+    [("pid", small_rig(), "'pid'"), ("integrator", small_rig(control="gain = 4.0"), "unstable")],
 )
 def test_a_loop_that_cannot_be_closed_is_refused_before_anything_is_opened(
     tmp_path: Path, controller: str, rig: Rig, message: str

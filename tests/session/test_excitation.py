@@ -122,10 +122,7 @@ def test_a_table_of_inputs_is_played_row_by_row_and_then_the_safe_input(tmp_path
     assert (found.exposures, found.text) == (2, "file u.npy")
 
 
-@pytest.mark.parametrize(
-    ("table", "why"),
-    [(np.zeros((5, 2)), "shape"), (np.full((5, 1), "x"), "table")],
-)
+@pytest.mark.parametrize(("table", "why"), [(np.zeros((5, 2)), "shape"), (np.full((5, 1), "x"), "table")])
 def test_a_file_that_is_no_table_of_inputs_is_refused(tmp_path: Path, table: np.ndarray, why: str) -> None:
     np.save(tmp_path / "u.npy", table)
     with pytest.raises(RigError, match=why):

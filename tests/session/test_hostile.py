@@ -46,10 +46,7 @@ def assert_caught(
     tmp_path: Path, lies: dict[str, Lie], pattern: str, *, rig: Rig = RIG, exposures: int = 6, real_time: bool = False,
 ) -> None:  # fmt: skip
     path = tmp_path / "a.mcap"
-    with (
-        lying_rig(rig, **lies, real_time=real_time) as ports,
-        pytest.raises(DeviceError, match=pattern) as caught,
-    ):
+    with lying_rig(rig, **lies, real_time=real_time) as ports, pytest.raises(DeviceError, match=pattern) as caught:
         record(rig, *ports, path, exposures=exposures)
     assert "\n" not in str(caught.value)
     if path.exists():

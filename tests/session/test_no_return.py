@@ -34,8 +34,8 @@ def ports() -> Iterator[tuple[str, str]]:
 @pytest.mark.parametrize(
     ("seed", "why"),
     [
-        ("9", "another device has returned on the mirror's port: its serial_number is"),
-        ("1", "the mirror has returned at fast step .*: it was restarted, and counts its steps anew"),
+        ("9", "serial_number"),
+        ("1", "restarted"),
     ],
 )
 def test_another_device_on_the_port_ends_the_session(
@@ -62,7 +62,7 @@ def test_a_port_that_does_not_return_ends_the_session_with_what_came(ports: tupl
     path, (camera, mirror) = tmp_path / "a.mcap", ports
     with (
         pulled_line(camera, tmp_path / "camera") as line,
-        pytest.raises(PortError, match=r"did not return within 0\.5 s: there is no port .*are saved in"),
+        pytest.raises(PortError, match="did not return.*saved"),
     ):
         record(RIG, line.port, mirror, path, reconnect_s=0.5, progress=pulling(line, after=2))
     recording = Recording(path)
@@ -73,10 +73,7 @@ def test_a_port_that_does_not_return_ends_the_session_with_what_came(ports: tupl
 
 def test_without_the_option_a_port_that_vanishes_ends_the_session(ports: tuple[str, str], tmp_path: Path) -> None:
     path, (camera, mirror) = tmp_path / "a.mcap", ports
-    with (
-        pulled_line(mirror, tmp_path / "mirror") as line,
-        pytest.raises(PortError, match="is the device still there"),
-    ):
+    with pulled_line(mirror, tmp_path / "mirror") as line, pytest.raises(PortError, match="still there"):
         record(RIG, camera, line.port, path, progress=pulling(line, after=2))
     assert Recording(path).complete
 
@@ -96,7 +93,7 @@ def test_a_session_is_interrupted_while_a_port_is_gone(ports: tuple[str, str], t
             RIG, camera, line.port, path, reconnect_s=60, progress=pulling(line, after=2), stop=parked.is_set
         )
     assert report.ended == "interrupted"
-    assert any("is the device still there" in warning for warning in report.warnings)
+    assert any("still there" in warning for warning in report.warnings)
     assert Recording(path).complete
 
 
@@ -119,7 +116,7 @@ def test_a_rig_whose_ports_vanish_by_its_rate(aolink: Run) -> None:
 def test_virtual_time_has_no_ports_that_vanish(aolink: Run) -> None:
     rig = aolink("sim", "section-vi", "--fault", "vanish=0.01")
     assert rig.returncode == RigError.exit_code
-    assert "ports vanish in real time only: add --real-time" in rig.stderr
+    assert "--real-time" in rig.stderr
     with simulated_rig("section-vi") as (camera, mirror):
         found = aolink(
             "record", "--camera", camera, "--mirror", mirror, "--rig", "section-vi", "--reconnect", "5", "-o", "a.mcap"

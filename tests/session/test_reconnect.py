@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -126,31 +127,37 @@ def test_both_ports_vanish_and_return_on_tcp(tmp_path: Path) -> None:
     assert report.frames_lost > 2
 
 
+SLEW = 0.05
+
+
+@contextmanager
+def pulled_with_a_slew_limit(folder: Path) -> Iterator[tuple[str, PulledLine]]:
+    """The camera's port of a rig whose mirror has a slew limit, and the line to its mirror."""
+    (folder / "rig.toml").write_text(RIG.toml.replace("dac_bits = 16", f"dac_bits = 16\nslew_max_per_s = {SLEW}"))
+    with simulated_rig(folder / "rig.toml", "--real-time") as (camera, mirror):
+        with pulled_line(mirror, folder / "mirror", once_latched) as line:
+            yield camera, line
+
+
 @pytest.mark.slow
 def test_with_a_slew_limit_the_mirror_goes_slowly_from_the_safe_input_to_what_is_commanded(tmp_path: Path) -> None:
-    path, slew = tmp_path / "a.mcap", 0.05
-    (tmp_path / "rig.toml").write_text(RIG.toml.replace("dac_bits = 16", f"dac_bits = 16\nslew_max_per_s = {slew}"))
-    rig = load_rig(tmp_path / "rig.toml")
+    path = tmp_path / "a.mcap"
 
     def inputs(first_step: int, n_steps: int) -> np.ndarray:
         """A ramp to 0.01, and there it stays."""
         return np.asarray(np.minimum(np.arange(first_step, first_step + n_steps) * 4e-5, 0.01)[:, None])
 
-    with (
-        simulated_rig(tmp_path / "rig.toml", "--real-time") as (camera, mirror),
-        pulled_line(mirror, tmp_path / "mirror", once_latched) as line,
-    ):
+    with pulled_with_a_slew_limit(tmp_path) as (camera, line):
         report = record(
-            rig, camera, line.port, path, estimators=["o3"], exposures=11, inputs=inputs, reconnect_s=20,
-            progress=pulling(line, after=3),
+            load_rig(tmp_path / "rig.toml"), camera, line.port, path, estimators=["o3"], exposures=11, inputs=inputs,
+            reconnect_s=20, progress=pulling(line, after=3),
         )  # fmt: skip
     check_whole(path, report, 11)
     assert report.ports_vanished == 1
     sent = messages_of(pb.CommandBlock, Recording(path), topics.COMMAND)
     steps = np.array([(each.first_step + k, u) for each in sent for k, u in enumerate(each.u)])
     jump = int(np.argmax(np.diff(steps[:, 0])))
-    after = steps[jump + 1 :, 1]
-    most = slew * rig.timing.fast_step_s
+    after, most = steps[jump + 1 :, 1], SLEW * RIG.timing.fast_step_s
     assert 0 < after[0] <= 1.001 * most
     assert np.abs(np.diff(after)).max() <= 1.001 * most
     np.testing.assert_allclose(np.diff(after)[after[1:] < 0.01], most)
@@ -158,18 +165,13 @@ def test_with_a_slew_limit_the_mirror_goes_slowly_from_the_safe_input_to_what_is
 
 @pytest.mark.slow
 def test_a_closed_loop_with_a_slew_limit_goes_on_after_a_gap(tmp_path: Path) -> None:
-    path, slew = tmp_path / "a.mcap", 0.05
-    (tmp_path / "rig.toml").write_text(RIG.toml.replace("dac_bits = 16", f"dac_bits = 16\nslew_max_per_s = {slew}"))
-    rig = load_rig(tmp_path / "rig.toml")
-    with (
-        simulated_rig(tmp_path / "rig.toml", "--real-time") as (camera, mirror),
-        pulled_line(mirror, tmp_path / "mirror", once_latched) as line,
-    ):
+    path = tmp_path / "a.mcap"
+    with pulled_with_a_slew_limit(tmp_path) as (camera, line):
         report = record(
-            rig, camera, line.port, path, estimators=["o3"], exposures=11, control="integrator", reconnect_s=20,
-            progress=pulling(line, after=3),
+            load_rig(tmp_path / "rig.toml"), camera, line.port, path, estimators=["o3"], exposures=11,
+            control="integrator", reconnect_s=20, progress=pulling(line, after=3),
         )  # fmt: skip
     check_whole(path, report, 11)
     assert report.ports_vanished == 1
     for block in messages_of(pb.CommandBlock, Recording(path), topics.COMMAND):
-        assert np.abs(np.diff(block.u)).max(initial=0.0) <= 1.001 * slew * rig.timing.fast_step_s
+        assert np.abs(np.diff(block.u)).max(initial=0.0) <= 1.001 * SLEW * RIG.timing.fast_step_s
