@@ -11,6 +11,7 @@ import threading
 import tty
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 from google.protobuf.message import Message
 
@@ -152,10 +153,8 @@ class PulledLine:
 
 
 @contextlib.contextmanager
-def pulled_line(
-    device_port: str, link: Path | None, back: Callable[[Message], bool] = lambda message: False
-) -> Iterator[PulledLine]:
-    line = PulledLine(device_port, link, back)
+def pulled_line(*arguments: Any) -> Iterator[PulledLine]:
+    line = PulledLine(*arguments)
     try:
         yield line
     finally:

@@ -32,7 +32,7 @@ from tests.session.test_beside import children
 RIG = parse_rig(small_rig(DRIFT).toml.replace("exposure_steps = 40", "exposure_steps = 20"))
 LOSSY = parse_rig(f"{RIG.toml}\n[simulation.faults]\npacket_loss_rate = 0.25\ncommand_loss_rate = 0.25\n")
 BOUNDED = {
-    "report.latencies": 10_000, "delay_ms": 10_000, "_gate._sent": 4096, "_effective": 4096, "_answers._open": 4096,
+    "report.latencies": 10_000, "delay_ms": 10_000, "_gate._sent": 4096,
     "_flights": 64 * 6, "_skipped._rows": 10_000, "loop._sent": 1000, "loop._held": 1000, "loop._limited": 1000,
 }  # fmt: skip
 """What grows for a while, by the end of its name, and up to how many items."""

@@ -62,7 +62,7 @@ def test_a_port_that_does_not_return_ends_the_session_with_what_came(ports: tupl
     path, (camera, mirror) = tmp_path / "a.mcap", ports
     with (
         pulled_line(camera, tmp_path / "camera") as line,
-        pytest.raises(PortError, match="did not return.*saved"),
+        pytest.raises(PortError, match=r"did not return.*saved"),
     ):
         record(RIG, line.port, mirror, path, reconnect_s=0.5, progress=pulling(line, after=2))
     recording = Recording(path)

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 import aolink
+from aolink.devices.discovery import identify_port
 from aolink.recording.reader import Recording
 from aolink.recording.reestimate import first_difference, reestimate
 from aolink.rig import load_rig
@@ -138,5 +139,6 @@ def test_a_silent_host_leaves_the_mirror_latched_and_the_next_session_rearms_it(
             time.sleep(2 * RIG.mirror.watchdog_s)  # the fault itself: nothing is sent
         with open_native(RIG, *ports) as (_, _, mirror):
             assert (mirror.identity.mirror.parked, mirror.identity.mirror.latched) == (True, True)
+        assert identify_port(ports[1]).geometry.endswith("parked by its watchdog")
         report = record(RIG, *ports, tmp_path / "a.mcap", exposures=3)
     assert (report.ended, report.exposures, report.commands.applied) == ("complete", 3, 600)

@@ -134,9 +134,11 @@ SLEW = 0.05
 def pulled_with_a_slew_limit(folder: Path) -> Iterator[tuple[str, PulledLine]]:
     """The camera's port of a rig whose mirror has a slew limit, and the line to its mirror."""
     (folder / "rig.toml").write_text(RIG.toml.replace("dac_bits = 16", f"dac_bits = 16\nslew_max_per_s = {SLEW}"))
-    with simulated_rig(folder / "rig.toml", "--real-time") as (camera, mirror):
-        with pulled_line(mirror, folder / "mirror", once_latched) as line:
-            yield camera, line
+    with (
+        simulated_rig(folder / "rig.toml", "--real-time") as (camera, mirror),
+        pulled_line(mirror, folder / "mirror", once_latched) as line,
+    ):
+        yield camera, line
 
 
 @pytest.mark.slow
