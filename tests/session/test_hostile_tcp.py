@@ -29,7 +29,7 @@ def test_a_device_that_lies_ends_the_session_with_the_field(tmp_path: Path, part
         named = {"offset": "data", "first_step": "last_step"}.get(field, field) if line == "camera" else field
         (folder := tmp_path / str(number)).mkdir()
         assert_caught(
-            folder, {line: changed(kind, says(field, value), 2)}, rf"{kind.__name__}\.{named}.* = .*, expected ",
+            folder, {line: changed(kind, says(field, value), 2)}, rf"{kind.__name__}\.{named}",
             rig=RIG, exposures=100, real_time=True, tcp=True,
         )  # fmt: skip
 
