@@ -19,7 +19,7 @@ from aolink.recording import topics
 from aolink.recording.compare import compare
 from aolink.recording.facts import recording_facts
 from aolink.recording.reader import Recording
-from aolink.recording.reestimate import first_difference, reestimate, scored_and_compared, write_reestimated
+from aolink.recording.reestimate import first_difference, reestimate, scored_anew, write_reestimated
 from aolink.rig import load_rig, parse_rig
 from aolink.session import record
 from tests.commands import simulated_rig
