@@ -88,15 +88,6 @@ def processes(count: int) -> Iterator[ProcessPoolExecutor]:
                 os.environ[name] = value
 
 
-def end_with_parent() -> None:
-    """Make this process, which multiprocessing has started, end in good order on SIGTERM or when its parent is gone.
-
-    The standard library gives each child one end of a pipe that closes when the parent ends, however that comes about.
-    """
-    signal.signal(signal.SIGTERM, _exit)
-    _begin_to_watch()
-
-
 def end_with(parent: int) -> None:
     """Make this process end at once when the process ``parent``, which has started it, is gone, however that ends.
 

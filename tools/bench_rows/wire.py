@@ -27,7 +27,6 @@ from aolink.devices.clock import (
 )
 from aolink.estimation import Driver
 from aolink.jobs.demo import simulated_rig
-from aolink.numerics.workers import end_with_parent
 from aolink.polling import wait_readable
 from aolink.recording.reader import Recording
 from aolink.rig import load_rig
@@ -79,7 +78,6 @@ def link_throughput(effort: Effort) -> Row:
         return elapsed
 
     def write_all(descriptor: int, data: bytes) -> None:
-        end_with_parent()  # no process reads from it after that one is killed
         view = memoryview(data)
         while view:
             view = view[os.write(descriptor, view[:65536]) :]
