@@ -220,6 +220,7 @@ def record(
                 _make_safe(loop)
                 if isinstance(error, ControlError):
                     error.args = (f"{error}; the mirror is parked",)
+                    report.ended = f"error: {error}"
             except Exception as unsafe:  # also one of a driver
                 report.warnings.append(str(unsafe))
             with contextlib.suppress(Exception):

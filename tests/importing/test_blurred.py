@@ -90,6 +90,7 @@ def test_a_hot_pixel_is_no_spot() -> None:
     assert len(found.corners) == 1
 
 
+@pytest.mark.slow
 def test_the_kernel_is_found_beside_shot_noise() -> None:
     film = draw(26, motion="sinusoid")
     found = find_spots(film.film, film.settings, FRAMES)

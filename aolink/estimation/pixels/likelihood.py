@@ -189,7 +189,8 @@ def _resting_noise(sensor: BaseSensor, variance: float, order: int) -> float:
     positions = line.pixel_size * np.linspace(0, 1, _POINTS, endpoint=False)
     masses = [each / line.pixel_size for each in pixel_masses(variance, line.edges, positions, order)]
     noise = effective_noise_density(line) / line.pixel_size + shot_gain(line) * np.maximum(masses[0], 0.0)
-    return float(1 / (masses[order] ** 2 / noise).sum(axis=1).mean())
+    information = float((masses[order] ** 2 / noise).sum(axis=1).mean())
+    return 1 / information if information else math.inf
 
 
 class PixelView:
