@@ -29,11 +29,6 @@ def cholesky(covariance: FloatArray) -> FloatArray:
     return np.asarray(np.linalg.cholesky(lifted))
 
 
-def lower_inverse(root: FloatArray) -> FloatArray:
-    """Inverse of lower triangular matrices."""
-    return np.asarray(np.linalg.solve(root, np.broadcast_to(np.eye(root.shape[-1]), root.shape)))
-
-
 def in_correlation_steps(covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Covariances as standard deviations (..., n) in single precision and multiples of `CORRELATION_STEP` between them:
     whole numbers of steps (..., n, n), of which the upper triangle mirrors the lower.

@@ -62,33 +62,13 @@ def cholesky_into(a: FloatArray, root: FloatArray) -> None:
         largest = max(largest, a[i, i])
     for j in range(n):
         root[j, j] = a[j, j] * (1.0 + JITTER) + 1e-14 * largest + 1e-300
-    _factor(a, root, 0.0)
-
-
-@compiled
-def floored_cholesky_into(a: FloatArray, root: FloatArray) -> None:
-    """As `cholesky_into`, without its change to the diagonal: squared pivots have a floor of 1e-15 of the variance.
-
-    Sums that depend on each other leave nothing but rounding there.
-    """
-    for j in range(len(a)):
-        root[j, j] = a[j, j]
-    _factor(a, root, 1e-15)
-
-
-@inlined
-def _factor(a: FloatArray, root: FloatArray, least: float) -> None:
-    """Cholesky's factorisation of ``a`` with the diagonal that ``root`` holds; ``least`` is a squared pivot's floor."""
-    n = len(a)
     for j in range(n):
         for i in range(j):
             root[i, j] = 0.0
         total = root[j, j]
         for k in range(j):
             total -= root[j, k] * root[j, k]
-        if not total > least * a[j, j]:
-            total = least * a[j, j] if least > 0.0 else math.nan
-        root[j, j] = pivot = math.sqrt(total)
+        root[j, j] = pivot = math.sqrt(total) if total > 0.0 else math.nan
         for i in range(j + 1, n):
             total = a[i, j]
             for k in range(j):
