@@ -250,7 +250,7 @@ def remove_unfinished(target: Path) -> None:
 
 
 def why_not(problem: OSError) -> str:
-    """The reason why a file cannot be written, in words."""
+    """The reason why a file cannot be read or written, in words."""
     if problem.errno == errno.EFBIG:
         return "it would be larger than the disk or a limit (ulimit -f) lets a file be"
     full = problem.errno in (errno.ENOSPC, errno.EDQUOT)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Collection, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -105,8 +106,10 @@ class RecordedMessages:
     def digest(self) -> str:
         """The name of the recording in side files: SHA-256 of its bytes. An index would be cheaper to read, but two
         recordings may have the same one."""
-        with open_recording(self.path) as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
+        found = hashlib.sha256()
+        with open_recording(self.path) as file, suppress(OSError):  # what the disk cannot read is damage
+            hashlib.file_digest(file, lambda: found)
+        return found.hexdigest()
 
     @property
     def side_of(self) -> str:

@@ -15,6 +15,7 @@ import zlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from io import BufferedReader, BytesIO
+from itertools import pairwise
 from pathlib import Path
 from typing import IO
 
@@ -28,6 +29,7 @@ from mcap.records import AttachmentIndex, Channel, Chunk, ChunkIndex, McapRecord
 from mcap.records import Message as McapMessage
 
 from aolink.errors import RecordingError
+from aolink.files import why_not
 from aolink.limits import ATTACHMENT_BYTES, CHUNK_BYTES, RECORD_BYTES, Budget, exceeded
 from aolink.recording.search import HEAD, MESSAGE_HEAD, Search, begins_a_record, is_plausible
 
@@ -145,6 +147,13 @@ def read_summary(file: IO[bytes]) -> Summary | None:
 
     It is empty where the writer has left it out.
     """
+    try:
+        return _read_summary(file)
+    except OSError:  # the disk cannot read it
+        return None
+
+
+def _read_summary(file: IO[bytes]) -> Summary | None:
     size = file.seek(0, os.SEEK_END)
     if size < len(MAGIC) + _FOOTER_BYTES:
         return None
@@ -163,8 +172,11 @@ def read_summary(file: IO[bytes]) -> Summary | None:
     if crc and zlib.crc32(tail[: HEAD.size + 16], zlib.crc32(data)) != crc:
         return None
     summary = _parse_summary(data, Budget(_name(file), size))
-    # Where it leads out of the file, it is no index.
-    return summary if summary is not None and all(place < start for place in summary.places) else None
+    if summary is None:
+        return None
+    # Where it leads out of the file, or to one place twice and so not to another, it is no index.
+    places = summary.places
+    return summary if all(a < b for a, b in pairwise([*places, start])) else None
 
 
 def _parse_summary(data: bytes, budget: Budget) -> Summary | None:
@@ -214,8 +226,16 @@ def _chunk_index(data: bytes) -> ChunkIndex:
 
 def scan(file: IO[bytes], on_loss: Callable[[Loss], None]) -> Iterator[tuple[McapRecord, bool]]:
     """Every whole record of a file from its start to its index, those in chunks too, each with whether a checksum
-    confirms it; losses go to ``on_loss``.
+    confirms it; losses go to ``on_loss``. Where the disk cannot read the file, it is lost from there on.
     """
+    try:
+        yield from _scan(file, on_loss)
+    except OSError as error:
+        at, size = file.tell(), file.seek(0, os.SEEK_END)
+        on_loss(Loss(at, size - at, f"the disk cannot read it from byte {at} on: {why_not(error)}"))
+
+
+def _scan(file: IO[bytes], on_loss: Callable[[Loss], None]) -> Iterator[tuple[McapRecord, bool]]:
     whole = True
 
     def lose(loss: Loss) -> None:
@@ -293,11 +313,8 @@ def chunk_at(
     file: IO[bytes], index: ChunkIndex, on_loss: Callable[[Loss], None], budget: Budget
 ) -> Iterator[McapRecord]:
     """The records in a chunk that the summary names; none if it is damaged."""
-    opcode, length = _head_at(file, index.chunk_start_offset)
-    if opcode != Opcode.CHUNK or length > RECORD_BYTES:
-        on_loss(_chunk_loss(index.chunk_start_offset, index.chunk_length, index))
-        return
-    record = _record_at(file, index.chunk_start_offset, on_loss, budget)
+    loss = _chunk_loss(index.chunk_start_offset, index.chunk_length, index)
+    record = _named_record(file, Opcode.CHUNK, loss, on_loss, budget)
     if isinstance(record, Chunk):
         yield from broken_up(record, index.chunk_start_offset, on_loss, budget)
 
@@ -307,10 +324,21 @@ def record_at(
 ) -> McapRecord | None:
     """An attachment or metadata that the summary names; None, and a loss, if it is damaged."""
     kind = Opcode.ATTACHMENT if isinstance(index, AttachmentIndex) else Opcode.METADATA
-    opcode, length = _head_at(file, index.offset)
-    if opcode == kind and length <= RECORD_BYTES:
-        return _record_at(file, index.offset, on_loss, budget)
-    on_loss(Loss(index.offset, index.length, f"the {kind.name.lower()} {index.name!r} is damaged"))
+    loss = Loss(index.offset, index.length, f"the {kind.name.lower()} {index.name!r} is damaged")
+    return _named_record(file, kind, loss, on_loss, budget)
+
+
+def _named_record(
+    file: IO[bytes], kind: Opcode, loss: Loss, on_loss: Callable[[Loss], None], budget: Budget
+) -> McapRecord | None:
+    """The record that the summary names; None, and a loss, where it is damaged, another, or the disk cannot read it."""
+    try:
+        opcode, length = _head_at(file, loss.offset)
+        if opcode == kind and length <= RECORD_BYTES:
+            return _record_at(file, loss.offset, on_loss, budget)
+    except OSError:
+        pass
+    on_loss(loss)
     return None
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import io
 import os
 import struct
@@ -40,7 +41,6 @@ from aolink.rig import load_rig
 from aolink.wire import messages_pb2 as wire
 from tests.conftest import Session
 from tests.kinds import must_be
-from tests.recording.small import write_small
 
 Chunks = tuple[bytes, list[tuple[int, int]]]
 
@@ -412,19 +412,87 @@ def test_a_picture_that_lies_is_one_loss_everywhere(tmp_path: Path, change: dict
     assert not Recording(tmp_path / "b.mcap", check=True).losses
 
 
-@pytest.mark.parametrize("place", [1 << 63, (1 << 64) - 1, 1000])
-def test_an_index_that_leads_elsewhere_is_damage_for_the_reader_and_the_check(tmp_path: Path, place: int) -> None:
+class Unreadable(io.FileIO):
+    """A file that the disk cannot read from a byte on: as of a disk's, less comes of a read that reaches it."""
+
+    first = 0
+
+    def readinto(self, buffer: Any) -> int:
+        left = self.first - self.tell()
+        if left <= 0:
+            raise OSError(errno.EIO, os.strerror(errno.EIO))
+        return super().readinto(memoryview(buffer).cast("B")[:left]) or 0
+
+
+@pytest.fixture
+def unreadable_from(monkeypatch: pytest.MonkeyPatch) -> Callable[[Path, int], None]:
+    """A function that makes a file unreadable from a byte on, in this process."""
+
+    def make(path: Path, first: int) -> None:
+        plain = Path.open
+
+        def opened(self: Path, *arguments: Any, **options: Any) -> Any:
+            if self != path:
+                return plain(self, *arguments, **options)
+            (raw := Unreadable(path)).first = first
+            return io.BufferedReader(raw)
+
+        monkeypatch.setattr(Path, "open", opened)
+
+    return make
+
+
+@pytest.mark.parametrize("chunk", [3, 20, None])
+def test_what_the_disk_cannot_read_is_damage_from_there_on(
+    many_chunks: Chunks, tmp_path: Path, unreadable_from: Callable[[Path, int], None], chunk: int | None
+) -> None:
+    """In the middle of a chunk, or the last four bytes of the file."""
+    data, chunks = many_chunks
+    (path := tmp_path / "a.mcap").write_bytes(data)
+    first = len(data) - 4 if chunk is None else sum(chunks[chunk]) // 2
+    whole = set().union(*(m for m, (_, end) in zip(by_chunk(data, chunks), chunks, strict=True) if end <= first))
+    unreadable_from(path, first)
+    for check in (False, True):
+        recording = Recording(path, check=check)
+        assert {each.sequence for each in recording.messages()} == whole
+        assert f"byte {first} on" in "; ".join(loss.what for loss in recording.losses)
+        assert len(recording.digest) == 64
+    edited = recover(path, tmp_path / "b.mcap")
+    assert (edited.messages, bool(edited.losses)) == (len(whole), True)
+    assert not Recording(tmp_path / "b.mcap", check=True).losses
+
+
+def test_of_a_disk_that_reads_the_index_only_what_it_names_is_lost(
+    many_chunks: Chunks, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    data, chunks = many_chunks
+    (path := tmp_path / "a.mcap").write_bytes(data)
+    recording = Recording(path)
+    unreadable = Unreadable(path)
+    unreadable.first = chunks[1][1]
+    monkeypatch.setattr(Path, "open", lambda *_: io.BufferedReader(unreadable))
+    assert {each.sequence for each in recording.messages()} == set().union(*by_chunk(data, chunks)[:2])
+    assert [loss.offset for loss in recording.losses] == [start for start, _ in chunks[2:]]
+
+
+@pytest.mark.parametrize("place", [1 << 63, (1 << 64) - 1, 1000, "another chunk"])
+def test_an_index_that_leads_elsewhere_is_damage_for_the_reader_and_the_check(
+    many_chunks: Chunks, tmp_path: Path, place: int | str
+) -> None:
     """Its checksum is right: other software may have written it so."""
-    data = bytearray(write_small(path := tmp_path / "a.mcap", 3).read_bytes())
+    written, chunks = many_chunks
+    data, named = bytearray(written), chunks[0][0] if isinstance(place, str) else place
     footer = len(data) - 8 - 29
     (start,) = struct.unpack_from("<Q", data, footer + 9)
     at = start
-    while data[at] != 0x08:  # the chunk's index
+    while data[at] != 0x08 or struct.unpack_from("<Q", data, at + 9 + 16)[0] != chunks[4][0]:  # its index of chunks
         at += 9 + struct.unpack_from("<Q", data, at + 1)[0]
-    struct.pack_into("<Q", data, at + 9 + 16, place)
+    struct.pack_into("<Q", data, at + 9 + 16, named)
     struct.pack_into("<I", data, footer + 25, zlib.crc32(data[start : footer + 25]))
-    path.write_bytes(data)
+    (path := tmp_path / "a.mcap").write_bytes(data)
     for check in (False, True):
         recording = Recording(path, check=check)
-        list(recording)
+        lost = set().union(*by_chunk(written, chunks)) - {each.sequence for each in recording.messages()}
+        assert lost in (set(), by_chunk(written, chunks)[4])
+        assert not (check and lost)
         assert "damaged" in recording.damage
