@@ -1,13 +1,20 @@
 """The command ``aolink``: signals are handled before anything else is loaded, which takes a second."""
 
-import mmap
 import os
-import resource
 import sys
 
 # `python -m aolink` has put the current folder first, where somebody else's numpy.py may lie.
 if __name__ == "__main__" and not sys.flags.safe_path and sys.path[0] != os.path.dirname(os.path.dirname(__file__)):
     del sys.path[0]
+# So has an empty entry of PYTHONPATH, as `PYTHONPATH=$PYTHONPATH:/opt/x` leaves it.
+if (_given := os.environ.get("PYTHONPATH")) and "" in (_entries := _given.split(os.pathsep)):
+    os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, _entries))
+    sys.path[:] = [
+        each for each in sys.path if each in _entries or not (os.path.exists(each) and os.path.samefile(each, "."))
+    ]
+
+import mmap
+import resource
 
 from aolink.signals import ending_the_command
 

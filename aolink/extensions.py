@@ -35,7 +35,7 @@ def loaded(point: EntryPoint, kind: str, error: type[AolinkError]) -> Any:
     be loaded."""
     try:
         return point.load()
-    except Exception as why:  # any error of another package
+    except (Exception, SystemExit) as why:  # whatever another package raises
         raise error(f"{described(point, kind)} cannot be loaded: {why!r}") from why
 
 

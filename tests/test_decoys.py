@@ -33,8 +33,8 @@ def decoys(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def run(decoys: Path, *command: str | Path) -> None:
-    environment = {name: value for name, value in os.environ.items() if name != "PYTHONSAFEPATH"}
+def run(decoys: Path, *command: str | Path, **more: str) -> None:
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONSAFEPATH"} | more
     done = subprocess.run(command, cwd=decoys, env=environment, capture_output=True, text=True, timeout=600)
     assert not (decoys / "ran").exists(), (decoys / "ran").read_text()
     assert done.returncode == 0, done.stdout + done.stderr
@@ -62,6 +62,26 @@ def test_nor_does_the_module_once_it_runs(decoys: Path, options: tuple[str, ...]
         for name in ("aolink", "random", "threading"):
             (decoys / f"{name}.py").unlink()
     run(decoys, sys.executable, *options, "-m", "aolink", *BATCH.split())
+
+
+@pytest.mark.parametrize("words", ["info s.mcap", pytest.param(BATCH, marks=pytest.mark.slow)])
+def test_nor_does_one_that_an_empty_entry_of_a_variable_leads_there(decoys: Path, words: str) -> None:
+    """Before a command's first lines Python has looked there itself."""
+    for name in ("aolink", "random", "threading", "sitecustomize", "usercustomize"):
+        (decoys / f"{name}.py").unlink()
+    run(decoys, Path(sys.executable).with_name("aolink"), *words.split(), PYTHONPATH=f"{ROOT}:")
+
+
+@pytest.mark.slow
+def test_nor_does_a_style_for_pictures_change_ours(decoys: Path) -> None:
+    """TeX would run what the style says."""
+    rc = decoys / "matplotlibrc"
+    pages = []
+    for text in ("", "text.usetex: True\ntext.latex.preamble: \\input{there}\nlines.linewidth: 9\nfont.size: 30\n"):
+        rc.write_text(text)
+        run(decoys, Path(sys.executable).with_name("aolink"), "report", "s.mcap", "-o", "r.html", "--overwrite")
+        pages.append((decoys / "r.html").read_text())
+    assert pages[0] == pages[1]
 
 
 def test_nor_do_processes_that_a_notebook_starts(decoys: Path) -> None:

@@ -29,6 +29,8 @@ def needed(module: str, extra: str, what: str) -> Any:
     except ImportError:
         package = module.partition(".")[0]
         raise ExportError(f"{what} needs {package}: {install_command(extra)}") from None
+    except UnicodeDecodeError as error:  # matplotlib reads a matplotlibrc of the current folder
+        raise ExportError(f"{module} cannot be loaded: a file of settings is no text ({error})") from None
 
 
 def together(

@@ -7,14 +7,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from aolink.errors import ExportError
-from aolink.exporting.common import needed
 from aolink.files import writing
 from aolink.gathered import PER_SLOPE, SLOPES, Blur
 from aolink.plotting.exposure import draw_intensity, draw_paths, draw_spot, step_of
 from aolink.plotting.overview import need_exposures, overview
 from aolink.plotting.scene import plot_scene
 from aolink.plotting.session import plot_blur
-from aolink.plotting.style import MM, legend_above, new_figure
+from aolink.plotting.style import MM, legend_above, new_figure, paper
 from aolink.recording.reader import Recording
 
 if TYPE_CHECKING:
@@ -26,7 +25,7 @@ if TYPE_CHECKING:
 _SIZE_MM, _DPI = (16 / MM, 10 / MM), 110
 _NEAR = 4
 """Exposures before and after the one that is explained whose blur is drawn."""
-_STYLE: dict[Any, Any] = {
+_STYLE = {
     "font.size": 10, "axes.spines.top": False, "axes.spines.right": False, "legend.frameon": False,
 }  # fmt: skip
 
@@ -48,12 +47,11 @@ def draw_session(series: Series, path: str | Path) -> Path:
     ExportError
         matplotlib is missing, the series has no exposure, or the file cannot be written.
     """
-    plain = needed("matplotlib", "plot", "a picture")
     view = overview(series)
     need_exposures(view)
     number = view.most_blurred
     step, rig = step_of(series, number, view.names), series.rig
-    with plain.rc_context(_STYLE):
+    with paper(_STYLE):
         figure = new_figure(*_SIZE_MM)
         figure.suptitle(f"{rig.name}: exposure {number}, the most blurred", x=0.01, ha="left", fontsize=13)
         has_scene = isinstance(series, Recording) and step.exposure.scene is not None

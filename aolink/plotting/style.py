@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 MM = 1 / 25.4
 """A millimetre in inches."""
-_PAPER: dict[Any, Any] = {
+_PAPER = {
     "font.size": 8, "axes.linewidth": 0.6, "lines.linewidth": 1.0, "legend.frameon": False, "legend.fontsize": 7,
     "axes.spines.top": False, "axes.spines.right": False, "pdf.fonttype": 42, "savefig.dpi": 300,
     "axes.titlesize": 8, "svg.hashsalt": "aolink",
@@ -25,9 +25,13 @@ _NARROW_IN = 4.8
 
 
 @contextmanager
-def paper() -> Iterator[None]:
-    """A context with small type and thin lines for the figures made in it. Raises ExportError without matplotlib."""
-    with needed("matplotlib", "plot", "a figure").rc_context(_PAPER):
+def paper(style: Mapping[str, Any] = _PAPER) -> Iterator[None]:
+    """A context with small type and thin lines, or another style, for the figures made in it. Raises ExportError
+    without matplotlib.
+
+    Nothing of a ``matplotlibrc`` is in it: matplotlib reads one of the current folder, which may be a stranger's.
+    """
+    with needed("matplotlib.style", "plot", "a figure").context(["default", style]):
         yield
 
 

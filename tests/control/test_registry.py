@@ -51,12 +51,17 @@ def test_it_may_refuse_a_rig(with_example: dict[str, str]) -> None:
 
 @pytest.mark.parametrize(
     ("value", "why"),
-    [("nowhere.at_all:ROW", "cannot be loaded: ModuleNotFoundError"), ("math:pi", "(math:pi) is 3.14159")],
+    [
+        ("nowhere.at_all:ROW", "cannot be loaded: ModuleNotFoundError"),
+        ("math:pi", "(math:pi) is 3.14159"),
+        ("ends:ROW", "cannot be loaded: SystemExit"),
+    ],
 )
 def test_a_broken_package_is_one_line_for_who_asks_for_it(
     with_example: dict[str, str], tmp_path: Path, value: str, why: str
 ) -> None:
     site = package(tmp_path / "site", "broken", f"[aolink.controllers]\ncracked = {value}\n")
+    (site / "ends.py").write_text("raise SystemExit")
     environment = with_example | {"PYTHONPATH": f"{site}:{with_example['PYTHONPATH']}"}
     code = (
         "from aolink.control import find_controller; from tests.control.rigs import small_rig; rig = small_rig();"
