@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -10,6 +13,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import dask
+import psutil
 import pytest
 from distributed import Client, LocalCluster
 
@@ -17,6 +21,7 @@ from aolink.batch import Model
 from aolink.errors import AolinkError
 from aolink.jobs import batch
 from aolink.recording.reader import Recording
+from tests.kinds import must_be
 from tests.recording.small import write_small
 
 Run = Callable[..., subprocess.CompletedProcess[str]]
@@ -139,6 +144,24 @@ def test_the_command_on_a_cluster(cluster: LocalCluster, aolink: Run, tmp_path: 
         assert f"3 of 3 done, {before} of them before, 0 failed" in done.stdout
         assert done.stderr == ""
     assert {each.name for each in (tmp_path / "out").glob("*.mcap")} == {f"s{k}.moments.mcap" for k in range(3)}
+
+
+def test_as_the_page_starts_it_no_other_machine_reaches_it() -> None:
+    page = (Path(__file__).parents[2] / "aolink" / "pages" / "many_recordings.md").read_text()
+    with contextlib.ExitStack() as started:
+        for line in re.findall(r"^dask (.*)$", page, re.MULTILINE):
+            command = [sys.executable, "-m", "dask", *line.replace("8786", "28786").replace("8787", "0").split()]
+            process = started.enter_context(
+                subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True)
+            )
+            started.callback(os.killpg, process.pid, signal.SIGKILL)
+            for said in must_be(io.TextIOBase, process.stderr):
+                if "Registered to" in said or "Scheduler at" in said:
+                    break
+        every = [each for at_top in psutil.Process().children() for each in (at_top, *at_top.children(recursive=True))]
+        ports = [port for each in every for port in each.net_connections("inet") if port.status == psutil.CONN_LISTEN]
+        assert len(ports) >= 4
+        assert {port.laddr.ip for port in ports} == {"127.0.0.1"}
 
 
 @pytest.mark.parametrize("address", ["127.0.0.1:1", "nonsense"])
