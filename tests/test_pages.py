@@ -104,6 +104,7 @@ NO_CODE = {
     "Copyright (c)": "a licence",
     "MIT License": "a licence",
     "aolink sim section-vi --real-time --listen": "test_the_block_of_a_tunnel_works",
+    "dask ": "tests/jobs/test_cluster.py starts them",
     "make ": "tests/tools/test_device.py makes the reference device, tests/session/test_real_time.py runs it",
 }
 """How indented blocks begin that are no commands, and what holds them."""

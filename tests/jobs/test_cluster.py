@@ -149,7 +149,7 @@ def test_the_command_on_a_cluster(cluster: LocalCluster, aolink: Run, tmp_path: 
 def test_as_the_page_starts_it_no_other_machine_reaches_it() -> None:
     page = (Path(__file__).parents[2] / "aolink" / "pages" / "many_recordings.md").read_text()
     with contextlib.ExitStack() as started:
-        for line in re.findall(r"^dask (.*)$", page, re.MULTILINE):
+        for line in re.findall(r"^    dask (.*)$", page, re.MULTILINE):
             command = [sys.executable, "-m", "dask", *line.replace("8786", "28786").replace("8787", "0").split()]
             process = started.enter_context(
                 subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True)
