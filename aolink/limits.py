@@ -8,6 +8,7 @@ import math
 import mmap
 import os
 import zipfile
+from collections.abc import Sequence
 from pathlib import Path
 from typing import IO, Any
 
@@ -41,6 +42,10 @@ _UNPACKED_BYTES = 1 << 30
 at once."""
 _PICTURE_PIXELS = 1 << 26
 """Pixels of a picture: 8192 rows and columns, which take 512 MiB as doubles."""
+_FREE_FILM_BYTES = 1 << 28
+"""Bytes of all frames of a film that are allowed beside 255 for each byte of its file."""
+LOSSY_EXPANSION = 10_000
+"""Bytes of frames for each byte of a video or a JPEG: one that nothing moves in is compressed far more."""
 
 
 def exceeded(what: str, limit: int, error: type[AolinkError] = RecordingError) -> AolinkError:
@@ -115,6 +120,17 @@ def check_picture(width: int, height: int, error: type[AolinkError]) -> None:
     """Raise ``error`` for a picture that is above the limit."""
     if width * height > _PICTURE_PIXELS:
         raise exceeded(f"it has {width} x {height} pixels", _PICTURE_PIXELS, error)
+
+
+def check_film(
+    shape: Sequence[int], itemsize: int, count: int, size: int, error: type[AolinkError], expansion: int = _EXPANSION
+) -> None:
+    """Raise ``error`` for a film of ``count`` frames of (rows, columns) whose reading costs more than its ``size``,
+    bytes, allows."""
+    check_picture(shape[1], shape[0], error)
+    held, most = count * shape[0] * shape[1] * itemsize, _FREE_FILM_BYTES + expansion * size
+    if held > most:
+        raise exceeded(f"its {size} bytes hold {count} frames of {held} bytes in all", most, error)
 
 
 def load_array(source: Path | bytes) -> NDArray[Any]:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +14,8 @@ from numpy.typing import NDArray
 
 from aolink.errors import ImportingError
 from aolink.extensions import needs_extra
-from aolink.films.film import Film, array_film
-from aolink.limits import load_archive
+from aolink.films.film import Film, Stored, array_film
+from aolink.limits import check_picture, load_archive
 
 _SER = np.dtype(
     [("magic", "S14"), ("lu", "<i4"), ("colour", "<i4"), ("big", "<i4"), ("columns", "<i4"), ("rows", "<i4"),
@@ -27,8 +29,11 @@ _SER_EPOCH = 621_355_968_000_000_000
 def npy_film(path: Path) -> Film:
     """The frames of a .npy file."""
     with path.open("rb") as file:
-        np.lib.format.read_magic(file)  # `load` takes archives and pickles by this name, too
-    return array_film(np.load(path, mmap_mode="r", allow_pickle=False), path.name)
+        version = np.lib.format.read_magic(file)
+        read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+        shape, columns_first, dtype = read(file)
+        stored = Stored(path, dtype, shape[::-1] if columns_first else shape, file.tell())
+    return array_film(np.asarray(stored).T if columns_first else stored, path.name)
 
 
 def npz_film(path: Path) -> Film:
@@ -51,6 +56,11 @@ def hdf5_film(path: Path, topic: str | None) -> Film:
         frames = [name for name, each in found.items() if each.ndim >= 3 and each.dtype.kind in "biuf"]
         wanted = frames if topic is None else [name for name in found if name == f"/{topic.strip('/')}"]
         chosen = found[_only(path, wanted, found, "say with --film topic=NAME which one has the frames")]
+        if chosen.external or chosen.is_virtual:
+            raise ImportingError(
+                f"{path} keeps the pixels of {chosen.name} in other files, which are not read: write them into the file"
+            )
+        check_picture(math.prod(chosen.chunks or (1,)) * chosen.dtype.itemsize // 8, 1, ImportingError)
         beside = {name.rpartition("/")[2]: each for name, each in found.items() if each.parent == chosen.parent}
         known = _known(path, {key: np.asarray(each) for key, each in (*beside.items(), *chosen.attrs.items())
                               if key in _FACTS})  # fmt: skip
@@ -105,16 +115,13 @@ def ser_film(path: Path) -> Film:
     if channels == 1 and colour and colour not in _SER_MOSAICS:
         raise ImportingError(f"{path} has a mosaic of colours that is not known, {colour}")
     shape = (count, rows, columns, *((3,) if channels == 3 else ()))
-    kind = np.dtype("u1" if bits <= 8 else "<u2")
-    end = _SER.itemsize + kind.itemsize * int(np.prod(shape))
-    if path.stat().st_size < end:
-        raise ImportingError(f"{path} is cut off: {count} frames are announced")
-    frames: NDArray[Any] = np.memmap(path, kind, "r", _SER.itemsize, shape)
+    frames = Stored(path, np.dtype("u1" if bits <= 8 else "<u2"), shape, _SER.itemsize)
+    end = _SER.itemsize + frames.dtype.itemsize * math.prod(shape)
     top = float((1 << bits) - 1)
     # The header's word on the order of bytes means the opposite to most programs, so the values decide if they can.
     if bits > 8 and ((fits := [frames[0].view(each).max() <= top for each in ("<u2", ">u2")]) == [False, True]
                      or (all(fits) and header["big"])):  # fmt: skip
-        frames = frames.view(">u2")
+        frames = replace(frames, dtype=np.dtype(">u2"))
     known: dict[str, Any] = {"top": top, "mosaic": _SER_MOSAICS.get(colour, "")}
     stamps = np.fromfile(path, "<i8", count, offset=end)
     if len(stamps) == count and stamps.min() > _SER_EPOCH:
@@ -122,4 +129,5 @@ def ser_film(path: Path) -> Film:
         known |= {"times_ns": times, "start_ns": int(times[0])}
     elif header["utc"] > _SER_EPOCH:
         known |= {"start_ns": int(header["utc"] - _SER_EPOCH) * 100}
-    return array_film(frames[..., ::-1] if colour == 101 else frames, path.name, **known)
+    film = array_film(frames, path.name, **known)
+    return replace(film, pictures=lambda: (each[..., ::-1] for each in film.pictures())) if colour == 101 else film

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
-import mmap
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import islice
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,8 +21,6 @@ _CONVERTERS = (8, 10, 12, 14)
 """Bits of cameras whose pixels are stored in 16, at the lower end or at the upper one."""
 _READ_FRAMES = 2000
 """Frames that are read, at most, to find out where a film saturates."""
-_KEPT = 16
-"""Frames of a mapped file that stay in memory."""
 _LEAST_PIXELS = 3
 """A film saturates at its largest value if that is a converter's last, and so many pixels have it at least, and no
 fewer than are within a hundredth below it."""
@@ -165,17 +163,38 @@ def array_film(frames: Any, name: str, **known: Any) -> Film:
         raise ImportingError(f"{name} has {shape[0]} frames and times of shape {times.shape}: give one for each")
     return Film(
         name=name, shape=(int(shape[1]), int(shape[2])), dtype=dtype, count=int(shape[0]), **known,
-        pictures=lambda: frame_by_frame(frames),
+        pictures=lambda: (np.asarray(frames[k]) for k in range(len(frames))),
     )  # fmt: skip
 
 
-def frame_by_frame(frames: Any) -> Iterator[FilmFrame]:
-    """The frames of an array. Where it is mapped from a file, the memory of those that were seen is given back."""
-    mapped = getattr(frames, "_mmap", None)
-    for k in range(len(frames)):
-        yield np.asarray(frames[k])
-        if mapped is not None and k % _KEPT == _KEPT - 1:
-            mapped.madvise(mmap.MADV_DONTNEED)
+@dataclass(frozen=True)
+class Stored:
+    """An array that lies in a file as it is. It is read frame by frame and not mapped: a mapped file that somebody
+    shortens ends the process."""
+
+    path: Path
+    dtype: np.dtype[Any]
+    shape: tuple[int, ...]
+    offset: int
+    """Its first byte."""
+
+    def __post_init__(self) -> None:
+        if self.path.stat().st_size < self.offset + math.prod(self.shape) * self.dtype.itemsize:
+            raise ImportingError(f"{self.path} is cut off: it announces numbers of shape {self.shape}")
+
+    def __len__(self) -> int:
+        return self.shape[0]
+
+    def __getitem__(self, k: int) -> FilmFrame:
+        numbers = math.prod(self.shape[1:])
+        found = np.fromfile(self.path, self.dtype, numbers, offset=self.offset + k * numbers * self.dtype.itemsize)
+        if len(found) < numbers:
+            raise ImportingError(f"{self.path} has become shorter while it was read: frame {k} is cut off")
+        return found.reshape(self.shape[1:])
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
+        whole = Stored(self.path, self.dtype, (1, *self.shape), self.offset)
+        return np.asarray(whole[0], dtype)
 
 
 def one_colour(film: Film, colour: str) -> Film:

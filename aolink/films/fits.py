@@ -35,6 +35,8 @@ def fits_film(path: Path, topic: str | None) -> Film:
         try:
             for k, each in enumerate(file):
                 shape = each.shape if each.is_image else ()
+                if min(shape, default=0) < 0:
+                    raise ImportingError(f"it is damaged: it announces an array of shape {shape}")
                 if len(shape) < 2 or not math.prod(shape):
                     continue
                 place = each.fileinfo()
@@ -48,8 +50,7 @@ def fits_film(path: Path, topic: str | None) -> Film:
         if not arrays:
             raise ImportingError(f"{path} has no array of pixels, neither a primary one nor in an image extension")
         number, chosen = arrays[0]
-        shape, own = chosen.shape, header.copy() if chosen is file[0] else header + chosen.header
-        own = {**header, **chosen.header}
+        shape, own = chosen.shape, {**header, **chosen.header}
         cubes = len(shape) > 2
         more = [each for _, each in arrays[1:] if (len(each.shape) > 2 if cubes else each.shape == shape)]
         if more and not cubes:
@@ -60,22 +61,34 @@ def fits_film(path: Path, topic: str | None) -> Film:
         # As cameras with several windows write it, there may be axes of length one.
         if math.prod(shape[:-2]) != max(shape[:-2], default=1):
             raise ImportingError(f"{path} holds an array of shape {shape}, expected (frames, rows, columns)")
-        check_picture(shape[-1], shape[-2], ImportingError)
+        rows, columns = getattr(chosen, "tile_shape", (1, 1))[-2:]
+        check_picture(columns, rows, ImportingError)
         count = math.prod(shape[:-2])
         along = next((k for k, n in enumerate(shape[:-2]) if n > 1), None)
         at = [tuple(k if axis == along else 0 for axis in range(len(shape) - 2)) for k in range(count)]
-        first = chosen.section[(*at[0], slice(0, 1), slice(0, 1))]
-        dtype = np.dtype(first.dtype)
-        if "BLANK" in own and (own.get("BSCALE", 1), own.get("BZERO", 0)) == (1, 0):
-            dtype = np.dtype(f"i{own['BITPIX'] // 8}") if own["BITPIX"] > 8 else np.dtype("u1")
+    bits = int(own["BITPIX"])
+    scale, zero = (_number(own.get(key)) or 0.0 for key in ("BSCALE", "BZERO"))
+    scale = scale if "BSCALE" in own else 1.0
+    kind = f"{'f' if bits < 0 else 'u' if bits == 8 else 'i'}{abs(bits) // 8}"
+    if bits > 0 and scale == 1 and zero == (-128 if bits == 8 else 2.0 ** (bits - 1)):
+        kind = "i1" if bits == 8 else f"u{bits // 8}"  # the usual way to keep these
+    elif (scale, zero) != (1, 0):
+        kind = "f4" if abs(bits) <= 16 or bits == -32 else "f8"
+    dtype = np.dtype(kind)
 
     def pictures() -> Iterator[FilmFrame]:
         with _opened(path) as (file, _):
             for each in at:
-                frame = np.asarray(file[number].section[(*each, slice(None), slice(None))])
-                yield frame.astype(frame.dtype.newbyteorder("="), copy=False)
+                raw = np.asarray(file[number].section[(*each, slice(None), slice(None))])
+                unknown = raw == own["BLANK"] if "BLANK" in own and bits > 0 else np.zeros(1, np.bool_)
+                if dtype.kind == "f":
+                    frame = (raw * dtype.type(scale) + dtype.type(zero)).astype(dtype)
+                else:
+                    frame = raw.astype(dtype) + np.array(int(zero) % 2**64, np.uint64).astype(dtype)
+                yield np.where(unknown, np.nan, frame) if unknown.any() else frame
 
-    numbers = {key: _number(own.get(key)) for key in ("EXPTIME", "EXPOSURE", "FRATE", "FRAMRATE", "KINTIME")}
+    found = {key: _number(own.get(key)) for key in ("EXPTIME", "EXPOSURE", "FRATE", "FRAMRATE", "KINTIME")}
+    numbers = {key: each if each and each > 0 else None for key, each in found.items()}
     cycle = numbers["KINTIME"]
     odd = [f"{key} = {own[key]!r} is no time or rate: not used" for key in numbers if key in own and not numbers[key]]
     several = f"{path.name} holds {len(more) + 1} cubes: the first is taken" if more else ""
@@ -109,7 +122,7 @@ def _opened(path: Path) -> Iterator[tuple[Any, int]]:
         source: Any = io.BytesIO(unpacked(file, ImportingError)) if packed else file
         size = source.seek(0, io.SEEK_END)
         source.seek(0)
-        with fits.open(source, lazy_load_hdus=True) as opened:
+        with fits.open(source, lazy_load_hdus=True, memmap=False, do_not_scale_image_data=True) as opened:
             yield opened, size
 
 
@@ -118,7 +131,7 @@ def _number(value: Any) -> float | None:
         number = float(str(value).strip().upper().replace("D", "E"))
     except (TypeError, ValueError):
         return None
-    return number if math.isfinite(number) and number > 0 else None
+    return number if math.isfinite(number) else None
 
 
 def start_of(header: dict[str, Any]) -> tuple[int | None, str]:

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from aolink.errors import AolinkError, ImportingError
 from aolink.films import arrays, bags, fits, stills, tiff, video
 from aolink.films.film import Film, FilmFrame
+from aolink.limits import LOSSY_EXPANSION, check_film
 
 _PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".pgm", ".ppm", ".pbm", ".pnm", ".webp", ".jp2")
 _FITS = (".fits", ".fit", ".fts")
@@ -69,12 +70,16 @@ def open_film(source: str | Path, topic: str | None = None) -> Film:
             film = read(path)
         else:
             raise ImportingError(fits.no_topic(path, topic))
+        files = path.iterdir() if path.is_dir() else [path]
+        size = sum(each.stat().st_size for each in files if each.is_file())
+        more = {"expansion": LOSSY_EXPANSION} if film.nonlinear else {}
+        check_film(film.shape, film.dtype.itemsize, film.count, size, ImportingError, **more)
     if film.mosaic:
         note = (
             f"its pixels are under a Bayer mosaic, {film.mosaic}: --film colour=green (or red, blue) takes one colour"
         )
         film = replace(film, notes=(*film.notes, note))
-    return replace(film, pictures=lambda: _checked(film, path))
+    return replace(film, pictures=lambda: _checked(film, path, size))
 
 
 @contextmanager
@@ -97,8 +102,8 @@ def _first_line(error: Exception) -> str:
     return next(iter(str(error).strip().splitlines()), "") or type(error).__name__
 
 
-def _checked(film: Film, path: Path) -> Iterator[FilmFrame]:
-    """The pictures of a film, checked against the size and the number that it announced."""
+def _checked(film: Film, path: Path, size: int) -> Iterator[FilmFrame]:
+    """The pictures of a film, checked against the size and the number that it announced, and its file's bytes."""
     count, channels = 0, None
     with _one_error(path):
         for picture in film.pictures():
@@ -107,6 +112,8 @@ def _checked(film: Film, path: Path) -> Iterator[FilmFrame]:
                     f"{path}: frame {count} is {' x '.join(map(str, picture.shape))} pixels, those before it"
                     f" {' x '.join(map(str, (*film.shape, *(channels or ()))))}: a film has frames of one size"
                 )
+            if path.is_file() and path.stat().st_size < size:  # for what lacks then, HDF5 gives zeros
+                raise ImportingError(f"{path} has become shorter while it was read")
             yield picture
             count, channels = count + 1, picture.shape[2:]
     if count != film.count:

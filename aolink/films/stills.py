@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 COMPRESSED = "JPEG and video hold light after a gamma curve and lossy compression"
 LOSSY = (".jpg", ".jpeg", ".webp")
 _LOSSLESS = ("PNG", "BMP", "TIFF", "PPM", "JPEG2000")
+_FORMATS = (*_LOSSLESS, "JPEG", "WEBP", "GIF")
+"""What is decoded, whatever a file's name says: others may run programs."""
 _NETPBM = (b"P1", b"P2", b"P3", b"P4", b"P5", b"P6", b"P7")
 
 
@@ -72,7 +74,7 @@ def opened_image(source: Path | IO[bytes], error: type[AolinkError]) -> Iterator
     with warnings.catch_warnings():  # Pillow has other limits of its own
         warnings.simplefilter("ignore", Image.DecompressionBombWarning)
         try:
-            image = Image.open(source)
+            image = Image.open(source, formats=_FORMATS)
         except Image.DecompressionBombError as problem:
             raise error(str(problem).partition(",")[0].lower()) from None
     with image:

@@ -32,7 +32,7 @@ def aot_film(path: Path, uid: str | None = None) -> Film:
         warnings.filterwarnings(
             "ignore", r"\[.*\(Error level: "
         )  # about parts that are not read; worse ones are raised
-        system = aotpy.AOSystem.read_from_file(path)
+        system = aotpy.AOSystem.read_from_file(path, externals="disallow", memmap=False)
     sensors = system.wavefront_sensors
     if uid is not None:
         have = ", ".join(str(each.uid) for each in sensors) or "none"

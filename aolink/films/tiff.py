@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import UTC, datetime
@@ -15,8 +16,9 @@ from numpy.typing import NDArray
 
 from aolink.errors import ImportingError
 from aolink.extensions import needs_extra
-from aolink.films.film import Film, FilmFrame, frame_by_frame
+from aolink.films.film import Film, FilmFrame, Stored
 from aolink.films.stills import COMPRESSED
+from aolink.limits import check_picture
 
 _LOSSY = (6, 7)  # JPEG
 _SECONDS = {
@@ -31,6 +33,9 @@ def tiff_film(path: Path) -> Film:
     with needs_extra("films", ImportingError):
         import tifffile
     with _complaints(path), tifffile.TiffFile(path) as file:
+        named = re.findall(r"FileName *= *[\"']([^\"']*)", file.ome_metadata or "")
+        if far := next((each for each in named if Path(each).name != each), None):
+            raise ImportingError(f"{path} names the file {far}: files of a stack are read from its own folder alone")
         kinds = [(each.shape, each.axes, np.dtype(each.dtype)) for each in file.series]
         first: Any = file.series[0]
         page: Any = file.pages.first
@@ -38,6 +43,7 @@ def tiff_film(path: Path) -> Film:
         names = {Path(each.parent.filehandle.path).name for each in first.pages if each is not None}
         lossy, bits = int(page.compression) in _LOSSY, page.bitspersample
         _, top, dtype = _light(path, page)
+        place, order = first.dataoffset, file.byteorder
         white_is_zero = str(page.photometric.name) == "MINISWHITE"
     (shape, axes, stored), *others = kinds
     size = tuple(n for n, axis in zip(shape, axes, strict=True) if axis != "S")
@@ -53,13 +59,15 @@ def tiff_film(path: Path) -> Film:
 
     def pictures() -> Iterator[FilmFrame]:
         with _complaints(path), tifffile.TiffFile(path) as file:
-            pages = [page for each in file.series for page in each.pages] if one_by_one else file.series[0].pages
+            pages: Any = [page for each in file.series for page in each.pages] if one_by_one else file.series[0].pages
             if len(pages) != size[0]:  # ImageJ keeps a large stack as one page
-                yield from frame_by_frame(tifffile.memmap(path, mode="r").reshape(size[0], *shape[1:]))
+                whole = Stored(path, stored.newbyteorder(order), (size[0], *shape[1:]), place)
+                yield from (whole[k] for k in range(size[0]))
                 return
             for page in pages:
                 if page is None or math.prod(page.chunked) > len(page.dataoffsets):  # it would count them all
                     raise ImportingError(f"{path} is damaged: a page lacks some of its pixels")
+                check_picture(page.keyframe.tilewidth, page.keyframe.tilelength, ImportingError)
                 handle = page.parent.filehandle
                 handle.open()  # of another file of the stack, it is closed
                 yield _light(path, page.aspage(), read=True)[0]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from aolink.errors import ImportingError
 from aolink.extensions import needs_extra
 from aolink.films.film import Film
 from aolink.films.stills import COMPRESSED
+from aolink.limits import LOSSY_EXPANSION, check_film, check_picture
 
 _LINEAR = ("ffv1", "huffyuv", "rawvideo", "utvideo", "png", "tiff", "ffvhuff")
 """Codecs that lose nothing."""
@@ -20,11 +22,9 @@ _LINEAR = ("ffv1", "huffyuv", "rawvideo", "utvideo", "png", "tiff", "ffvhuff")
 
 def video_film(path: Path) -> Film:
     """The frames of a video, and when each is shown."""
-    with needs_extra("films", ImportingError):
-        import av
 
     def decoded() -> Iterator[Any]:
-        with av.open(str(path), options={"min_delay": "0"}) as file:  # of a GIF: it is not slowed down
+        with _opened(path) as file:
             for frame in file.decode(file.streams.video[0]):
                 if frame.is_corrupt:
                     raise ImportingError(f"{path} is damaged: a frame cannot be decoded")
@@ -32,14 +32,17 @@ def video_film(path: Path) -> Film:
 
     if path.suffix.lower() == ".gif" and not path.read_bytes().rstrip(b"\0").endswith(b";"):
         raise ImportingError(f"{path} is cut off: it has no end")
-    with av.open(str(path)) as file:
+    with _opened(path) as file:
         if not file.streams.video:
             raise ImportingError(f"{path} has no pictures")
         stream = file.streams.video[0]
+        shape = (stream.codec_context.height, stream.codec_context.width)
+        check_picture(shape[1], shape[0], ImportingError)
         tick, codec, rate = stream.time_base, stream.codec_context.name, stream.guessed_rate
     shown: list[int | None] = []
     first = None
     for frame in decoded():
+        check_film(shape, 1, len(shown), path.stat().st_size, ImportingError, LOSSY_EXPANSION)
         shown.append(frame.pts)
         first = frame if first is None else first
     if first is None:
@@ -63,6 +66,20 @@ def video_film(path: Path) -> Film:
         pictures=lambda: map(_pixels, decoded()), nonlinear="" if linear else COMPRESSED,
         mosaic=mosaic, top=float((1 << bits) - 1) if bits not in (8, 16, 32) else None, **known,
     )  # fmt: skip
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[Any]:
+    """The container. A list of other files, which FFmpeg knows by what it holds, opens none."""
+    with needs_extra("films", ImportingError):
+        import av
+
+    def other(url: str, *_: Any) -> None:
+        raise ImportingError(f"{path} names {url}: films in other files are not read; give that file")
+
+    options = {"min_delay": "0", "protocol_whitelist": "none"}  # the first of a GIF: it is not slowed down
+    with path.open("rb") as file, av.open(file, options=options, io_open=other) as opened:
+        yield opened
 
 
 def _bits(frame: Any) -> int:

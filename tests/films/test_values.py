@@ -225,7 +225,7 @@ def test_ser_with_its_stamps(kind, tmp_path):
     np.testing.assert_array_equal(film.times_ns, stamps)
     assert film.start_ns == stamps[0]
     path.write_bytes(path.read_bytes()[:250])
-    assert "cut off: 3 frames are announced" in refused(path)
+    assert "cut off" in refused(path)
 
 
 def test_one_colour_of_a_mosaic_and_of_colours(tmp_path):
