@@ -34,7 +34,7 @@ class Estimator:
         filter does not search for modes."""
         self.posterior: Posterior | None = None
         """The filter's last posterior, of an exposure that it took by itself."""
-        self.judge: Judge | None = Judge(rig)
+        self.judge: Judge | None = Judge(rig, filter.orders)
         """Judges whether the model fits; None in copies whose estimates are not those that are given."""
         self._next_step: int | None = None
         self._last_input = np.zeros(rig.n_inputs)
@@ -53,9 +53,9 @@ class Estimator:
         Raises EstimatorError where the rig has numbers that cannot be computed with.
         """
         try:
-            for exposure, estimate in zip(batch.exposures, self._steps(batch), strict=True):
+            for estimate in self._steps(batch):
                 assert self.posterior is not None
-                yield estimate if self.judge is None else self.judge.take(exposure, estimate, self.posterior.likeliest)
+                yield estimate if self.judge is None else self.judge.take(estimate, self.posterior.residual)
         except (ArithmeticError, np.linalg.LinAlgError) as error:
             raise EstimatorError(
                 f"{self.name} cannot compute with this rig: {error}; are its numbers too large or too small?"

@@ -20,6 +20,7 @@ import numpy as np
 
 from aolink.errors import EstimatorError
 from aolink.estimation.estimate import AlignmentError, Estimate, Status
+from aolink.estimation.judge import scaled
 from aolink.estimation.model.base import over_steps
 from aolink.exposure import Exposure
 from aolink.numerics import batched
@@ -67,13 +68,17 @@ def smooth(
 
 def _backward(plant: Plant, exposures: Sequence[Exposure], estimates: Sequence[Estimate]) -> list[Estimate]:
     """Each estimate corrected by all later ones of the series."""
+    # Process noise is never widened: the intervals are again as wide as the verdict has them afterwards.
+    factors = [1.0 if each.verdict is None else each.verdict.widening for each in estimates]
+    estimates = [each if f == 1 else scaled(each, 1 / f) for each, f in zip(estimates, factors, strict=True)]
     smoothed: list[Estimate] = []
     for k in reversed(range(len(estimates))):
         estimate = estimates[k]
         if smoothed and smoothed[-1].status != Status.REINITIALISED:
             estimate = _corrected(plant, exposures[k], estimate, exposures[k + 1], smoothed[-1])
         smoothed.append(estimate)
-    return smoothed[::-1]
+    pairs = zip(reversed(smoothed), factors, strict=True)
+    return [each if f == 1 else scaled(each, f) for each, f in pairs]
 
 
 def _corrected(

@@ -16,14 +16,12 @@ class Fit(enum.IntEnum):
 
 
 ADVICE = {
-    "at fixed places": "a hot pixel, a second object or a background: `sensor.defects`, or subtract it",
-    "in a ring about the spot": "the kernel: `aolink calibrate`",
-    "at the ends of the blur": "light that changes in the exposure, or its timing: check the lamp and the trigger",
-    "everywhere in the spot": "the noise or the light: `aolink calibrate`",
-    "to one side of the prediction": "the zero: `aolink calibrate`",
-    "from exposure to exposure": "the plant, a missing vibration or the timing: `aolink identify`, check the trigger",
+    "pixels": "the frames are not what kernel, light and noise make: `aolink calibrate`; a hot pixel: `sensor.defects`",
+    "motion": "positions are not as predicted: the plant, a missing vibration or the timing: `aolink identify`",
+    "zero": "positions are off to one side of the prediction: the zero: `aolink calibrate`",
+    "": "`aolink calibrate` for the sensor, `aolink identify` for the plant, and check the trigger",
 }
-"""What to do, by where the evidence is; the first four are of the pixels, the others of the motion."""
+"""What to do, by the kind of the evidence."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,26 +29,22 @@ class Verdict:
     """Of the newest exposures of one estimator."""
 
     fit: Fit
-    where: str = ""
-    """Where the evidence is, a key of `ADVICE`; empty unless the model does not fit."""
+    kind: str = ""
+    """The kind of the evidence, a key of `ADVICE`; empty unless the model does not fit, or where it cannot be told."""
     pixels: float = 0.0
-    """The pixels' residuals beyond those of frames drawn from the fitted paths, in standard errors."""
+    """How far the pixels' residuals and the light are from what is expected, in standard errors."""
     motion: float = 0.0
-    """The squared errors with which the spot's positions were predicted, beyond what is expected, in standard errors;
-    or those of their mean, if larger."""
+    """The squared errors of the predicted mean positions beyond what is expected, in standard errors."""
+    zero: float = 0.0
+    """The mean of these errors, in standard errors."""
     nis: float = 0.0
-    """The estimator's NIS beyond what is expected, in the standard deviations that its sum has where the model fits."""
+    """The estimator's NIS beyond what is expected, in standard errors."""
     since: int = 0
     """Number of the frame with which ``fit`` became what it is."""
     exposures: int = 0
-    """Exposures whose pixels were compared."""
+    """Exposures that were judged together."""
     widening: float = 1.0
     """Factor of this estimate's standard deviations; one unless the model does not fit."""
-
-    @property
-    def kind(self) -> str:
-        """ "pixels" or "motion" where the model does not fit, otherwise empty."""
-        return "" if not self.where else "pixels" if self.where in [*ADVICE][:4] else "motion"
 
     def begins_with(self, frame_id: int) -> bool:
         """Whether it is this exposure with which the model no longer fits, or fits at last."""
@@ -60,9 +54,8 @@ class Verdict:
     def text(self) -> str:
         """The verdict in words."""
         if self.fit is Fit.UNKNOWN:
-            return f"cannot tell yet whether the model fits ({self.exposures} exposures compared)"
+            return f"cannot tell yet whether the model fits ({self.exposures} exposures judged)"
         if self.fit is Fit.FITS:
             return "the model fits"
-        where = f"residuals {self.where}" if self.kind == "pixels" else f"positions are off {self.where}"
-        what = f"the model does not fit ({self.kind}: {where}): {ADVICE[self.where]}"
-        return f"{what}; intervals are {self.widening:.2g} times as wide"
+        kind = f" ({self.kind})" if self.kind else ""
+        return f"the model does not fit{kind}: {ADVICE[self.kind]}; intervals are {self.widening:.2g} times as wide"

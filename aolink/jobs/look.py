@@ -54,12 +54,12 @@ _MUCH_WIDER = 1.5
 _REFUSED = 0.1
 """Share of gated exposures from which on a rig file is of no use."""
 _ADVICE = {
-    "in a ring about the spot": "the kernel: give its width with --kernel",
-    "everywhere in the spot": "the noise or the light",
-    "to one side of the prediction": "a drift of where it rests",
-    "from exposure to exposure": "a vibration that is missing, or the exposure time",
+    "pixels": "the kernel, the light or the noise: give the kernel's width with --kernel",
+    "motion": "a vibration that is missing, or the exposure time",
+    "zero": "a drift of where it rests",
+    "": "the kernel, a vibration that is missing, or the exposure time",
 }
-"""What to do about a verdict, by where its evidence is."""
+"""What to do about a verdict, by the kind of its evidence."""
 ESTIMATOR = "profile"
 """The estimator of the paths: `moments` refuses spots that swing fast along a slanted line."""
 DIRECTIONS = ("x", "y")
@@ -316,7 +316,7 @@ def _identified(
         _for_films(each)
         for each in verdicts
         if each is not None and each.fit is Fit.DOES_NOT_FIT and each.widening > _MUCH_WIDER
-        if direction.blurred or each.kind == "motion"  # what sharp frames tell needs no kernel
+        if direction.blurred or each.kind != "pixels"  # what sharp frames tell needs no kernel
     ]
     return replace(
         direction,
@@ -346,10 +346,7 @@ def _common_band(one: Direction, other: Direction) -> tuple[float, float] | None
 
 def _for_films(verdict: Verdict) -> str:
     """A verdict with advice that somebody with a film can follow."""
-    text = verdict.text
-    for where, advice in _ADVICE.items():
-        text = text.replace(ADVICE[where], advice)
-    return text
+    return verdict.text.replace(ADVICE[verdict.kind], _ADVICE[verdict.kind])
 
 
 def heeding(looked: Looked, score: Score) -> Looked:

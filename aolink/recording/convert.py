@@ -40,7 +40,7 @@ _OF_ACT = (
     "frame_id", "first_step", "delay_steps", "late", "reason", "slope_rms", "path_rms", "clipped_steps", "acting",
 )  # fmt: skip
 _OF_RESTORATION = ("frame_id", "estimator", "method", "scene_noise_sd", "path_noise_sd", "reason")
-_OF_VERDICT = ("where", "pixels", "motion", "exposures", "widening", "since", "nis")
+_OF_VERDICT = ("kind", "pixels", "motion", "zero", "exposures", "widening", "since", "nis")
 _OF_ESTIMATE = ("estimator", "frame_id", "first_step", "n_steps", "reason")
 
 

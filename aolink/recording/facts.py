@@ -60,7 +60,7 @@ class Counted:
             name = recorded.topic.removeprefix(topics.ESTIMATE)
             self._counts[name] += 1
             if (verdict := verdict_of(message)) is not None and verdict.exposures:
-                self._verdicts[name] = asdict(verdict) | {"kind": verdict.kind, "text": verdict.text}
+                self._verdicts[name] = asdict(verdict) | {"text": verdict.text}
             with contextlib.suppress(ValueError):  # a status of a later aolink
                 self._unused[name].add(Status(message.status), message.reason, message.frame_id)
 

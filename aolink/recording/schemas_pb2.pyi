@@ -238,7 +238,7 @@ class Estimate(_message.Message):
     def __init__(self, estimator: _Optional[str] = ..., frame_id: _Optional[int] = ..., first_step: _Optional[int] = ..., n_steps: _Optional[int] = ..., status: _Optional[_Union[Estimate.Status, str]] = ..., reason: _Optional[str] = ..., axes: _Optional[int] = ..., n_states: _Optional[int] = ..., n_coefficients: _Optional[int] = ..., n_measurements: _Optional[int] = ..., end_state: _Optional[_Iterable[float]] = ..., end_covariance: _Optional[_Iterable[float]] = ..., coefficients: _Optional[_Iterable[float]] = ..., coefficient_covariance: _Optional[_Iterable[float]] = ..., innovation: _Optional[_Iterable[float]] = ..., innovation_covariance: _Optional[_Iterable[float]] = ..., nis: _Optional[_Iterable[float]] = ..., innovation_variance: _Optional[_Iterable[float]] = ..., correlated_end_covariance: _Optional[bytes] = ..., correlated_coefficient_covariance: _Optional[bytes] = ..., alignment_steps: _Optional[float] = ..., alignment_coefficients: _Optional[_Iterable[float]] = ..., alignment_end_state: _Optional[_Iterable[float]] = ..., verdict: _Optional[_Union[Verdict, _Mapping]] = ...) -> None: ...
 
 class Verdict(_message.Message):
-    __slots__ = ("fit", "where", "pixels", "motion", "exposures", "nis", "since", "widening")
+    __slots__ = ("fit", "kind", "pixels", "motion", "zero", "exposures", "nis", "since", "widening")
     class Fit(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
         __slots__ = ()
         UNKNOWN: _ClassVar[Verdict.Fit]
@@ -248,22 +248,24 @@ class Verdict(_message.Message):
     FITS: Verdict.Fit
     DOES_NOT_FIT: Verdict.Fit
     FIT_FIELD_NUMBER: _ClassVar[int]
-    WHERE_FIELD_NUMBER: _ClassVar[int]
+    KIND_FIELD_NUMBER: _ClassVar[int]
     PIXELS_FIELD_NUMBER: _ClassVar[int]
     MOTION_FIELD_NUMBER: _ClassVar[int]
+    ZERO_FIELD_NUMBER: _ClassVar[int]
     EXPOSURES_FIELD_NUMBER: _ClassVar[int]
     NIS_FIELD_NUMBER: _ClassVar[int]
     SINCE_FIELD_NUMBER: _ClassVar[int]
     WIDENING_FIELD_NUMBER: _ClassVar[int]
     fit: Verdict.Fit
-    where: str
+    kind: str
     pixels: float
     motion: float
+    zero: float
     exposures: int
     nis: float
     since: int
     widening: float
-    def __init__(self, fit: _Optional[_Union[Verdict.Fit, str]] = ..., where: _Optional[str] = ..., pixels: _Optional[float] = ..., motion: _Optional[float] = ..., exposures: _Optional[int] = ..., nis: _Optional[float] = ..., since: _Optional[int] = ..., widening: _Optional[float] = ...) -> None: ...
+    def __init__(self, fit: _Optional[_Union[Verdict.Fit, str]] = ..., kind: _Optional[str] = ..., pixels: _Optional[float] = ..., motion: _Optional[float] = ..., zero: _Optional[float] = ..., exposures: _Optional[int] = ..., nis: _Optional[float] = ..., since: _Optional[int] = ..., widening: _Optional[float] = ...) -> None: ...
 
 class Estimation(_message.Message):
     __slots__ = ("estimator", "frame_id", "skipped", "reason", "took_ns")

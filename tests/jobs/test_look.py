@@ -81,7 +81,7 @@ def test_a_film_without_motion_is_said_to_have_none() -> None:
     assert heeding(looked, replace(some, gated=6)).doubts == looked.doubts
     (*_, doubt) = heeding(looked, replace(some, gated=7)).doubts
     assert "7 of 60 frames do not fit the rig file" in doubt
-    wrong = Verdict(fit=Fit.DOES_NOT_FIT, where="in a ring about the spot", widening=1.4)
+    wrong = Verdict(fit=Fit.DOES_NOT_FIT, kind="pixels", widening=1.4)
     assert heeding(looked, replace(some, verdict=wrong)).doubts == looked.doubts
     (*_, doubt) = heeding(looked, replace(some, verdict=replace(wrong, widening=1.6))).doubts
     assert "give its width with --kernel" in doubt

@@ -72,6 +72,8 @@ class Carried(NamedTuple):
     """One for all axes, (n, n)."""
     missed: IntArray
     """Measurements in a row that were not used, (axes,)."""
+    begun: BoolArray
+    """Whether a measurement was used, (axes,)."""
 
 
 class Filtered(NamedTuple):
@@ -107,7 +109,7 @@ def filter_series(step: Step, series: Series, carried: Carried, out: Filtered) -
     A, Q, gains, gate, patience = step.transition, step.noise, step.gains, step.gate, step.patience
     C_bar, M, first, second, second_order = step.mean_row, step.quadratic, step.first, step.second, step.second_order
     means, slopes, squares, kicks, values, noises, usable = series
-    x, P, unseen, unseen_P, missed = carried
+    x, P, unseen, unseen_P, missed, begun = carried
     start, start_P, end, end_P, innovation, spread, nis, used, again, missed_by_then = out
     (axes, n), m = x.shape, values.shape[1]
     s, after, y, white = np.empty(n), np.empty(n), np.empty(m), np.empty(m)
@@ -125,19 +127,30 @@ def filter_series(step: Step, series: Series, carried: Carried, out: Filtered) -
         for i in range(m):
             y[i] = 0.0
             for j in range(m):
-                S[i, j], R[i, j] = 0.0, noises[row, i, j]
-        if usable[row]:
+                S[i, j] = 0.0
+        for widened in range(2 if usable[row] else 0):
+            square = 0.0
+            for i in range(m):
+                for j in range(m):
+                    R[i, j] = noises[row, i, j]
             _innovation(C_bar, M, first, second, means, slopes, squares, values, row, s, y, H)
             if second_order:
                 _second_order(M, first, V, MP, y, R)
             _optimal_gain(V, y, H, R, S, root, white, K)
             for i in range(m):
                 square += white[i] * white[i]
-            if len(gains):
+            if widened or begun[axis] or not gate < square < math.inf:
+                break
+            for i in range(n):  # the plant moved before the first exposure
+                for j in range(n):
+                    V[i, j] *= square / m
+        if usable[row]:
+            if len(gains) and not widened:
                 for i in range(n):
                     for j in range(m):
                         K[i, j] = gains[axis % len(gains), i, j]
             passes = square <= gate and math.isfinite(_joseph(s, V, y, H, R, K, KR, keep, product, after, updated))
+            begun[axis] = begun[axis] or passes
             missed[axis] = 0 if passes else 1 if restarts else missed[axis] + 1
         nis[row], used[row], again[row], missed_by_then[row] = square, passes, restarts, missed[axis]
         for i in range(m):

@@ -54,51 +54,11 @@ def spread_starts(
 
 
 @compiled
-def innovations(
-    seen: Pixels, mean: FloatArray, covariance: FloatArray, t: FloatArray, tells_nothing: float,
-    value: FloatArray, information: FloatArray, nis: FloatArray, square: FloatArray,
-) -> None:  # fmt: skip
-    """Innovations at points t (rows, n) in k directions, as `pixels.modes.innovation`.
-
-    ``value`` and ``information`` are (rows, k); ``square`` is the sum of score^2 / I.
-    """
-    (rows, k), (outputs, n, nodes) = value.shape, seen.basis.shape
-    path, B, root, s = np.empty((outputs, nodes)), np.empty((outputs, n, nodes)), np.empty((n, n)), np.empty(n)
-    H, pull, values, vectors = np.empty((n, n)), np.empty(n), np.empty(n), np.empty((n, n))
-    for row in range(rows):
-        cholesky_into(covariance[row], root)
-        for o in range(outputs):
-            times(root.T, seen.basis[o], B[o])
-            path_of(seen.inputs[row, o], seen.basis[o], t[row], path[o])
-        H[:] = 0.0
-        pull[:] = 0.0
-        _, square[row] = information_of_row(seen, row, path, B, H, pull)
-        for i in range(n):
-            s[i] = t[row, i] - mean[row, i]
-            for j in range(i):
-                H[j, i] = H[i, j]
-        lower_solve(root, s)
-        eigh(H, values, vectors)
-        nis[row] = 0.0
-        for d in range(k):
-            size = max(values[d], 0.0)
-            moved = pulled = 0.0
-            for i in range(n):
-                moved += vectors[d, i] * s[i]
-                pulled += vectors[d, i] * pull[i]
-            # The innovation is zero in a direction about which the pixels have no information.
-            along = pulled / math.sqrt(size) if size > tells_nothing * values[0] else 0.0
-            value[row, d] = along + math.sqrt(size) * moved
-            information[row, d] = size
-            nis[row] += value[row, d] * value[row, d] / (1.0 + size)
-
-
-@compiled
 def find_modes(
     seen: Pixels, mean: FloatArray, covariance: FloatArray, starts: FloatArray, of_row: Indices, whole: int,
     reversed_precision: float, passes: int, first_damping: float, largest_damping: float, free_damping: float,
     converged: float, out_mean: FloatArray, out_covariance: FloatArray, out_evidence: FloatArray,
-    out_distance: FloatArray, out_objective: FloatArray,
+    out_total: FloatArray, out_residual: FloatArray, out_objective: FloatArray,
 ) -> None:  # fmt: skip
     """Modes that the first ``of_row`` (rows,) of the whitened starts (rows, starts, n) lead to, then their reversals.
 
@@ -127,7 +87,7 @@ def find_modes(
             if twin < 0:
                 for i in range(n):
                     s[i] = begins[done, i]
-                now = _at(seen, row, rest, B, s, path, H, pull)
+                now, square = _at(seen, row, rest, B, s, path, H, pull)
                 damping = first_damping
                 for _ in range(passes):
                     for i in range(n):
@@ -141,12 +101,12 @@ def find_modes(
                     for i in range(n):
                         there[i] = s[i] + step[i]
                         decrement += step[i] * pull[i]
-                    objective = _at(seen, row, rest, B, there, path, other, its_pull)
+                    objective, its_square = _at(seen, row, rest, B, there, path, other, its_pull)
                     decrease, before = now - objective, damping
                     better = decrease > 0
                     if better:
                         # Copied, not swapped: names that change arrays have their references counted.
-                        now = objective
+                        now, square = objective, its_square
                         for i in range(n):
                             s[i], pull[i] = there[i], its_pull[i]
                             for j in range(i + 1):
@@ -168,28 +128,31 @@ def find_modes(
                         their_H[found, i, j] = H[i, j]
                 found += 1
                 cholesky_into(H, lower)
-                log_H = distance = 0.0
+                log_H, total, free = 0.0, square, float(n)
                 for i in range(n):
                     log_H += 2 * math.log(lower[i, i])
-                    distance += s[i] * s[i]
+                    total += s[i] * s[i]
                 lower_inverse_into(lower, inverse)
+                for i in range(n):
+                    for j in range(i + 1):
+                        free -= inverse[i, j] * inverse[i, j]
+                out_total[row, done], out_residual[row, done] = total, square + free
                 # Covariance L H^-1 L' = W W' with W = L R^-T.
                 for i in range(n):
                     place = mean[row, i]
                     for j in range(n):
-                        total = 0.0
+                        product = 0.0
                         for k in range(i + 1):
-                            total += root[i, k] * inverse[j, k]
-                        damped[i, j] = total
+                            product += root[i, k] * inverse[j, k]
+                        damped[i, j] = product
                     for j in range(i + 1):
                         place += root[i, j] * s[j]
-                        total = 0.0
+                        product = 0.0
                         for k in range(n):
-                            total += damped[i, k] * damped[j, k]
-                        out_covariance[row, done, i, j] = out_covariance[row, done, j, i] = total
+                            product += damped[i, k] * damped[j, k]
+                        out_covariance[row, done, i, j] = out_covariance[row, done, j, i] = product
                     out_mean[row, done, i] = place
                 out_evidence[row, done] = -now - 0.5 * log_H
-                out_distance[row, done] = distance
                 out_objective[row, done] = now
                 if done == 0 or now < out_objective[row, best]:
                     best, best_end = done, found - 1
@@ -255,24 +218,25 @@ def _near(s: FloatArray, ends: FloatArray, H: FloatArray, count: int) -> int:
 def _at(
     seen: Pixels, row: int, rest: FloatArray, B: FloatArray, s: FloatArray, path: FloatArray, H: FloatArray,
     pull: FloatArray,
-) -> float:  # fmt: skip
-    """Information H, negative gradient ``pull`` and objective (returned) at whitened coordinates s."""
-    n, square = len(s), 0.0
+) -> tuple[float, float]:  # fmt: skip
+    """Information H and negative gradient ``pull`` at whitened coordinates s; gives the objective and the pixels'
+    chi-square."""
+    n, distance = len(s), 0.0
     for o in range(len(path)):
         path_of(rest[o], B[o], s, path[o])
     for i in range(n):
         pull[i] = -s[i]
-        square += s[i] * s[i]
+        distance += s[i] * s[i]
         for j in range(i + 1):
             H[i, j] = 1.0 if i == j else 0.0
-    log_likelihood, _ = information_of_row(seen, row, path, B, H, pull)
-    return float(0.5 * square - log_likelihood)
+    log_likelihood, square = information_of_row(seen, row, path, B, H, pull)
+    return 0.5 * distance - log_likelihood, square
 
 
 @compiled
 def drop_repeats(
-    mean: FloatArray, covariance: FloatArray, apart: float, evidence: FloatArray, distance: FloatArray,
-    objective: FloatArray,
+    mean: FloatArray, covariance: FloatArray, apart: float, evidence: FloatArray, total: FloatArray,
+    residual: FloatArray, objective: FloatArray,
 ) -> int:  # fmt: skip
     """Distinct modes of (rows, modes, ...) are put first; repeats of an earlier one get log-evidence minus infinity.
 
@@ -303,7 +267,7 @@ def drop_repeats(
             if kept < j:
                 mean[row, kept], covariance[row, kept] = mean[row, j], covariance[row, j]
                 evidence[row, kept], evidence[row, j] = evidence[row, j], -math.inf
-                distance[row, kept] = distance[row, j]
+                total[row, kept], residual[row, kept] = total[row, j], residual[row, j]
                 objective[row, kept], objective[row, j] = objective[row, j], math.inf
             kept += 1
         most = max(most, kept)

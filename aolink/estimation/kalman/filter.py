@@ -55,8 +55,9 @@ class Posterior:
     they are not searched for."""
     remark: str = ""
     """A note for the estimate's reason about unusual steps of the filter on some axes; otherwise empty."""
-    likeliest: FloatArray | None = None
-    """Mean of the heaviest component where the posterior is a mixture, of its reduced coefficients, (axes, n)."""
+    residual: FloatArray | None = None
+    """The pixels' chi-square at the most likely path, with what that takes of it given back, and the number of pixels
+    that it should be, (axes, 2), zero without a measurement; None where no path was fitted to pixels."""
     log_evidence: FloatArray | None = None
     """Log-likelihood of the measurement, up to a constant that is the same for all plants and cameras, (axes,), NaN
     without a measurement; None where it follows from innovation and covariance."""
@@ -75,6 +76,11 @@ class Filter(ABC):
     @abstractmethod
     def needs(self) -> Needs | None:
         """The measurements that it needs of each frame; None if it takes none."""
+
+    @property
+    def orders(self) -> IntArray:
+        """Orders of the moments of a spot that it measures, (n_measurements,); none where it measures something else."""
+        return np.zeros(0, dtype=np.int64)
 
     @abstractmethod
     def bridge(self, inputs: FloatArray) -> None:
@@ -122,6 +128,7 @@ class BlurFilter(Filter):
         # The transition that no longer changes that covariance; None until it has settled.
         self._settled_under: FloatArray | None = None
         self._missed = np.zeros(plant.axes, dtype=np.int64)
+        self._begun = np.zeros(plant.axes, dtype=bool)
         degrees = observation.n_measurements if observation else 0
         self._of_model: tuple[ExposureModel, Step] | None = None
         self._gate = 2 * float(special.gammainccinv(degrees / 2, GATE_PROBABILITY)) if gate and degrees else np.inf
@@ -129,6 +136,10 @@ class BlurFilter(Filter):
     @property
     def needs(self) -> Needs | None:
         return self.observation.needs if self.observation else None
+
+    @property
+    def orders(self) -> IntArray:
+        return self.observation.moment_orders if self.observation else super().orders
 
     def bridge(self, inputs: FloatArray) -> None:
         if len(inputs):
@@ -148,8 +159,11 @@ class BlurFilter(Filter):
             status = np.full(axes, Status.PREDICTED if looks is None else Status.INPUT_INVALID, dtype=np.int64)
             coefficients = prior
         else:
-            done = looks.update(model, response, prior, measured)
-            done = _without(done, measured.usable)
+            done = _without(looks.update(model, response, prior, measured), measured.usable)
+            wide = starts_wider(~self._begun, _gated(done), self._gate, looks.n_measurements)
+            if wide is not None:
+                prior = _scaled(prior, wide, model.plant.n_states)
+                done = _without(looks.update(model, response, prior, measured), measured.usable)
             coefficients, status = self._trusted(prior, done, lost, measured.usable)
         if with_noise:
             self.prior = predict(coefficients, model.end_rows, model.end_remainder, response.end)
@@ -177,10 +191,11 @@ class BlurFilter(Filter):
     ) -> tuple[Gaussian, IntArray]:
         """The updated Gaussian where it is finite and not gated, otherwise the prior; and the status of each axis."""
         after = done.posterior
-        used = (done.nis if done.gate is None else done.gate) <= self._gate
+        used = _gated(done) <= self._gate
         # Sums are finite where all is; those that overflow are checked again, axis by axis.
         if not (_has_finite_sum(after.mean) and _has_finite_sum(after.covariance)):
             used &= np.isfinite(after.mean).all(axis=1) & np.isfinite(after.covariance).all(axis=(1, 2))
+        self._begun |= used if usable is None else used & usable
         if usable is None and used.all() and not self._missed.any():
             return after, np.full(len(used), int(Status.OK), dtype=np.int64)
         status, missed = gate_status(used, lost, self._missed)
@@ -190,6 +205,25 @@ class BlurFilter(Filter):
             missed = np.where(usable, missed, self._missed)
         self._missed = missed
         return _where(~used, prior, after), status
+
+
+def starts_wider(first: BoolArray, gate: FloatArray, limit: float, degrees: int) -> FloatArray | None:
+    """How many times as large the prior's covariance is to be where the first measurement of an axis is beyond the
+    gate, (axes,): the plant moved before the session, which its prior does not know. None where none is."""
+    wide = first & (gate > limit) & np.isfinite(gate)
+    return np.where(wide, gate / degrees, 1.0) if wide.any() else None
+
+
+def _gated(done: Update) -> FloatArray:
+    """What the gate compares."""
+    return done.nis if done.gate is None else done.gate
+
+
+def _scaled(prior: Gaussian, factor: FloatArray, n: int) -> Gaussian:
+    """The prior with the covariance of its first n coefficients times a factor, (axes,)."""
+    covariance = np.array(np.broadcast_to(prior.covariance, (len(factor), *prior.covariance.shape[1:])))
+    covariance[:, :n, :n] *= factor[:, None, None]
+    return Gaussian(prior.mean, covariance)
 
 
 def gate_status(used: BoolArray, lost: BoolArray, missed: IntArray) -> tuple[IntArray, IntArray]:
@@ -246,14 +280,15 @@ class PathFilter(BlurFilter):
         series = (responses.mean, responses.slope, responses.square, responses.end, measured.value, noise, usable)
         covariance = np.broadcast_to(self.prior.covariance, (axes, *self.prior.covariance.shape[1:]))
         unseen = self._unseen
-        before = (self.prior.mean, covariance, unseen.mean, unseen.covariance[0], self._missed)
+        before = (self.prior.mean, covariance, unseen.mean, unseen.covariance[0], self._missed, self._begun)
         carried = kalman.Carried(*(np.array(each, order="C") for each in before))  # they are changed
         n = carried.mean.shape[1]
         shapes = ((n,), (n, n), (n,), (n, n), (m,), (m, m), ())
         flags = (np.empty(rows, dtype=kind) for kind in (bool, bool, np.int64))
         out = kalman.Filtered(*(np.empty((rows, *shape)) for shape in shapes), *flags)
         kalman.filter_series(self._step_of(model), kalman.Series(*map(_own, series)), carried, out)
-        self.prior, self._missed = Gaussian(carried.mean, carried.covariance), carried.missed
+        self.prior = Gaussian(carried.mean, carried.covariance)
+        self._missed, self._begun = carried.missed, carried.begun
         self._unseen = Gaussian(carried.unseen_mean, carried.unseen_covariance[None])
         status = np.where(usable, _status(out.used, out.again, out.missed), Status.INPUT_INVALID)
         innovation, spread, nis = map(_numbers, (out.innovation, out.innovation_covariance, out.nis))

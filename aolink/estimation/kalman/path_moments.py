@@ -11,7 +11,7 @@ from aolink.estimation.frames.frame_data import Measurement, Needs
 from aolink.estimation.kalman.gaussian import Gaussian, Update
 from aolink.estimation.kalman.update import blocked_update
 from aolink.estimation.model.base import ExposureModel, InputResponse
-from aolink.numerics.arrays import FloatArray
+from aolink.numerics.arrays import FloatArray, IntArray
 from aolink.rig import Plant
 
 MOST_OUTPUTS = 2
@@ -26,6 +26,8 @@ class Observation(Protocol[Data]):
     models_noise: bool
     """Whether the coefficients go on after the start state, to the process noise inside the exposure."""
     n_measurements: int
+    moment_orders: IntArray
+    """`Filter.orders`."""
 
     def update(self, model: ExposureModel, response: InputResponse, prior: Gaussian, measured: Data) -> Update:
         """Update the prior of the exposure's coefficients with the measurement."""
@@ -50,7 +52,8 @@ class PathMoments:
     ) -> None:
         self.orders, self.gain, self.second_order = tuple(orders), gain, second_order
         self.needs = Needs(what="moments", orders=self.orders)
-        self.n_measurements = plant.n_outputs * len(self.orders)
+        self.moment_orders = np.tile(self.orders, plant.n_outputs)
+        self.n_measurements = len(self.moment_orders)
 
     def update(self, model: ExposureModel, response: InputResponse, prior: Gaussian, measured: Measurement) -> Update:
         """One step of the (extended) Kalman filter for many outputs: spots, of which each has noise of its own.

@@ -55,7 +55,8 @@ class WindowedMoments:
         line = outputs == 1
         self.sensor: BaseSensor = sensor.profile if line else sensor
         self.orders, spots = LINE if line else PLANE, max(1, outputs // 2)
-        self.n_measurements = spots * len(self.orders)
+        self.moment_orders = np.tile(self.orders.sum(axis=1), spots)
+        self.n_measurements = len(self.moment_orders)
         self.needs = Needs(what="profile" if line else "windows", least_usable=HALF)
         size = self.sensor.pixel_size
         self._optics = Optics(

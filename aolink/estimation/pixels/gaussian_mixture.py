@@ -46,11 +46,6 @@ class GaussianMixture(NamedTuple):
         compiled_mixtures.moments(*self.contiguous, out.mean, out.covariance)
         return out
 
-    @property
-    def likeliest(self) -> FloatArray:
-        """Mean of the heaviest component, (axes, n)."""
-        return np.asarray(self.mean[np.arange(len(self.mean)), np.argmax(self.log_weight, axis=1)])
-
     def mapped(self, rows: FloatArray, remainder: FloatArray) -> GaussianMixture:
         """The mixture of M t + e: M is ``rows`` (m, n), e independent of t with covariance ``remainder`` (m, m)."""
         after = Gaussian(self.mean, self.covariance).mapped(rows, remainder)

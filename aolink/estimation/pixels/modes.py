@@ -10,14 +10,11 @@ leaves the path most uncertain: a path and its reversal in time give the same bl
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy import special
 
 from aolink.estimation.compiled import modes as compiled_modes
-from aolink.estimation.kalman.filter import GATE_PROBABILITY
 from aolink.estimation.kalman.gaussian import Gaussian
 from aolink.estimation.pixels.gaussian_mixture import log_sum
 from aolink.estimation.pixels.levenberg_marquardt import FIRST_DAMPING, FREE_DAMPING, LARGEST_DAMPING
@@ -39,36 +36,6 @@ CONVERGED = 0.03
 """Nats by which the objective still changes at a mode."""
 APART = 0.7
 """Modes that are nearer to each other than this many standard deviations count as one."""
-NEW_DIRECTIONS = 4
-"""Directions of the innovation, for each output; the others hold hardly more than noise."""
-NO_INFORMATION = 1e-13
-"""Information of a direction, as a share of the largest, that is rounding."""
-
-
-class Innovation(NamedTuple):
-    """Innovation of the pixels, in the directions in which the prior lets them vary most."""
-
-    value: FloatArray
-    """(axes, k)"""
-    covariance: FloatArray
-    """(axes, k, k)"""
-    nis: FloatArray
-    """(axes,)"""
-    within_gate: BoolArray
-    """Whether the chi-square of pixels and prior together passes the gate, (axes,)."""
-
-    @classmethod
-    def none(cls, axes: int, k: int) -> Innovation:
-        """Zeros for axes of which nothing was measured."""
-        return cls(np.zeros((axes, k)), np.zeros((axes, k, k)), np.zeros(axes), np.zeros(axes, dtype=bool))
-
-    def spread(self, parts: Sequence[Innovation], seen: Indices) -> Innovation:
-        """Innovations of these axes in their places, and nothing for the others."""
-        out = Innovation.none(len(self.nis), parts[0].value.shape[1])
-        for room, *each in zip(out, *parts, strict=True):
-            room[seen] = np.concatenate(each)
-        return out
-
 
 class Modes(NamedTuple):
     """Modes of the posterior, (axes, starts, ...)."""
@@ -77,8 +44,11 @@ class Modes(NamedTuple):
     covariance: FloatArray
     log_evidence: FloatArray
     """Laplace's log-evidence, without the prior weight, (axes, starts); minus infinity for a mode that is not there."""
-    distance: FloatArray
-    """|s|^2, squared distance from the prior, (axes, starts)."""
+    total: FloatArray
+    """The pixels' chi-square plus |s|^2, the squared distance from the prior, (axes, starts)."""
+    residual: FloatArray
+    """The pixels' chi-square plus the number of coefficients that they determine, n - tr(H^-1): the number of pixels, on
+    average, (axes, starts)."""
     objective: FloatArray
     """-log p(s, y) up to a constant, (axes, starts)."""
 
@@ -86,7 +56,7 @@ class Modes(NamedTuple):
     def none(cls, axes: int, count: int, n: int) -> Modes:
         """Room for a number of modes, none of which is there yet."""
         nothing, never = np.zeros((axes, count)), np.full((axes, count), np.inf)
-        return cls(np.zeros((axes, count, n)), np.zeros((axes, count, n, n)), -never, nothing, never)
+        return cls(np.zeros((axes, count, n)), np.zeros((axes, count, n, n)), -never, nothing, nothing.copy(), never)
 
     @property
     def total_evidence(self) -> FloatArray:
@@ -159,24 +129,3 @@ def precision_of_reversal(view: PixelView) -> float:
     """Precision with which a path is fitted to the reversal of another, one over slope units squared."""
     return 1 / (REVERSED_TO**2 * view.kernel_variance)
 
-
-def innovation(view: PixelView, prior: Gaussian, modes: Modes) -> Innovation:
-    """Innovation of the pixels linearised at the best mode, in units of their noise.
-
-    With A = R^(-1/2) J L = U S V', the pixels' innovation has variance 1 + S^2 along U's columns, and 1 elsewhere.
-    """
-    rows = np.arange(len(modes.mean)), modes.best
-    t, distance = modes.mean[rows], modes.distance[rows]
-    axes, n = t.shape
-    k = min(NEW_DIRECTIONS * view.outputs, n)
-    u, values, nis, square = np.empty((axes, k)), np.empty((axes, k)), np.empty(axes), np.empty(axes)
-    compiled_modes.innovations(
-        view.seen, np.ascontiguousarray(prior.mean), np.ascontiguousarray(prior.covariance), t,
-        NO_INFORMATION, u, values, nis, square,
-    )  # fmt: skip
-    # At the truth this is chi-square of all pixels and coefficients, and where the objective is least it is less.
-    total = square + distance
-    degrees = np.add.reduce(view.mask, axis=1) + n
-    within_gate = total <= 2 * special.gammainccinv(degrees / 2, GATE_PROBABILITY)
-    covariance = (1 + values)[..., None] * np.eye(k)
-    return Innovation(u, covariance, nis, within_gate & np.isfinite(nis))

@@ -18,19 +18,27 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+from scipy import special
 
 from aolink.estimation.estimate import Status
 from aolink.estimation.frames.frame_data import HALF, Needs, Profile, SpotWindows
-from aolink.estimation.kalman.filter import PATIENCE, Filter, Posterior, gate_status
-from aolink.estimation.kalman.gaussian import Gaussian
+from aolink.estimation.kalman.filter import (
+    GATE_PROBABILITY,
+    PATIENCE,
+    Filter,
+    Posterior,
+    gate_status,
+    starts_wider,
+)
+from aolink.estimation.kalman.gaussian import Gaussian, Update
 from aolink.estimation.kalman.predict import predict
 from aolink.estimation.model.base import ExposureModel, InputResponse, over_steps
 from aolink.estimation.model.exposure_model import exposure_model
 from aolink.estimation.moments.windowed import WindowedMoments
 from aolink.estimation.pixels.gaussian_mixture import GaussianMixture, single
 from aolink.estimation.pixels.likelihood import PixelView, reduction
-from aolink.estimation.pixels.modes import Innovation, Modes, innovation, modes_of, without_repeats
-from aolink.numerics.arrays import BoolArray, FloatArray, Indices
+from aolink.estimation.pixels.modes import Modes, modes_of, without_repeats
+from aolink.numerics.arrays import BoolArray, FloatArray, Indices, IntArray
 from aolink.numerics.workers import in_threads, thread_count
 from aolink.optics.camera import effective_noise_density
 from aolink.optics.sensor import BaseSensor
@@ -58,7 +66,12 @@ class Found(NamedTuple):
 
     posterior: GaussianMixture
     """Of the reduced coefficients t."""
-    innovation: Innovation
+    moments: Update
+    """The update with windowed moments, whose innovation is reported."""
+    within_gate: BoolArray
+    """Whether the chi-square of pixels and prior together, at the best mode, passes the gate, (axes,)."""
+    residual: FloatArray
+    """As in `Posterior`, (axes, 2)."""
     log_evidence: FloatArray
     """Log-likelihood of the pixels by Laplace's method, (axes,)."""
     is_multimodal: BoolArray
@@ -78,6 +91,7 @@ class ProfileFilter(Filter):
         # The prediction without any measurement.
         self._unseen = start
         self._missed = np.zeros(axes, dtype=np.int64)
+        self._begun = np.zeros(axes, dtype=bool)
 
     def warm_up(self) -> None:
         """Update one axis with a dark exposure, so that what this compiles is compiled before the session."""
@@ -94,6 +108,10 @@ class ProfileFilter(Filter):
     @property
     def needs(self) -> Needs:
         return Needs(what="windows" if self.plant.n_outputs > 1 else "profile", least_usable=HALF)
+
+    @property
+    def orders(self) -> IntArray:
+        return self._moments.moment_orders
 
     def bridge(self, inputs: FloatArray) -> None:
         if len(inputs):
@@ -120,19 +138,27 @@ class ProfileFilter(Filter):
         predicted = reduced.prior(Gaussian(prior.mean, prior.covariance))
         posterior = GaussianMixture(prior.log_weight, predicted.mean, predicted.covariance)
         status = np.full(axes, int(Status.INPUT_INVALID), dtype=np.int64)
-        new = Innovation.none(axes, 0)
-        is_multimodal, log_evidence = np.zeros(axes, dtype=bool), np.full(axes, np.nan)
+        m = 0 if measured is None else self._moments.n_measurements
+        innovation, spread, nis = np.zeros((axes, m)), np.zeros((axes, m, m)), np.zeros(axes)
+        is_multimodal, log_evidence, residual = np.zeros(axes, bool), np.full(axes, np.nan), np.zeros((axes, 2))
         if measured is not None:
             parts, views = self._parts(model, response, measured, prior)
-            done = in_threads(lambda p: self.found(views[p[0]].part(p), prior.part(p)), parts)
+            done = in_threads(lambda p: self._begin_or_go_on(views[p[0]].part(p), prior.part(p), p), parts)
             if parts:
                 seen = np.concatenate(parts)
-                new = new.spread([each.innovation for each in done], seen)
-                log_evidence[seen] = np.concatenate([each.log_evidence for each in done])
+                for room, values in (
+                    (innovation, [each.moments.innovation for each in done]),
+                    (spread, [each.moments.innovation_covariance for each in done]),
+                    (nis, [each.moments.nis for each in done]),
+                    (log_evidence, [each.log_evidence for each in done]),
+                    (residual, [each.residual for each in done]),
+                ):
+                    room[seen] = np.concatenate(values)
                 # The pixels' own noise is left out of their likelihoods, being the same at all points of one camera.
                 pixels = np.count_nonzero(measured.mask.reshape(axes, -1), axis=1)
                 log_evidence -= 0.5 * pixels * math.log(effective_noise_density(self.sensor) / self.sensor.pixel_size)
-                trusted = new.within_gate[seen] | (not self._gate)
+                trusted = np.concatenate([each.within_gate for each in done]) | (not self._gate)
+                self._begun[seen] |= trusted
                 status[seen], self._missed[seen] = gate_status(trusted, lost[seen], self._missed[seen])
                 new_posterior = GaussianMixture.stacked([each.posterior for each in done])
                 posterior = posterior.replaced(seen[trusted], new_posterior.part(np.flatnonzero(trusted)))
@@ -142,8 +168,8 @@ class ProfileFilter(Filter):
         self._unseen = self._unwatched(model.transition, model.process_noise, response.end)
         return Posterior(
             coefficients=reduced.coefficients(posterior.gaussian), end=after.gaussian, status=status,
-            innovation=new.value, innovation_covariance=new.covariance, nis=new.nis, several=is_multimodal,
-            log_evidence=log_evidence, likeliest=posterior.likeliest,
+            innovation=innovation, innovation_covariance=spread, nis=nis, several=is_multimodal,
+            log_evidence=log_evidence, residual=residual,
         )  # fmt: skip
 
     def _parts(
@@ -165,22 +191,35 @@ class ProfileFilter(Filter):
                 views[int(alike[j])] = view
         return parts, views
 
+    def _begin_or_go_on(self, view: PixelView, prior: GaussianMixture, axes: Indices) -> Found:
+        done = self.found(view, prior)
+        assert done.moments.gate is not None
+        m = self._moments.n_measurements
+        factor = starts_wider(~(self._begun[axes] | done.within_gate), done.moments.gate, m, m) if self._gate else None
+        if factor is None:
+            return done
+        return self.found(view, prior._replace(covariance=prior.covariance * factor[:, None, None, None]))
+
     def found(self, view: PixelView, prior: GaussianMixture) -> Found:
         """The posterior of some axes."""
-        before = view.reduced.prior(prior.gaussian)
-        by_moments = self._by_moments(view, before)
-        modes = self._modes(view, prior, by_moments)
+        moments = self._by_moments(view, view.reduced.prior(prior.gaussian))
+        modes = self._modes(view, prior, moments.posterior)
         log_share = modes.log_evidence - modes.total_evidence[:, None]
         bent = view.blur_of(modes.covariance) > view.reduced.least_blur
         wide = np.flatnonzero((bent & (log_share > math.log(COUNTS))).any(axis=1))
         log_share = np.where(log_share > math.log(NEGLIGIBLE), log_share, -np.inf)
         posterior = GaussianMixture(log_share, modes.mean, modes.covariance).ordered()
-        posterior = posterior.replaced(wide, single(by_moments.part(wide)))
-        is_multimodal = (log_share > math.log(REPORTED)).sum(axis=1) > 1
-        return Found(posterior, innovation(view, before, modes), modes.total_evidence, is_multimodal)
+        posterior = posterior.replaced(wide, single(moments.posterior.part(wide)))
+        best, pixels = (np.arange(len(view.y)), modes.best), np.count_nonzero(view.mask, axis=1)
+        # At the truth it is chi-square of all pixels and coefficients, and where the objective is least it is less.
+        most = 2 * special.gammainccinv((pixels + view.reduced.size) / 2, GATE_PROBABILITY)
+        return Found(
+            posterior, moments, modes.total[best] <= most, np.stack([modes.residual[best], pixels], axis=1),
+            modes.total_evidence, (log_share > math.log(REPORTED)).sum(axis=1) > 1,
+        )  # fmt: skip
 
-    def _by_moments(self, view: PixelView, prior: Gaussian) -> Gaussian:
-        return self._moments.updated(view.dynamics, view.moment_nodes, prior, view.measured).posterior
+    def _by_moments(self, view: PixelView, prior: Gaussian) -> Update:
+        return self._moments.updated(view.dynamics, view.moment_nodes, prior, view.measured)
 
     def _modes(self, view: PixelView, prior: GaussianMixture, by_moments: Gaussian) -> Modes:
         """The modes for each component of the start state's prior; their log-evidence includes the components' weights.
@@ -191,7 +230,7 @@ class ProfileFilter(Filter):
         axes, count, _ = before.mean.shape
         there = np.nonzero(np.isfinite(prior.log_weight))
         rows, own = view.part(there[0]), Gaussian(before.mean[there], before.covariance[there])
-        wide = by_moments if count == 1 else self._by_moments(rows, own)
+        wide = by_moments if count == 1 else self._by_moments(rows, own).posterior
         heaviest = np.argmax(prior.log_weight, axis=1)[there[0]] == there[1]
         found = modes_of(rows, own, wide, heaviest)
         found = found._replace(log_evidence=found.log_evidence + prior.log_weight[there][:, None])

@@ -5,14 +5,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy import linalg, stats
+from scipy import linalg
 
 from aolink.estimation import exposure_model, make_estimator
 from aolink.estimation.compiled import modes as compiled_modes
 from aolink.estimation.compiled.pixels import information_of_row, places_of
 from aolink.estimation.frames.frame_data import Needs, Profile, SpotWindows
 from aolink.estimation.frames.measure import measure
-from aolink.estimation.kalman.filter import GATE_PROBABILITY
 from aolink.estimation.kalman.gaussian import Gaussian
 from aolink.estimation.pixels import likelihood, modes
 from aolink.estimation.pixels.gaussian_mixture import GaussianMixture
@@ -20,7 +19,6 @@ from aolink.estimation.pixels.levenberg_marquardt import FIRST_DAMPING, FREE_DAM
 from aolink.estimation.pixels.modes import (
     Modes,
     find_modes,
-    innovation,
     modes_of,
     spread_starts,
     without_repeats,
@@ -186,9 +184,9 @@ def test_a_mode_is_where_the_gradient_is_zero(pair):
 def test_modes_that_repeat_another_are_left_out():
     rng = np.random.default_rng(3)
     mean, root = rng.standard_normal((20, 7, 3)) * 0.4, np.linalg.cholesky(0.3 * np.eye(3) + 0.1)
-    evidence, distance, objective = rng.standard_normal((3, 20, 7))
+    evidence, total, residual, objective = rng.standard_normal((4, 20, 7))
     evidence[0, 2] = -np.inf
-    modes = Modes(mean, np.tile(root @ root.T, (20, 7, 1, 1)), evidence, distance, objective)
+    modes = Modes(mean, np.tile(root @ root.T, (20, 7, 1, 1)), evidence, total, residual, objective)
     ours, kept = without_repeats(modes), []
     for axis in range(20):
         own: list[int] = []
@@ -198,7 +196,7 @@ def test_modes_that_repeat_another_are_left_out():
                 own.append(j)
         kept.append(own)
         there = slice(0, len(own))
-        for field in ("mean", "covariance", "log_evidence", "distance", "objective"):
+        for field in ("mean", "covariance", "log_evidence", "total", "residual", "objective"):
             np.testing.assert_array_equal(getattr(ours, field)[axis, there], getattr(modes, field)[axis, own])
         assert np.all(ours.log_evidence[axis, len(own) :] == -np.inf)
         assert ours.best[axis] == np.argmin(objective[axis, own])
@@ -206,19 +204,16 @@ def test_modes_that_repeat_another_are_left_out():
     assert 20 < 140 - sum(map(len, kept)) < 120
 
 
-def test_the_innovation_is_that_of_the_twin(pair):
-    view, in_numpy, state = pair
+@pytest.mark.parametrize("kind", [kind for kind in KINDS if kind != "shot noise"])  # whose dim pixels count otherwise
+def test_chi_squares_at_a_mode_are_those_of_the_twin(kind):
+    view, in_numpy, state = looked_at(kind)
     prior = view.reduced.prior(state)
-    found = find_modes(view, prior, whitened(prior, by_moments(view, prior).mean[:, None]))
-    ours, k = innovation(view, prior, found), innovation(view, prior, found).value.shape[1]
-    value, information, _, square = plain.innovations(in_numpy, prior, found.mean[:, 0], k)
-    # In a direction of next to no information, the innovation is the noise along any direction of the pixels.
-    tells = information > 1e-5 * information[:, :1]
-    np.testing.assert_allclose(ours.value[tells] ** 2, value[tells] ** 2, rtol=0.02, atol=0.02)
-    np.testing.assert_allclose(np.einsum("aii->ai", ours.covariance), 1 + information, rtol=5e-3, atol=1e-3)
-    degrees = view.mask.sum(axis=1) + found.mean.shape[2]
-    total = square + found.distance[:, 0]
-    np.testing.assert_array_equal(ours.within_gate, total <= stats.chi2(degrees).isf(GATE_PROBABILITY))
+    starts = whitened(prior, by_moments(view, prior).mean[:, None])
+    ours, theirs = settled_modes(view, prior, starts), settled_modes(in_numpy, prior, starts)
+    same = np.abs(ours.objective - theirs.objective) < 0.02
+    assert same.mean() > 0.8
+    np.testing.assert_allclose(ours.total[same], theirs.total[same], rtol=0.01, atol=0.1)
+    np.testing.assert_allclose(ours.residual[same], theirs.residual[same], rtol=0.01, atol=0.1)
 
 
 SPOTS = load_rig("single-lenslet")

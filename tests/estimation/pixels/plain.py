@@ -127,10 +127,13 @@ def find_modes(view, prior, starts):
     _, log_H = np.linalg.slogdet(hessian)
     evidence = -objective - 0.5 * log_H
     mean = m[:, 0] + batched.matvec(L, s)
-    shape = (axes, count)
+    score, information = (value[:, 0] for value in rows.information(rows.predicted(mean[:, None])))
+    square = (score**2 / np.where(information > 0, information, 1.0)).reshape(len(mean), -1).sum(axis=1)
+    free = n - np.trace(np.linalg.inv(hessian), axis1=1, axis2=2)
+    numbers = (evidence, square + batched.dot(s, s), square + free, objective)
     return modes.Modes(
-        mean.reshape(*shape, n), batched.symmetric(covariance).reshape(*shape, n, n), evidence.reshape(shape),
-        batched.dot(s, s).reshape(shape), objective.reshape(shape),
+        mean.reshape(axes, count, n), batched.symmetric(covariance).reshape(axes, count, n, n),
+        *(value.reshape(axes, count) for value in numbers),
     )  # fmt: skip
 
 
@@ -210,24 +213,6 @@ def with_more(found, axes, more):
     for room, new in zip(spread, more, strict=True):
         room[axes] = new
     return modes.Modes(*(np.concatenate(each, axis=1) for each in zip(found, spread, strict=True)))
-
-
-def innovations(view, prior, t, k):
-    """Innovations at points t (axes, n) in k directions: values, S^2, NIS, and e'e with e = R^(-1/2) (y - f)."""
-    L, s = cholesky(prior.covariance), whitened(prior, t[:, None])[:, 0]
-    f, J = view.linearised(t[:, None])
-    score, information = (each[:, 0] for each in view.information(f))
-    root = np.sqrt(information)
-    A = batched.matmul(J[:, 0] * root[..., None], L)
-    e = score / np.where(root > 0, root, 1.0)
-    values, V = np.linalg.eigh(batched.matmul(batched.transpose(A), A))
-    values, V = np.maximum(values[:, ::-1][:, :k], 0.0), V[:, :, ::-1][:, :, :k]
-    S = np.sqrt(values)
-    # The innovation is zero in a direction about which the pixels have no information.
-    tells = values > modes.NO_INFORMATION * values[:, :1]
-    pull = batched.matvec(batched.transpose(batched.matmul(A, V)), e)
-    u = np.where(tells, pull / np.where(tells, S, 1.0), 0.0) + S * batched.matvec(batched.transpose(V), s)
-    return u, values, np.add.reduce(u * u / (1 + values), axis=1), batched.dot(e, e)
 
 
 def settled_modes(view, prior, starts):
