@@ -1,8 +1,8 @@
 """The verdict's evidence, gathered exposure by exposure; and the wider intervals where the model does not fit.
 
-The evidence is what the estimator has computed: its innovation, and of `profile` the residuals of the pixels at the most
-likely path. Each exposure gives numbers that are standard normal where the model is right (squares by Wilson & Hilferty,
-Proc. Natl. Acad. Sci. 17 (1931)), and the sums over the newest exposures decide:
+The evidence is what the estimator has computed: its innovation, and of `profile` the residuals of the pixels at the
+most likely path. Each exposure gives numbers that are standard normal where the model is right (squares by Wilson &
+Hilferty, Proc. Natl. Acad. Sci. 17 (1931)), and the sums over the newest exposures decide:
 
 - *pixels*: the residuals, and the light that was measured (the moment of order 0);
 - *motion*: the squared errors with which the spot's mean position was predicted;
@@ -24,7 +24,7 @@ import numpy as np
 
 from aolink.estimation.estimate import Estimate, Status
 from aolink.estimation.verdict import Fit, Verdict
-from aolink.numerics.arrays import FloatArray, IntArray
+from aolink.numerics.arrays import BoolArray, FloatArray, IntArray
 from aolink.rig import Rig
 
 FIRST = 8
@@ -56,7 +56,7 @@ class Shown(NamedTuple):
 
 
 class Judge:
-    """Judges the estimates of one estimator on a rig. ``orders`` are those of the moments that it measures of a spot."""
+    """Judges the estimates of one estimator on a rig; ``orders`` are those of the moments that it measures."""
 
     def __init__(self, rig: Rig, orders: IntArray) -> None:
         self._position, self._light = (np.flatnonzero(orders == order) for order in (1, 0))
@@ -86,7 +86,7 @@ class Judge:
                 self.verdict = replace(after, since=since)
         return widened(estimate, self.verdict)
 
-    def _shown_by(self, estimate: Estimate, seen: FloatArray, residual: FloatArray | None) -> Shown:
+    def _shown_by(self, estimate: Estimate, seen: BoolArray, residual: FloatArray | None) -> Shown:
         innovation, degrees = estimate.innovation[seen], estimate.innovation.shape[1]
         variance = np.einsum("amm->am", estimate.innovation_covariance[seen])
         whole = estimate.coefficients.shape[1] > estimate.start_state.shape[1]
@@ -104,7 +104,9 @@ class Judge:
             pixels.append(as_normal(sums, counts).mean())
             ratios.append((sums / counts).mean())
         motion = float(as_normal(squares, 1).mean())
-        return Shown(float(max(pixels, key=abs)), motion, nis, np.clip(position, -_MOST, _MOST), min(max(ratios), _WIDEST))
+        return Shown(
+            float(max(pixels, key=abs)), motion, nis, np.clip(position, -_MOST, _MOST), min(max(ratios), _WIDEST)
+        )
 
     def _noise_inside(self, estimate: Estimate) -> FloatArray:
         """Variance of the mean path by the process noise inside the exposure, (outputs,)."""

@@ -429,3 +429,21 @@ def test_the_compiled_loop_is_the_filter_in_arrays(name):
         for field in ("start_state", "start_covariance", "end_state", "end_covariance", "innovation", "nis"):
             np.testing.assert_allclose(getattr(one, field), getattr(two, field), rtol=1e-9, atol=1e-12)
     assert {each.status for each in ours} >= {Status.OK, Status.GATED}
+
+
+@pytest.mark.parametrize("name", ["o1", "o3", "moments", "profile"])
+@pytest.mark.parametrize("rig_name", ["section-vi-lively", "tip-tilt"])
+def test_a_session_may_begin_while_the_plant_moves(rig_name, name):
+    """The first exposure widens a prior that does not know of it: no frame is refused, and the next ones are right."""
+    rig = load_rig(rig_name)
+    away = np.sqrt(np.diag(rig.plant.initial_covariance))
+    rig = dataclasses.replace(
+        rig, plant=dataclasses.replace(rig.plant, initial_covariance=rig.plant.initial_covariance / 30**2)
+    )
+    moving = dataclasses.replace(rig, plant=dataclasses.replace(rig.plant, initial_mean=rig.plant.initial_mean + away))
+    exposures = list(simulate(moving, 30, seed=3))
+    estimates = run(rig, exposures, [name])[name]
+    assert {each.status for each in estimates} == {Status.OK}
+    errors = [np.abs(e.path - truth_of(x).path) / e.path_sd for e, x in zip(estimates, exposures, strict=True)]
+    assert np.mean(np.array(errors[:3]) < 5) > 0.8  # o3's one linearisation is about a prior that is far away
+    assert np.mean(np.array(errors) < 3) > 0.9

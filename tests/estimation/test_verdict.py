@@ -137,7 +137,9 @@ def test_numbers_of_a_right_model_are_standard_normal(rig: Rig, right: list[Expo
 
 def test_smoothing_sees_no_widened_covariance(rig: Rig) -> None:
     exposures = list(simulate(with_noise(rig, 6.0), EXPOSURES, seed=5))
-    wide, plain = (smooth(rig.plant, exposures, estimates_of(rig, exposures, judged=judged)) for judged in (True, False))
+    wide, plain = (
+        smooth(rig.plant, exposures, estimates_of(rig, exposures, judged=judged)) for judged in (True, False)
+    )
     assert wide[-1].verdict is not None
     assert wide[-1].verdict.widening > 1
     for one, other in zip(wide, plain, strict=True):

@@ -88,7 +88,9 @@ def test_a_plot_on_axes_of_its_own_or_on_those_given(name: str) -> None:
     np.testing.assert_array_equal(np.asarray(lines["truth"])[[0, 16], 1], truth.path[output, [0, -1]])
     assert len(paths.collections) == 1  # the blur
     drawn = {line.get_label(): line.get_ydata() for line in nis.get_lines()}
-    np.testing.assert_allclose(drawn["o3"], [each.nis.mean() for each in series.estimates("o3")])  # over the axes
+    np.testing.assert_allclose(
+        np.asarray(drawn["o3"]), [each.nis.mean() for each in series.estimates("o3")]
+    )  # over the axes
     assert "open-loop" not in drawn
     _, mine = pyplot.subplots(1, 2)
     assert series[2:5].plot(["o3"], axes=tuple(mine)) == tuple(mine)

@@ -38,6 +38,8 @@ class Step(NamedTuple):
     """The largest NIS of a measurement that is used."""
     patience: int
     """After so many measurements in a row that were not used, an axis starts again."""
+    most_wider: float
+    """NIS, over its expectation, of an axis's first measurement up to which that widens the prior."""
 
 
 class Series(NamedTuple):
@@ -139,7 +141,7 @@ def filter_series(step: Step, series: Series, carried: Carried, out: Filtered) -
             _optimal_gain(V, y, H, R, S, root, white, K)
             for i in range(m):
                 square += white[i] * white[i]
-            if widened or begun[axis] or not gate < square < math.inf:
+            if widened or begun[axis] or not gate < square < step.most_wider * m:
                 break
             for i in range(n):  # the plant moved before the first exposure
                 for j in range(n):

@@ -31,6 +31,9 @@ if TYPE_CHECKING:
 GATE_PROBABILITY = 1e-9
 PATIENCE = 3
 """After this many gated measurements in a row a filter starts again from the prediction without any measurement."""
+MOST_WIDER = 1e4
+"""NIS, over its expectation, of an axis's first measurement up to which that widens the prior: what is further away is
+no motion of the plant."""
 # Relative change of a covariance that counts as rounding.
 _SETTLED = 1e-13
 
@@ -79,7 +82,7 @@ class Filter(ABC):
 
     @property
     def orders(self) -> IntArray:
-        """Orders of the moments of a spot that it measures, (n_measurements,); none where it measures something else."""
+        """Orders of the moments of a spot that it measures, (n_measurements,); none where it measures no such."""
         return np.zeros(0, dtype=np.int64)
 
     @abstractmethod
@@ -139,7 +142,7 @@ class BlurFilter(Filter):
 
     @property
     def orders(self) -> IntArray:
-        return self.observation.moment_orders if self.observation else super().orders
+        return np.asarray(getattr(self.observation, "moment_orders", ()), dtype=np.int64)
 
     def bridge(self, inputs: FloatArray) -> None:
         if len(inputs):
@@ -210,7 +213,7 @@ class BlurFilter(Filter):
 def starts_wider(first: BoolArray, gate: FloatArray, limit: float, degrees: int) -> FloatArray | None:
     """How many times as large the prior's covariance is to be where the first measurement of an axis is beyond the
     gate, (axes,): the plant moved before the session, which its prior does not know. None where none is."""
-    wide = first & (gate > limit) & np.isfinite(gate)
+    wide = first & (gate > limit) & (gate < MOST_WIDER * degrees)
     return np.where(wide, gate / degrees, 1.0) if wide.any() else None
 
 
@@ -315,6 +318,7 @@ class PathFilter(BlurFilter):
                 mean_row=_own(model.mean_row), quadratic=_own(model.quadratic), first=1 in looks.orders,
                 second=2 in looks.orders, second_order=looks.second_order,
                 gains=_own(gains.reshape(-1, n, looks.n_measurements)), gate=self._gate, patience=PATIENCE,
+                most_wider=MOST_WIDER,
             )  # fmt: skip
         return self._of_model[1]
 

@@ -26,8 +26,6 @@ class Observation(Protocol[Data]):
     models_noise: bool
     """Whether the coefficients go on after the start state, to the process noise inside the exposure."""
     n_measurements: int
-    moment_orders: IntArray
-    """`Filter.orders`."""
 
     def update(self, model: ExposureModel, response: InputResponse, prior: Gaussian, measured: Data) -> Update:
         """Update the prior of the exposure's coefficients with the measurement."""

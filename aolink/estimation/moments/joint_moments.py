@@ -31,7 +31,6 @@ class JointObservation(ABC):
 
     needs = Needs(what="windows", least_usable=HALF, least_spots=HALF)
     models_noise = True
-    moment_orders = np.zeros(0, dtype=np.int64)
 
     left_out = LEFT_OUT
     """As in `JointPaths`."""

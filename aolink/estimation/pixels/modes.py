@@ -37,6 +37,7 @@ CONVERGED = 0.03
 APART = 0.7
 """Modes that are nearer to each other than this many standard deviations count as one."""
 
+
 class Modes(NamedTuple):
     """Modes of the posterior, (axes, starts, ...)."""
 
@@ -47,8 +48,8 @@ class Modes(NamedTuple):
     total: FloatArray
     """The pixels' chi-square plus |s|^2, the squared distance from the prior, (axes, starts)."""
     residual: FloatArray
-    """The pixels' chi-square plus the number of coefficients that they determine, n - tr(H^-1): the number of pixels, on
-    average, (axes, starts)."""
+    """The pixels' chi-square plus the number of coefficients that they determine, n - tr(H^-1), (axes, starts): on
+    average the number of pixels."""
     objective: FloatArray
     """-log p(s, y) up to a constant, (axes, starts)."""
 
@@ -128,4 +129,3 @@ def spread_starts(view: PixelView, prior: Gaussian, wide: Gaussian) -> tuple[Flo
 def precision_of_reversal(view: PixelView) -> float:
     """Precision with which a path is fitted to the reversal of another, one over slope units squared."""
     return 1 / (REVERSED_TO**2 * view.kernel_variance)
-

@@ -18,7 +18,6 @@ from aolink.estimation.pixels.gaussian_mixture import GaussianMixture
 from aolink.estimation.pixels.levenberg_marquardt import FIRST_DAMPING, FREE_DAMPING, LARGEST_DAMPING
 from aolink.estimation.pixels.modes import (
     Modes,
-    find_modes,
     modes_of,
     spread_starts,
     without_repeats,
