@@ -11,7 +11,7 @@ from aolink.estimation.frames.frame_data import Measurement, Needs
 from aolink.estimation.kalman.gaussian import Gaussian, Update
 from aolink.estimation.kalman.update import blocked_update
 from aolink.estimation.model.base import ExposureModel, InputResponse
-from aolink.numerics.arrays import FloatArray, IntArray
+from aolink.numerics.arrays import FloatArray
 from aolink.rig import Plant
 
 MOST_OUTPUTS = 2
