@@ -166,9 +166,9 @@ class Series(Sequence[Exposure]):
         Functions in ``also`` get the messages of a recording's other topics, by topic, as they are read; of a part of
         a recording these may include messages from before and after it.
         """
-        numbers = self.numbers
+        wanted = self.numbers if isinstance(self.numbers, range) else frozenset(self.numbers)
         for start, stop in self._runs():
-            yield from (each for each in self.source.steps(names, start, stop, also=also) if each.number in numbers)
+            yield from (each for each in self.source.steps(names, start, stop, also=also) if each.number in wanted)
 
     def _runs(self) -> Iterator[tuple[int, int]]:
         """First number and end of each part of the source that is read through."""

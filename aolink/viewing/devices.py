@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+from itertools import pairwise
 from typing import Any, Protocol
 
 import numpy as np
@@ -104,8 +105,9 @@ def log_drops(drawing: Drawing, timebase: Timebase, records: Sequence[Timed]) ->
     """Frames and chunks lost since the start: ``/connection/lost/frames``, ``/connection/lost/chunks``."""
     infos = [r.message for r in records]
     times = timebase.at_steps([m.first_step for m in infos], [m.frame_id for m in infos])
-    frames = np.cumsum([m.frames_lost_before for m in infos])
-    chunks = np.cumsum([m.chunks_lost for m in infos])
+    lost = [drawing.lost, *((m.frames_lost_before, m.chunks_lost) for m in infos)]
+    frames, chunks = np.cumsum(lost, axis=0)[1:].T
+    drawing.lost = (int(frames[-1]), int(chunks[-1]))
     send_line(drawing, f"{LOST}/frames", times, frames, Style("frames lost", (240, 80, 80), width=2.5, steps=True))
     send_line(drawing, f"{LOST}/chunks", times, chunks, Style("chunks lost", (250, 170, 90), steps=True))
 
@@ -116,7 +118,8 @@ def log_connection(drawing: Drawing, timebase: Timebase, records: Sequence[Timed
     ``/connection/faults/DEVICE`` and, for causes that occurred, ``/connection/faults/DEVICE/CAUSE`` (since the start),
     ``/connection/round_trip/DEVICE`` (ms), ``/connection/received/DEVICE`` (kB/s).
     """
-    for d, (device, samples) in enumerate(_by_device(records).items()):
+    for device, samples in _by_device(records).items():
+        known, d = drawing.device(device), drawing.device(device).number
         host = np.array([r.log_time_ns for r in samples], dtype=np.int64)
         times, plain = timebase.at_host(host), series_colour(d)
         counts = np.array([[getattr(r.message, field) for field in CONNECTION_COUNTS] for r in samples])
@@ -129,21 +132,27 @@ def log_connection(drawing: Drawing, timebase: Timebase, records: Sequence[Timed
         trip = np.array([r.message.round_trip_s for r in samples]) * 1e3
         if not np.isnan(trip).all():
             send_line(drawing, f"{ROUND_TRIP}/{device}", times, trip, Style(f"{device} round trip", plain))
-        rate = np.diff([r.message.bytes_received for r in samples]) / np.maximum(np.diff(host), 1) * 1e6
-        send_line(drawing, f"{RECEIVED}/{device}", timebase.at_host(host[1:]), rate, Style(f"{device} to host", plain))
+        received = [*known.received, *((r.log_time_ns, r.message.bytes_received) for r in samples)]
+        known.received = received[-1:]
+        rate = [(now - before) / max(at - last, 1) * 1e6 for (last, before), (at, now) in pairwise(received)]
+        times = timebase.at_host([at for at, _ in received[1:]])
+        send_line(drawing, f"{RECEIVED}/{device}", times, rate, Style(f"{device} to host", plain))
 
 
 def log_clock(drawing: Drawing, timebase: Timebase, records: Sequence[Timed]) -> None:
     """The regression of each device's clock on the host's: ``/clock/NAME/DEVICE`` for each of `CLOCKS`; the offset is
     that since the first sample."""
-    for d, (device, samples) in enumerate(_by_device(records).items()):
+    for device, samples in _by_device(records).items():
+        known = drawing.device(device)
         messages = [r.message for r in samples]
         times = timebase.at_host([m.host_receive_ns for m in messages])
         for name, (_, label, field, unit) in CLOCKS.items():
             values = np.array([getattr(m, field) for m in messages], dtype=np.float64)
             if name == "offset":
-                values -= next(iter(values[np.isfinite(values)]), np.nan)
-            style = Style(f"{device} {label}", series_colour(d))
+                if np.isnan(known.offset_ns):
+                    known.offset_ns = next(iter(values[np.isfinite(values)]), np.nan)
+                values -= known.offset_ns
+            style = Style(f"{device} {label}", series_colour(known.number))
             send_line(drawing, f"{CLOCK}/{name}/{device}", times, unit * values, style)
 
 

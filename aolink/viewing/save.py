@@ -109,7 +109,8 @@ def sent_parts(
 
 
 class RecordingSender(Sender):
-    """Sends a recording to a stream, part by part, so that the memory does not grow with its length."""
+    """Sends a recording to a stream, part by part: no more than a part is in memory. Rerun itself keeps the places of
+    what it has written, some 2 kB for each exposure."""
 
     def __init__(self, stream: rr.RecordingStream, recording: Recording, look: Look) -> None:
         check_stands_alone(recording)
@@ -126,16 +127,14 @@ class RecordingSender(Sender):
         """Send the exposures with all that belongs to them, then the devices; gives after each part how many exposures
         are sent."""
         recording, look, drawing = self._recording, self._look, self.drawing
-        runs: list[RecordedMessage] = []
-        others: list[RecordedMessage] = []
+        messages: list[RecordedMessage] = []
         restorations, starts = Restorations(), dict[int, int]()
-        kept = {topic: runs if topic in topics.RUNS else others for topic in recording.counts if _shows(topic)}
+        shown = [topic for topic in recording.counts if _shows(topic)]
         also: dict[str, Callable[[RecordedMessage], None]] = dict.fromkeys(Restorations.TOPICS, restorations.see)
         if look.exposures is None:
-            also |= {topic: messages.append for topic, messages in kept.items()}
+            also |= dict.fromkeys(shown, messages.append)
         else:
-            for message in self._messages(list(kept)):
-                kept[message.topic].append(message)
+            messages += self._messages(shown)
         for steps, following in self._read(also):
             timebase = self.send(steps, following=following)
             for each in steps:
@@ -145,13 +144,13 @@ class RecordingSender(Sender):
             if topics.RESTORATION in recording.counts:
                 starts |= {each.exposure.frame_id: each.exposure.first_step for each in steps}
                 scene.log_restored(drawing, timebase, starts, list(restorations.taken()))
-            _send_messages(drawing, timebase, runs)
+            _send_messages(drawing, timebase, messages)
             yield self.sent
         if self.timebase is None:
             raise ViewerError(
                 f"there is no exposure in {recording.path}, so nothing to view; `aolink info` says what it holds"
             )
-        _send_messages(drawing, self.timebase, runs + others)
+        _send_messages(drawing, self.timebase, messages)
         scene.log_restored(drawing, self.timebase, starts, list(restorations.taken(ended=True)))
         for k, (name, loop) in enumerate(look.loops.items()):
             part = loop[look.exposures.start : look.exposures.stop] if look.exposures is not None else loop

@@ -26,6 +26,17 @@ _SECOND = 0.55
 
 
 @dataclass(kw_only=True)
+class Device:
+    """What has been drawn of a device so far."""
+
+    number: int
+    offset_ns: float = float("nan")
+    """The first offset of its clock."""
+    received: list[tuple[int, int]] = field(default_factory=list)
+    """Host time, ns, and bytes received at its newest statistics; empty before the first."""
+
+
+@dataclass(kw_only=True)
 class Drawing:
     """A stream into a file or a viewer, the options of the drawing, and what has been drawn so far, which the layout
     depends on."""
@@ -46,10 +57,16 @@ class Drawing:
     """Maps over the lenslets, and the value at the end of each one's colours."""
     extents: dict[str, tuple[float, float]] = field(default_factory=dict)
     """The least and the largest value of each entity's lines."""
+    styles: dict[str, tuple[Any, ...]] = field(default_factory=dict)
+    """The style of each line, and what the legend adds."""
     swinging: dict[str, bool] = field(default_factory=dict)
     """Whether a path swings more than its points show, so that its range is drawn; by its name."""
     states: dict[str, str] = field(default_factory=dict)
     """The last state of each lane."""
+    lost: tuple[int, int] = (0, 0)
+    """Frames and chunks lost so far."""
+    devices: dict[str, Device] = field(default_factory=dict)
+    """The devices by their names, in the order in which they came."""
 
     @cached_property
     def outputs(self) -> list[int]:
@@ -66,6 +83,10 @@ class Drawing:
     def labels(self) -> tuple[str, ...]:
         """The text that the legend adds for each output."""
         return (" x", " y") if len(self.outputs) == 2 else ("",)
+
+    def device(self, name: str) -> Device:
+        """What has been drawn of a device so far."""
+        return self.devices.setdefault(name, Device(number=len(self.devices)))
 
     def log(self, path: str, what: Any) -> None:
         """Log data that is valid for the whole session."""
@@ -120,7 +141,9 @@ def send_line(
         widths=[style.width] * lines,
         interpolation_mode="StepAfter" if style.steps else None,  # without a style a line is linear
     )
-    drawing.log(path, look)
+    if drawing.styles.get(path) != (style, *labels):  # Rerun keeps the place of all that it is sent
+        drawing.styles[path] = (style, *labels)
+        drawing.log(path, look)
     drawing.send_columns(path, times, rr.Scalars.columns(scalars=columns))
     if np.isfinite(columns).any():
         low, high = drawing.extents.get(path, (np.inf, -np.inf))

@@ -18,6 +18,8 @@ from aolink.exposure import Exposure
 from aolink.numerics.arrays import IntArray
 from aolink.rig import Rig
 
+_KEPT = 1000
+"""Exposures before the ones that are sent whose times are kept: a session may go on for days."""
 FAST_STEP = "fast_step"
 TIME = "time"
 FRAME = "frame"
@@ -36,7 +38,7 @@ class Timebase:
     origin_ns: int
     """The start of that exposure on the device's clock, ns: the zero of the timeline of seconds."""
     device_ns: IntArray
-    """Starts of exposures on the device's clock, ns, (n,)."""
+    """Starts of the newest exposures on the device's clock, ns, (n,)."""
     host_ns: IntArray
     """The same starts on the host's clock, ns, (n,)."""
 
@@ -56,9 +58,13 @@ class Timebase:
         )  # fmt: skip
 
     def followed_by(self, exposures: Sequence[Exposure]) -> Timebase:
-        """The timebase with the times of later exposures added."""
+        """The timebase with the times of later exposures added, without those of a past that no message belongs to."""
         device, host = ([getattr(e, name) for e in exposures] for name in ("device_start_ns", "host_start_ns"))
-        return replace(self, device_ns=np.append(self.device_ns, device), host_ns=np.append(self.host_ns, host))
+        return replace(
+            self,
+            device_ns=np.append(self.device_ns[-_KEPT:], device),
+            host_ns=np.append(self.host_ns[-_KEPT:], host),
+        )
 
     def device_of_step(self, steps: ArrayLike) -> IntArray:
         """Device time at which a fast step begins, ns."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,8 @@ from aolink.plotting.report import write_report
 from aolink.recording import scan
 from aolink.recording.reader import Recording
 from aolink.recording.reestimate import scored_anew, write_reestimated
+from aolink.rig import load_rig
+from aolink.series import NOTHING, Also, Series, Step
 from aolink.viewing import save_rrd
 from tests.needs import needed
 
@@ -157,3 +159,33 @@ def test_a_recording_is_read_once(what: str, most: int, tmp_path: Path, monkeypa
     read = chunks_read(work[what], monkeypatch)
     assert len(read) >= len(recording.chunk_index or ())
     assert sum(read.values()) <= most * len(read)
+
+
+def test_a_mask_costs_no_more_for_each_exposure_of_a_long_series() -> None:
+    """As many comparisons of numbers as there are exposures, and not their square."""
+    compared = 0
+
+    class Number(int):
+        __hash__ = int.__hash__
+
+        def __eq__(self, other: object) -> bool:
+            nonlocal compared
+            compared += 1
+            return int(self) == other
+
+    class Source:
+        def __init__(self) -> None:
+            self.exposures = list(aolink.simulate("section-vi", n_exposures=1, seed=1)) * 1000
+            self.rig, self.path, self.metadata = load_rig("section-vi"), LIVELY, dict[str, str]()
+            self.estimators, self.has_truth, self.damage = list[str](), False, ""
+
+        def __len__(self) -> int:
+            return len(self.exposures)
+
+        def steps(
+            self, names: Sequence[str] = (), start: int = 0, stop: int | None = None, *, also: Also = NOTHING
+        ) -> Iterator[Step]:
+            return (Step(Number(k), each) for k, each in enumerate(self.exposures[start:stop], start))
+
+    assert len(list(Series(Source())[np.arange(1000) % 3 > 0])) == 666
+    assert compared < 3000

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import resource
 import subprocess
 import sys
@@ -24,12 +25,13 @@ from aolink.optics.kernel import exposure_density
 from aolink.plain import plain_data
 from aolink.recording import topics
 from aolink.recording.editing import cut, merge
+from aolink.recording.messages import RecordedMessage
 from aolink.recording.reader import Recording
 from aolink.rig import load_rig
 from aolink.series import Step
 from aolink.session import record
 from aolink.session.replay import replay
-from aolink.viewing import LiveView
+from aolink.viewing import LiveView, save
 from aolink.viewing.camera import HISTORY
 from aolink.viewing.incidents import log_status, log_warnings
 from aolink.viewing.motion import log_estimates
@@ -407,6 +409,30 @@ def test_a_file_that_cannot_be_written_is_one_clear_error_and_leaves_nothing(
 
 
 @pytest.mark.slow
+def test_of_a_long_session_one_part_is_in_memory_and_its_lines_go_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with simulated_rig("section-vi-lively", "--fault", "missing=0.2") as ports:
+        record(load_rig("section-vi-lively"), *ports, tmp_path / "a.mcap", exposures=8 * HISTORY)
+    recording, alive, drawn = Recording(tmp_path / "a.mcap"), list[int](), list[Entities]()
+    for pages in (1, 100):
+        monkeypatch.setattr(save, "_PAGES", pages)
+        save_rrd(
+            recording, path := tmp_path / f"{pages}.rrd",
+            progress=lambda _: alive.append(sum(isinstance(each, RecordedMessage) for each in gc.get_objects())),
+        )  # fmt: skip
+        drawn.append(read_rrd(path))
+    assert alive[0] >= max(alive)
+    lines = [each for each in drawn[1] if each.startswith(("/clock", "/connection", "/status"))]
+    assert len(lines) > 12
+    for entity in lines:
+        ours, theirs = ([v for v in each[entity]["fast_step"] if v is not None] for each in drawn)
+        np.testing.assert_allclose(ours, theirs, atol=1, err_msg=entity)
+        for column in drawn[1][entity].keys() & {"Scalars:scalars", "StateChange:state"}:
+            ours, theirs = ([v for v in each[entity][column] if v is not None] for each in drawn)
+            assert ours == theirs, entity
+
+
 def test_fed_exposure_by_exposure_it_shows_what_the_file_shows(recorded: Session, tmp_path: Path) -> None:
     """Frames, paths, errors and states are those of `save_rrd`; only the brightness follows the first frame."""
     recording = Recording(recorded.path)

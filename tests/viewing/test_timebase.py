@@ -1,8 +1,11 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from aolink import simulate
 from aolink.errors import ViewerError
 from aolink.rig import load_rig
 from aolink.viewing.timebase import Timebase
@@ -41,3 +44,12 @@ def test_host_times_before_the_first_exposure_keep_its_offset() -> None:
 def test_no_exposure_is_one_clear_error() -> None:
     with pytest.raises(ViewerError, match="no exposure"):
         Timebase.of(load_rig("section-vi"), [])
+
+
+def test_it_keeps_the_newest_of_a_session_that_goes_on_for_long() -> None:
+    (exposure,), base = simulate("section-vi", n_exposures=1, seed=1), timebase()
+    for k in range(3000):
+        later = replace(exposure, device_start_ns=10**12 + k * 10**6, host_start_ns=2 * 10**18 + k * 10**6)
+        base = base.followed_by([later])
+    assert len(base.device_ns) == len(base.host_ns) < 1500
+    assert base.device_of_host([base.host_ns[-1] - 500_000])[0] == base.device_ns[-1] - 500_000
