@@ -57,6 +57,8 @@ class SerialPort:
     def __init__(self, url: str, baud_rate: int = BAUD_RATE, *, stop: Callable[[], bool] = lambda: False) -> None:
         self.url = url
         self._stop = stop
+        self._full_since_s: float | None = None
+        """Since when it has taken nothing: a dead line is waited for once, and not again by each who writes."""
         check_address(url)
         self._port: serial.SerialBase | socket.socket
         try:
@@ -99,14 +101,14 @@ class SerialPort:
 
     def write(self, data: bytes) -> None:
         # pyserial's own write cannot be interrupted and does not say how much went out before a time-out.
-        start = time.monotonic()
         try:
             descriptor = self._port.fileno()
             while data:
                 with contextlib.suppress(BlockingIOError):
-                    data = data[os.write(descriptor, data) :]
+                    data, self._full_since_s = data[os.write(descriptor, data) :], None
                     continue
-                waited_s = time.monotonic() - start
+                self._full_since_s = self._full_since_s or time.monotonic()
+                waited_s = time.monotonic() - self._full_since_s
                 if waited_s > (_STOPPED_TIMEOUT_S if self._stop() else _WRITE_TIMEOUT_S):
                     raise PortError(f"{self.url} took no data for {waited_s:.0f} s; is the device running?")
                 wait_readable([], _SLICE_S, [descriptor])

@@ -9,6 +9,7 @@ import socket
 import tty
 from collections.abc import Iterator
 from contextlib import ExitStack, closing
+from typing import Any
 
 import pytest
 
@@ -145,6 +146,28 @@ def test_a_port_that_is_pulled_is_one_clear_error(peer: Peer, link: Link) -> Non
     os.close(descriptor)
     with pytest.raises(PortError, match="lost"):
         link.receive()
+
+
+def test_a_port_that_takes_nothing_is_waited_for_once(peer: Peer, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each who writes afterwards is refused at once, until it takes something."""
+    waits = 0
+
+    def counted(*arguments: Any) -> bool:
+        nonlocal waits
+        waits += 1
+        return wait_readable(*arguments)
+
+    monkeypatch.setattr("aolink.wire.port.wait_readable", counted)
+    monkeypatch.setattr("aolink.wire.port._WRITE_TIMEOUT_S", 0.3)
+    with closing(SerialPort(peer.path)) as port:
+        for first in (True, False):
+            with pytest.raises(PortError, match="took no data"):
+                port.write(bytes(1 << 20))
+            assert bool(waits) is first
+            waits = 0
+        while wait_readable([peer.master], 0.1):
+            os.read(peer.master, 1 << 20)
+        port.write(b"a")
 
 
 def test_a_port_that_is_not_there_is_refused() -> None:
