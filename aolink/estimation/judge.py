@@ -24,7 +24,7 @@ import numpy as np
 
 from aolink.estimation.estimate import Estimate, Status
 from aolink.estimation.verdict import Fit, Verdict
-from aolink.numerics.arrays import BoolArray, FloatArray, IntArray
+from aolink.numerics.arrays import FloatArray, IntArray
 from aolink.rig import Rig
 
 FIRST = 8
@@ -44,15 +44,16 @@ _MOST = 4.0
 
 
 class Shown(NamedTuple):
-    """What one exposure says; means over the axes, whose errors may be alike."""
+    """What one exposure says."""
 
-    pixels: float
-    motion: float
-    nis: float
-    position: FloatArray
-    """Error of the predicted mean position in its standard deviations, zero where there was none, (axes, outputs)."""
-    widening: float
-    """The largest of the squares over their expectation."""
+    innovation: FloatArray
+    """(axes, n_measurements)"""
+    covariance: FloatArray
+    """(axes, n_measurements, n_measurements)"""
+    nis: FloatArray
+    """(axes,), zero where nothing was measured."""
+    residual: FloatArray
+    """As in `Posterior`, (axes, 2)."""
 
 
 class Judge:
@@ -61,10 +62,10 @@ class Judge:
     def __init__(self, rig: Rig, orders: IntArray) -> None:
         self._position, self._light = (np.flatnonzero(orders == order) for order in (1, 0))
         self._able = 0 < len(self._position) == rig.plant.n_outputs <= 2 and rig.sensor.spot_light is None
+        self._no_residual = np.zeros((rig.plant.axes, 2))
         self._shown: deque[Shown] = deque(maxlen=WINDOW)
         self._gated: deque[bool] = deque(maxlen=WINDOW)
         self._exposures = 0
-        self._noise_of: tuple[object, FloatArray] = None, np.zeros(0)
         self.verdict = Verdict(fit=Fit.UNKNOWN)
 
     def take(self, estimate: Estimate, residual: FloatArray | None) -> Estimate:
@@ -77,45 +78,58 @@ class Judge:
         self._exposures += 1
         if self._exposures > FIRST:
             self._gated.append(estimate.status in _REFUSED)
-            seen = estimate.nis > 0
-            if seen.any():
-                self._shown.append(self._shown_by(estimate, seen, residual))
+            if estimate.innovation.shape[1]:
+                residual = self._no_residual if residual is None else residual
+                shown = Shown(estimate.innovation, estimate.innovation_covariance, estimate.nis, residual)
+                self._shown.append(shown)
             if len(self._gated) >= FEWEST and self._exposures % BETWEEN == 0:
-                after = judged(self._shown, float(np.mean(self._gated)), self.verdict)
+                after = judged(self._evidence(estimate), len(self._shown), float(np.mean(self._gated)), self.verdict)
                 since = self.verdict.since if after.fit is self.verdict.fit else estimate.frame_id
                 self.verdict = replace(after, since=since)
         return widened(estimate, self.verdict)
 
-    def _shown_by(self, estimate: Estimate, seen: BoolArray, residual: FloatArray | None) -> Shown:
-        innovation, degrees = estimate.innovation[seen], estimate.innovation.shape[1]
-        variance = np.einsum("amm->am", estimate.innovation_covariance[seen])
-        whole = estimate.coefficients.shape[1] > estimate.start_state.shape[1]
-        position = np.zeros((len(seen), len(self._position)))
-        spread = variance[:, self._position] + (0.0 if whole else self._noise_inside(estimate))
-        position[seen] = innovation[:, self._position] / np.sqrt(spread)
-        squares = position[seen] ** 2
-        ratios, pixels, nis = [squares.mean()], [0.0], 0.0
-        if whole:
-            nis = float(as_normal(estimate.nis[seen], degrees).mean())
-            ratios.append(estimate.nis[seen].mean() / degrees)
-            pixels += [as_normal(innovation[:, k] ** 2 / variance[:, k], 1).mean() for k in self._light]
-        if residual is not None:
-            sums, counts = residual[seen].T
-            pixels.append(as_normal(sums, counts).mean())
-            ratios.append((sums / counts).mean())
-        motion = float(as_normal(squares, 1).mean())
-        return Shown(
-            float(max(pixels, key=abs)), motion, nis, np.clip(position, -_MOST, _MOST), min(max(ratios), _WIDEST)
-        )
+    def _evidence(self, estimate: Estimate) -> Evidence:
+        """What the newest exposures say; ``estimate`` is the last of them."""
+        if not self._shown:
+            return Evidence(0.0, 0.0, 0.0, 0.0, 1.0)
+        innovation, covariance, nis, residual = (np.array(each) for each in zip(*self._shown, strict=True))
+        count, _, m = innovation.shape
+        seen, n = nis > 0, estimate.start_state.shape[1]
+        variance = np.where(seen[..., None], np.einsum("kamm->kam", covariance), 1.0)
+        with_noise = estimate.coefficients.shape[1] > n
+        inside = np.zeros(1) if with_noise else (estimate.model.basis[..., n:].mean(axis=1) ** 2).sum(axis=1)
+        position = innovation[..., self._position] / np.sqrt(variance[..., self._position] + inside)
+        squares = position**2
+        kinds = {"motion": (squares, 1)}
+        if with_noise:
+            light = innovation[..., self._light] ** 2 / variance[..., self._light]
+            kinds |= {"nis": (nis[..., None], m), "light": (light, 1)}
+        fitted, pixels = residual[..., :1], residual[..., 1:]
+        if pixels.any():
+            kinds["pixels"] = (fitted, np.maximum(pixels, 1.0))
+        # Means over the axes, whose errors may be alike.
+        share = seen / np.maximum(seen.sum(axis=1, keepdims=True), 1)
+        sums = {
+            name: float((as_normal(each, degrees).mean(axis=2) * share).sum()) / math.sqrt(count)
+            for name, (each, degrees) in kinds.items()
+        }
+        ratios = [((each / degrees).mean(axis=2) * share).sum(axis=1) for each, degrees in kinds.values()]
+        mean = np.abs(np.clip(position, -_MOST, _MOST).sum(axis=0)).max() / math.sqrt(count)
+        return Evidence(
+            pixels=max(sums.get("pixels", 0.0), sums.get("light", 0.0)), motion=sums["motion"], zero=float(mean),
+            nis=sums.get("nis", 0.0), square=float(np.minimum(np.max(ratios, axis=0), _WIDEST).mean()),
+        )  # fmt: skip
 
-    def _noise_inside(self, estimate: Estimate) -> FloatArray:
-        """Variance of the mean path by the process noise inside the exposure, (outputs,)."""
-        model, of = self._noise_of
-        if model is not estimate.model:
-            rows = estimate.model.basis[..., estimate.start_state.shape[1] :].mean(axis=1)
-            of = np.asarray((rows**2).sum(axis=1))
-            self._noise_of = estimate.model, of
-        return of
+
+class Evidence(NamedTuple):
+    """Sums over some exposures of numbers that are standard normal where the model is right, in standard errors."""
+
+    pixels: float
+    motion: float
+    zero: float
+    nis: float
+    square: float
+    """Mean of the largest of each exposure's squares over their expectations."""
 
 
 def as_normal(squares: FloatArray, degrees: FloatArray | int) -> FloatArray:
@@ -124,20 +138,18 @@ def as_normal(squares: FloatArray, degrees: FloatArray | int) -> FloatArray:
     return np.clip((np.cbrt(squares / degrees) - (1 - bend)) / np.sqrt(bend), -_MOST, _MOST)
 
 
-def judged(shown: deque[Shown], gated: float, before: Verdict) -> Verdict:
+def judged(found: Evidence, exposures: int, gated: float, before: Verdict) -> Verdict:
     """The verdict by some exposures, of which a share was gated; between the limits it stays as it was."""
-    root = math.sqrt(max(len(shown), 1))
-    numbers = {name: sum(getattr(each, name) for each in shown) / root for name in ("pixels", "motion", "nis")}
-    numbers["zero"] = float(np.abs(sum(each.position for each in shown)).max(initial=0.0)) / root
-    worst = max(gated / _GATED, *(numbers[name] / limit for name, limit in LIMITS.items()))
+    over = {name: getattr(found, name) / limit for name, limit in LIMITS.items()}
+    worst = max(gated / _GATED, *over.values())
     fit = Fit.DOES_NOT_FIT if worst > 1 else Fit.FITS if worst < FITS else before.fit
-    found = Verdict(fit=fit, exposures=len(shown), **numbers)
+    numbers = {name: getattr(found, name) for name in LIMITS}
     if fit is not Fit.DOES_NOT_FIT:
-        return found
-    kind = max(("pixels", "motion", "zero"), key=lambda name: numbers[name] / LIMITS[name])
-    told = gated <= _GATED and numbers[kind] > LIMITS[kind]
-    widening = math.sqrt(max(1.0, float(np.mean([each.widening for each in shown]))))
-    return replace(found, kind=kind if told else "", widening=widening)
+        return Verdict(fit=fit, exposures=exposures, **numbers)
+    kind = max(("pixels", "motion", "zero"), key=over.__getitem__)
+    kind = kind if gated <= _GATED and over[kind] > 1 else ""
+    widening = math.sqrt(max(1.0, found.square))
+    return Verdict(fit=fit, kind=kind, exposures=exposures, widening=widening, **numbers)
 
 
 def widened(estimate: Estimate, verdict: Verdict) -> Estimate:
