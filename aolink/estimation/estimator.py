@@ -29,7 +29,7 @@ class Estimator:
 
     def __init__(self, rig: Rig, name: str, filter: Filter) -> None:
         self.rig, self.name, self.filter = rig, name, filter
-        self.several: NDArray[np.bool_] | None = None
+        self.is_multimodal: NDArray[np.bool_] | None = None
         """Axes whose last posterior has several modes (more than one path explains the blur), (axes,); None if the
         filter does not search for modes."""
         self.posterior: Posterior | None = None
@@ -128,7 +128,7 @@ class Estimator:
     def _estimate(
         self, exposure: Exposure, model: ExposureModel, posterior: Posterior, reasons: Sequence[str]
     ) -> Estimate:
-        self.several, self.posterior = posterior.several, posterior
+        self.is_multimodal, self.posterior = posterior.is_multimodal, posterior
         n, covariance = self.rig.plant.n_states, as_recorded(posterior.coefficients.covariance)
         return Estimate(
             estimator=self.name, frame_id=exposure.frame_id, first_step=exposure.first_step, n_steps=exposure.n_steps,
@@ -184,8 +184,8 @@ def _status_reasons(posterior: Posterior) -> list[str]:
         if counts[status]:
             nis = f"NIS {posterior.nis[posterior.status == status].max():.3g}"
             reasons.append(f"{nis}, {text}" if axes == 1 else f"{counts[status]} of {axes} axes: {nis}, {text}")
-    if posterior.several is not None and posterior.several.any():
-        of = "" if axes == 1 else f"{int(posterior.several.sum())} of {axes} axes: "
+    if posterior.is_multimodal is not None and posterior.is_multimodal.any():
+        of = "" if axes == 1 else f"{int(posterior.is_multimodal.sum())} of {axes} axes: "
         reasons.append(f"{of}more than one path explains the blur")
     if posterior.remark:
         reasons.append(posterior.remark)

@@ -68,9 +68,9 @@ class Carried(NamedTuple):
     """(axes, n)"""
     covariance: FloatArray
     """(axes, n, n)"""
-    unseen_mean: FloatArray
+    model_only_mean: FloatArray
     """The prediction without any measurement, (axes, n)."""
-    unseen_covariance: FloatArray
+    model_only_covariance: FloatArray
     """One for all axes, (n, n)."""
     missed: IntArray
     """Measurements in a row that were not used, (axes,)."""
@@ -111,7 +111,7 @@ def filter_series(step: Step, series: Series, carried: Carried, out: Filtered) -
     A, Q, gains, gate, patience = step.transition, step.noise, step.gains, step.gate, step.patience
     C_bar, M, first, second, second_order = step.mean_row, step.quadratic, step.first, step.second, step.second_order
     means, slopes, squares, kicks, values, noises, usable = series
-    x, P, unseen, unseen_P, missed, begun = carried
+    x, P, model_only, model_only_P, missed, begun = carried
     start, start_P, end, end_P, innovation, spread, nis, used, again, missed_by_then = out
     (axes, n), m = x.shape, values.shape[1]
     s, after, y, white = np.empty(n), np.empty(n), np.empty(m), np.empty(m)
@@ -122,9 +122,9 @@ def filter_series(step: Step, series: Series, carried: Carried, out: Filtered) -
         axis = row % axes
         restarts = missed[axis] >= patience
         for i in range(n):
-            s[i] = unseen[axis, i] if restarts else x[axis, i]
+            s[i] = model_only[axis, i] if restarts else x[axis, i]
             for j in range(n):
-                V[i, j] = unseen_P[i, j] if restarts else P[axis, i, j]
+                V[i, j] = model_only_P[i, j] if restarts else P[axis, i, j]
         passes, square = False, 0.0
         for i in range(m):
             y[i] = 0.0
@@ -171,13 +171,13 @@ def filter_series(step: Step, series: Series, carried: Carried, out: Filtered) -
                 end[row, i] += A[i, j] * s[j]
                 start_P[row, i, j], end_P[row, i, j], P[axis, i, j] = V[i, j], updated[i, j], updated[i, j]
         for i in range(n):
-            x[axis, i], s[i] = end[row, i], unseen[axis, i]
+            x[axis, i], s[i] = end[row, i], model_only[axis, i]
         for i in range(n):
-            unseen[axis, i] = kicks[row, i]
+            model_only[axis, i] = kicks[row, i]
             for j in range(n):
-                unseen[axis, i] += A[i, j] * s[j]
+                model_only[axis, i] += A[i, j] * s[j]
         if axis == axes - 1:
-            _congruence(A, unseen_P, product, Q, unseen_P)
+            _congruence(A, model_only_P, product, Q, model_only_P)
 
 
 @inlined

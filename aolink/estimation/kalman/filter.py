@@ -53,7 +53,7 @@ class Posterior:
     """(axes, n_measurements, n_measurements), or its diagonal for many measurements, (axes, n_measurements)."""
     nis: FloatArray
     """(axes,)"""
-    several: BoolArray | None = None
+    is_multimodal: BoolArray | None = None
     """Whether several modes of the posterior were found (more than one path explains the blur), (axes,); None where
     they are not searched for."""
     remark: str = ""
@@ -127,7 +127,7 @@ class BlurFilter(Filter):
         )
         """The state after the last exposure or bridge: the next exposure starts there."""
         # The prediction without any measurement; its covariance is that of every axis, (1, n_states, n_states).
-        self._unseen = Gaussian(prior.mean, prior.covariance[:1])
+        self._from_model_only = Gaussian(prior.mean, prior.covariance[:1])
         # The transition that no longer changes that covariance; None until it has settled.
         self._settled_under: FloatArray | None = None
         self._missed = np.zeros(plant.axes, dtype=np.int64)
@@ -148,43 +148,43 @@ class BlurFilter(Filter):
         if len(inputs):
             over = over_steps(self.plant, inputs)
             self.prior = self._predict(self.prior, *over)
-            self._predict_unseen(*over)
+            self._predict_from_model_only(*over)
 
     def step(self, model: ExposureModel, response: InputResponse, measured: Any | None) -> Posterior:
-        axes, looks = self.plant.axes, self.observation
+        axes, observation = self.plant.axes, self.observation
         lost = self._missed >= PATIENCE
-        prior = _where(lost, self._unseen, self.prior)
-        with_noise = looks is None or looks.models_noise
+        prior = _where(lost, self._from_model_only, self.prior)
+        with_noise = observation is None or observation.models_noise
         if with_noise:
             prior = prior.with_noise(model.n_coefficients)
-        if measured is None or looks is None:
+        if measured is None or observation is None:
             done = Update(prior, np.zeros((axes, 0)), np.zeros((axes, 0, 0)), np.zeros(axes))
-            status = np.full(axes, Status.PREDICTED if looks is None else Status.INPUT_INVALID, dtype=np.int64)
+            status = np.full(axes, Status.PREDICTED if observation is None else Status.INPUT_INVALID, dtype=np.int64)
             coefficients = prior
         else:
-            done = _without(looks.update(model, response, prior, measured), measured.usable)
-            wide = starts_wider(~self._begun, _gated(done), self._gate, looks.n_measurements)
+            done = _without(observation.update(model, response, prior, measured), measured.usable)
+            wide = starts_wider(~self._begun, _gated(done), self._gate, observation.n_measurements)
             if wide is not None:
                 prior = _scaled(prior, wide, model.plant.n_states)
-                done = _without(looks.update(model, response, prior, measured), measured.usable)
+                done = _without(observation.update(model, response, prior, measured), measured.usable)
             coefficients, status = self._trusted(prior, done, lost, measured.usable)
         if with_noise:
             self.prior = predict(coefficients, model.end_rows, model.end_remainder, response.end)
         else:
             self.prior = self._predict(coefficients, model.transition, model.process_noise, response.end)
-        self._predict_unseen(model.transition, model.process_noise, response.end)
+        self._predict_from_model_only(model.transition, model.process_noise, response.end)
         return Posterior(
             coefficients=coefficients, end=self.prior, status=status, innovation=_numbers(done.innovation),
             innovation_covariance=_numbers(_kept(done.innovation_covariance)), nis=_numbers(done.nis),
         )  # fmt: skip
 
-    def _predict_unseen(self, transition: FloatArray, noise: FloatArray, kick: FloatArray) -> None:
-        """Predict `_unseen`; a covariance that has settled is not computed again."""
-        before = self._unseen
+    def _predict_from_model_only(self, transition: FloatArray, noise: FloatArray, kick: FloatArray) -> None:
+        """Predict `_from_model_only`; a covariance that has settled is not computed again."""
+        before = self._from_model_only
         if transition is self._settled_under:
-            self._unseen = Gaussian(predicted_mean(before.mean, transition, kick), before.covariance)
+            self._from_model_only = Gaussian(predicted_mean(before.mean, transition, kick), before.covariance)
             return
-        self._unseen = after = predict(before, transition, noise, kick)
+        self._from_model_only = after = predict(before, transition, noise, kick)
         change = np.abs(after.covariance - before.covariance).max()
         settled = change <= _SETTLED * np.abs(before.covariance).max()
         self._settled_under = transition if settled else None
@@ -282,8 +282,10 @@ class PathFilter(BlurFilter):
         noise = np.broadcast_to(measured.single_block, (rows, m, m))
         series = (responses.mean, responses.slope, responses.square, responses.end, measured.value, noise, usable)
         covariance = np.broadcast_to(self.prior.covariance, (axes, *self.prior.covariance.shape[1:]))
-        unseen = self._unseen
-        before = (self.prior.mean, covariance, unseen.mean, unseen.covariance[0], self._missed, self._begun)
+        model_only = self._from_model_only
+        before = (
+            self.prior.mean, covariance, model_only.mean, model_only.covariance[0], self._missed, self._begun
+        )  # fmt: skip
         carried = kalman.Carried(*(np.array(each, order="C") for each in before))  # they are changed
         n = carried.mean.shape[1]
         shapes = ((n,), (n, n), (n,), (n, n), (m,), (m, m), ())
@@ -292,7 +294,7 @@ class PathFilter(BlurFilter):
         kalman.filter_series(self._step_of(model), kalman.Series(*map(_own, series)), carried, out)
         self.prior = Gaussian(carried.mean, carried.covariance)
         self._missed, self._begun = carried.missed, carried.begun
-        self._unseen = Gaussian(carried.unseen_mean, carried.unseen_covariance[None])
+        self._from_model_only = Gaussian(carried.model_only_mean, carried.model_only_covariance[None])
         status = np.where(usable, _status(out.used, out.again, out.missed), Status.INPUT_INVALID)
         innovation, spread, nis = map(_numbers, (out.innovation, out.innovation_covariance, out.nis))
         return [
@@ -311,13 +313,13 @@ class PathFilter(BlurFilter):
         if self._of_model is None or self._of_model[0] is not model:
             from aolink.estimation.compiled.kalman import Step
 
-            looks, n = self.observation, self.plant.n_states
-            gains = np.zeros((0, n, looks.n_measurements)) if looks.gain is None else looks.gain
+            observation, n = self.observation, self.plant.n_states
+            gains = np.zeros((0, n, observation.n_measurements)) if observation.gain is None else observation.gain
             self._of_model = model, Step(
                 transition=_own(model.transition), noise=_own(model.process_noise),
-                mean_row=_own(model.mean_row), quadratic=_own(model.quadratic), first=1 in looks.orders,
-                second=2 in looks.orders, second_order=looks.second_order,
-                gains=_own(gains.reshape(-1, n, looks.n_measurements)), gate=self._gate, patience=PATIENCE,
+                mean_row=_own(model.mean_row), quadratic=_own(model.quadratic), first=1 in observation.orders,
+                second=2 in observation.orders, second_order=observation.second_order,
+                gains=_own(gains.reshape(-1, n, observation.n_measurements)), gate=self._gate, patience=PATIENCE,
                 most_wider=MOST_WIDER,
             )  # fmt: skip
         return self._of_model[1]

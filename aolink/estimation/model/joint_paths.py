@@ -74,12 +74,12 @@ class JointPaths:
     def _resolution(self, variance: float, sensor: SpotSensor) -> Resolution:
         """Number of nodes, which does not depend on where in a step an exposure starts."""
         if not self.model.moved:
-            return resolution(self._unseen(), variance, sensor.profile)
+            return resolution(self._from_model_only(), variance, sensor.profile)
         model = exposure_model(self.model.plant, self.model.n_steps)
         assert isinstance(model, FactoredModel)
         return joint_paths(model, sensor, self.left_out).resolution
 
-    def _unseen(self) -> FloatArray:
+    def _from_model_only(self) -> FloatArray:
         """Random paths of the outputs by the plant's prior, (paths, n_steps)."""
         z = np.random.default_rng(0).standard_normal((_DRAWS, self.size))
         n = self.model.plant.n_states

@@ -91,13 +91,13 @@ def find_modes(
     return found
 
 
-def modes_of(view: PixelView, prior: Gaussian, wide: Gaussian, at_length: BoolArray) -> Modes:
-    """The modes of a posterior; ``wide`` is the posterior of windowed moments, from which searches start.
+def modes_of(view: PixelView, prior: Gaussian, by_moments: Gaussian, at_length: BoolArray) -> Modes:
+    """The modes of a posterior; ``by_moments`` is the posterior of windowed moments, from which searches start.
 
     A search starts at its mean and, where it is to be ``at_length``, (axes,), at points on both sides of it
     (`spread_starts`). After their modes come those that the best mode's reversal and mirror images lead to.
     """
-    starts, squares = spread_starts(view, prior, wide)
+    starts, squares = spread_starts(view, prior, by_moments)
     many = at_length & (squares[:, 0] > WIDE_PATH * view.kernel_variance)
     of_axis = np.where(many, starts.shape[1], np.where(at_length, 3, 1))
     return find_modes(view, prior, starts, of_axis, reversals=True)
@@ -110,18 +110,18 @@ def without_repeats(modes: Modes) -> Modes:
     return Modes(*(each[:, : max(most, 1)] for each in kept))
 
 
-def spread_starts(view: PixelView, prior: Gaussian, wide: Gaussian) -> tuple[FloatArray, FloatArray]:
-    """The mean of a wide Gaussian and points on both sides of it along the path's most uncertain directions.
+def spread_starts(view: PixelView, prior: Gaussian, by_moments: Gaussian) -> tuple[FloatArray, FloatArray]:
+    """The mean of that posterior and points on both sides of it along the path's most uncertain directions.
 
     They are (axes, 1 + 2 directions, n), in coordinates in which the prior is N(0, I): the mean, and a pair for each
     direction. The second result is the mean square of the path along each direction at one standard deviation, the
     largest first, (axes, n).
     """
-    axes, n = wide.mean.shape
+    axes, n = by_moments.mean.shape
     starts, squares = np.empty((axes, 1 + 2 * min(DIRECTIONS, n), n)), np.empty((axes, n))
+    gaussians = (prior.mean, prior.covariance, by_moments.mean, by_moments.covariance)
     compiled_modes.spread_starts(
-        *(np.ascontiguousarray(each) for each in (prior.mean, prior.covariance, wide.mean, wide.covariance)),
-        view.gram, START_REACH, starts, squares,
+        *map(np.ascontiguousarray, gaussians), view.gram, START_REACH, starts, squares,
     )  # fmt: skip
     return starts, squares
 

@@ -89,7 +89,7 @@ class ProfileFilter(Filter):
         start = Gaussian(np.tile(plant.initial_mean, (axes, 1)), np.tile(plant.initial_covariance, (axes, 1, 1)))
         self.prior = single(start)
         # The prediction without any measurement.
-        self._unseen = start
+        self._from_model_only = start
         self._missed = np.zeros(axes, dtype=np.int64)
         self._begun = np.zeros(axes, dtype=bool)
 
@@ -117,12 +117,12 @@ class ProfileFilter(Filter):
         if len(inputs):
             transition, noise, kick = over_steps(self.plant, inputs)
             self.prior = self.prior.mapped(transition, noise).moved(kick)
-            self._unseen = self._unwatched(transition, noise, kick)
+            self._from_model_only = self._unwatched(transition, noise, kick)
 
     def _unwatched(self, transition: FloatArray, noise: FloatArray, kick: FloatArray) -> Gaussian:
-        """The prediction of `_unseen`; on an unstable plant it stops once it is so wide that it carries no
+        """The prediction of `_from_model_only`; on an unstable plant it stops once it is so wide that it carries no
         information."""
-        now, later = self._unseen, predict(self._unseen, transition, noise, kick)
+        now, later = self._from_model_only, predict(self._from_model_only, transition, noise, kick)
         widest = _WIDEST * (np.trace(self.plant.initial_covariance) + np.trace(noise))
         grows = np.isfinite(later.mean).all(axis=1) & (np.einsum("aii->a", later.covariance) <= widest)
         return Gaussian(
@@ -134,7 +134,7 @@ class ProfileFilter(Filter):
         axes, reduced = self.plant.axes, reduction(model, self.sensor)
         lost = self._missed >= PATIENCE
         again = np.flatnonzero(lost)
-        prior = self.prior.replaced(again, single(self._unseen.part(again)))
+        prior = self.prior.replaced(again, single(self._from_model_only.part(again)))
         predicted = reduced.prior(Gaussian(prior.mean, prior.covariance))
         posterior = GaussianMixture(prior.log_weight, predicted.mean, predicted.covariance)
         status = np.full(axes, int(Status.INPUT_INVALID), dtype=np.int64)
@@ -165,10 +165,10 @@ class ProfileFilter(Filter):
                 is_multimodal[seen] = trusted & np.concatenate([each.is_multimodal for each in done])
         after = posterior.mapped(reduced.end_rows, reduced.end_remainder).moved(response.end)
         self.prior = after.reduced(CARRIED, FREE)
-        self._unseen = self._unwatched(model.transition, model.process_noise, response.end)
+        self._from_model_only = self._unwatched(model.transition, model.process_noise, response.end)
         return Posterior(
             coefficients=reduced.coefficients(posterior.gaussian), end=after.gaussian, status=status,
-            innovation=innovation, innovation_covariance=spread, nis=nis, several=is_multimodal,
+            innovation=innovation, innovation_covariance=spread, nis=nis, is_multimodal=is_multimodal,
             log_evidence=log_evidence, residual=residual,
         )  # fmt: skip
 

@@ -144,7 +144,7 @@ before = overloads()
 several = 0
 for exposure in simulate(rig, int(sys.argv[4]), seed=2):
     estimator.step(exposure)
-    several += estimator.several is not None and estimator.several[0]
+    several += estimator.is_multimodal is not None and estimator.is_multimodal[0]
 print(before, overloads(), several)
 """
 

@@ -289,4 +289,4 @@ def test_an_unstable_plant_does_not_end_in_infinity():
         last = filter_.step(model, model.response(np.zeros((200, 1))), centred)
         assert (last.status == Status.OK).all()
     assert np.isfinite(filter_.prior.mean).all()
-    assert np.isfinite(filter_._unseen.covariance).all()
+    assert np.isfinite(filter_._from_model_only.covariance).all()
