@@ -14,13 +14,32 @@ if TYPE_CHECKING:
     from aolink.films.film import Film
     from aolink.importing.frames import FilmSettings
 
+
+def _fraction(text: str) -> float:
+    """A number, or two with a stroke between them."""
+    over, _, under = str(text).partition("/")
+    try:
+        return float(over) / float(under or 1)
+    except (ValueError, ZeroDivisionError):
+        raise typer.BadParameter(f"{text} is no number") from None
+
+
 RateOption = Annotated[
-    float | None, typer.Option("--rate", metavar="HZ", help="Frames a second, where the film does not state them.")
+    float | None,
+    typer.Option(
+        "--rate", metavar="HZ", parser=_fraction, help="Frames a second, also as 30000/1001; it goes before the film's."
+    ),
+]
+
+ExposureOption = Annotated[
+    float | None,
+    typer.Option("--exposure", metavar="S", parser=_fraction, help="Exposure time of a frame, s, also as 1/250."),
 ]
 _FILM = {
     "gamma=2.2": ("gamma", "undo a gamma curve, which most JPEG and video have"),
     "invert": ("invert", "dark objects on a bright ground"),
     "topic=NAME": ("topic", "channel of an MCAP file or a bag, wavefront sensor of AO telemetry"),
+    "pixels=signed": ("pixels", "or unsigned, swapped: how whole numbers were meant"),
     "colour=red": ("colour", "or green, blue, all, which is the mean of a mosaic's colours"),
     "sum=8": ("frames_per_exposure", "make one exposure of this many frames, the mean of their light"),
     "background": ("subtract_median", "subtract each frame's median"),
@@ -32,7 +51,7 @@ _FILM = {
     "row_time=S": ("row_time_s", "from the start of a row's exposure to the next row's, 0 for all at once"),
 }  # fmt: skip
 """The options of --film: the field of `FilmSettings` or `FilmFile` where each goes, and its help."""
-_TAKEN = {"look": 4, "import": len(_FILM)}
+_TAKEN = {"look": 5, "import": len(_FILM)}
 """How many of them, from the first on, a command takes."""
 _COLOURS = ("red", "green", "blue", "all")
 
@@ -56,14 +75,17 @@ class FilmFile(NamedTuple):
     """Fields of `FilmSettings`."""
     topic: str | None
     colour: str | None
+    pixels: str | None
 
     def open(self, source: Path) -> "Film":
-        """The film, of one colour where one is asked for."""
-        from aolink.films.film import one_colour
+        """The whole frames of the film, of one colour where one is asked for."""
+        from aolink.films.film import one_colour, other_pixels
         from aolink.films.formats import open_film
+        from aolink.films.whole import whole_frames
 
         film = open_film(source, self.topic)
-        return film if self.colour is None else one_colour(film, self.colour)
+        film = film if self.pixels is None else other_pixels(film, self.pixels)
+        return whole_frames(film if self.colour is None else one_colour(film, self.colour))
 
 
 def film_file(options: list[str] | None, command: str) -> FilmFile:
@@ -77,7 +99,7 @@ def film_file(options: list[str] | None, command: str) -> FilmFile:
         if bool(equals) != ("=" in forms[name]):
             raise ImportingError(f"--film {each}: write --film {forms[name]}")
         found[_FILM[forms[name]][0]] = _value(name, value) if equals else True
-    return FilmFile(found, found.pop("topic", None), found.pop("colour", None))
+    return FilmFile(found, found.pop("topic", None), found.pop("colour", None), found.pop("pixels", None))
 
 
 def _value(name: str, text: str) -> Any:
@@ -85,7 +107,9 @@ def _value(name: str, text: str) -> Any:
         return _start_ns(text)
     if name == "colour" and text not in _COLOURS:
         raise ImportingError(f"--film colour={text} is no colour: give {', '.join(_COLOURS[:3])} or {_COLOURS[3]}")
-    if name in ("topic", "colour"):
+    if name == "pixels" and text not in ("signed", "unsigned", "swapped"):
+        raise ImportingError(f"--film pixels={text}: give signed, unsigned or swapped")
+    if name in ("topic", "colour", "pixels"):
         return text
     try:
         value = float(text)
@@ -151,9 +175,7 @@ def import_(
     output: OutputOption,
     rig: Annotated[str, typer.Option(metavar="RIG.toml", help="What camera and plant the film shows.")],
     rate: RateOption = None,
-    exposure: Annotated[
-        float | None, typer.Option(metavar="S", help="Exposure time of a frame, s, where the film lacks it.")
-    ] = None,
+    exposure: ExposureOption = None,
     at: Annotated[
         list[str] | None,
         typer.Option(
@@ -191,5 +213,4 @@ def import_(
             " dark level was subtracted: --film background puts the ground at the rig's black level",
             markup=False,
         )
-    missing = f", {account.missing} frames are missing" if account.missing else ""
-    stdout.print(f"{output}: {account.exposures} exposures of {account.frames} frames{missing}", markup=False)
+    stdout.print(f"{output}: {account.exposures} exposures of {account.said}", markup=False)

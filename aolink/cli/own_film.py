@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from aolink.cli.common import JsonOption, OverwriteOption, app, program, progress, stderr, stdout
-from aolink.cli.films import FilmOfLook, RateOption, film_file, film_settings
+from aolink.cli.films import ExposureOption, FilmOfLook, RateOption, film_file, film_settings
 from aolink.errors import ExportError, ImportingError, RecordingError
 from aolink.files import writing
 from aolink.signals import Interrupted
@@ -25,9 +25,7 @@ def look(
         typer.Argument(metavar="FILM", help="A film of spots, as `aolink import` takes."),
     ],
     rate: RateOption = None,
-    exposure: Annotated[
-        float | None, typer.Option(metavar="S", help="Exposure time of a frame, s, where the film lacks it.")
-    ] = None,
+    exposure: ExposureOption = None,
     output: Annotated[
         Path | None,
         typer.Option("--output", "-o", metavar="DIR", help="Folder for rig file, recording and page. [FILM-look]"),

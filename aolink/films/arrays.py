@@ -14,13 +14,16 @@ from numpy.typing import NDArray
 
 from aolink.errors import ImportingError
 from aolink.extensions import needs_extra
-from aolink.films.film import Film, Stored, array_film
+from aolink.films.facts import Said, facts, meaning
+from aolink.films.film import Film, FilmFrame, Stored, array_film
 from aolink.limits import check_picture, load_archive
 
 _SER = np.dtype(
     [("magic", "S14"), ("lu", "<i4"), ("colour", "<i4"), ("big", "<i4"), ("columns", "<i4"), ("rows", "<i4"),
      ("bits", "<i4"), ("count", "<i4"), ("names", "S120"), ("date", "<i8"), ("utc", "<i8")]
 )  # fmt: skip
+_BLOCK_BYTES = 1 << 26
+"""Bytes of frames that are read at once."""
 _SER_MOSAICS = {8: "RGGB", 9: "GRBG", 10: "GBRG", 11: "BGGR"}
 _SER_EPOCH = 621_355_968_000_000_000
 """The year 1970 in units of 100 ns from the year 1 on, in which SER keeps times."""
@@ -40,13 +43,13 @@ def npz_film(path: Path) -> Film:
     """The frames of a .npz file, which may have times and inputs as well."""
     arrays = load_archive(path, ImportingError)
     stacks = [name for name in arrays if name == "frames"] or [n for n in arrays if arrays[n].ndim in (3, 4)]
-    return array_film(arrays[_only(path, stacks, arrays, "name the array with the film 'frames'")], path.name,
-                      **_known(path, arrays))  # fmt: skip
+    chosen = _only(path, stacks, arrays, "name the array with the film 'frames'")
+    return _with_facts(path, arrays[chosen], [Said(name, each) for name, each in arrays.items() if name != chosen])
 
 
 def hdf5_film(path: Path, topic: str | None) -> Film:
-    """The dataset ``topic`` of an HDF5 file, or its only one of three axes or more; times are attributes of it, or
-    datasets beside it, with the names that .npz has."""
+    """The dataset ``topic`` of an HDF5 file, or its only one of three axes or more; times are attributes of it or of
+    the groups about it, or other datasets."""
     with needs_extra("films", ImportingError):
         import h5py
     with ExitStack() as stack:
@@ -55,17 +58,58 @@ def hdf5_film(path: Path, topic: str | None) -> Film:
         file.visititems(lambda name, each: found.update({f"/{name}": each}) if hasattr(each, "dtype") else None)
         frames = [name for name, each in found.items() if each.ndim >= 3 and each.dtype.kind in "biuf"]
         wanted = frames if topic is None else [name for name in found if name == f"/{topic.strip('/')}"]
-        chosen = found[_only(path, wanted, found, "say with --film topic=NAME which one has the frames")]
+        chosen = found.pop(_only(path, wanted, found, "say with --film topic=NAME which one has the frames"))
         if chosen.external or chosen.is_virtual:
             raise ImportingError(
                 f"{path} keeps the pixels of {chosen.name} in other files, which are not read: write them into the file"
             )
         check_picture(math.prod(chosen.chunks or (1,)) * chosen.dtype.itemsize // 8, 1, ImportingError)
-        beside = {name.rpartition("/")[2]: each for name, each in found.items() if each.parent == chosen.parent}
-        known = _known(path, {key: np.asarray(each) for key, each in (*beside.items(), *chosen.attrs.items())
-                              if key in _FACTS})  # fmt: skip
+        said, group = [Said(key, value) for key, value in chosen.attrs.items()], chosen.parent
+        beside = {name: each for name, each in found.items() if each.ndim < 3 and not each.external}
+        for name, each in sorted(beside.items(), key=lambda one: one[1].parent != group):
+            if each.parent == group or meaning(name.rpartition("/")[2])[0]:
+                unit = each.attrs.get("units", each.attrs.get("unit", ""))
+                said.append(Said(name.rpartition("/")[2], each[()], unit if isinstance(unit, str) else ""))
+        for name in dict.fromkeys((group.name, "/")):
+            said += [Said(key, value) for key, value in file[name].attrs.items()]
         stack.pop_all()  # it is read frame by frame, as long as the film lives
-        return array_film(chosen, path.name, **known)
+        last = _written(chosen)
+        unwritten = f"the last {len(chosen) - last} of its {len(chosen)} frames were never written: they are left out"
+        film = _with_facts(path, _Blocks(chosen, last), [each for each in said if each.name not in _OF_HDF5])
+        return replace(film, notes=(*film.notes, *([unwritten] if last < len(chosen) else [])))
+
+
+_OF_HDF5 = ("DIMENSION_LIST", "CLASS", "REFERENCE_LIST", "NAME", "units", "unit", "_FillValue")
+
+
+def _written(data: Any) -> int:
+    """The number of frames up to the last one that has a place in the file."""
+    if not data.chunks or not data.id.get_num_chunks():
+        return len(data) if data.id.get_storage_size() else 0
+    firsts = list[int]()
+    data.id.chunk_iter(lambda chunk: firsts.append(chunk.chunk_offset[0]))
+    return min(len(data), max(firsts) + int(data.chunks[0]))
+
+
+class _Blocks:
+    """The first ``count`` frames of a dataset of HDF5, read chunk by chunk: each has to be decompressed at once."""
+
+    def __init__(self, data: Any, count: int) -> None:
+        self._data, self.dtype, self.shape, self._first = data, data.dtype, (count, *data.shape[1:]), 0
+        many = _BLOCK_BYTES // (math.prod(data.shape[1:]) * data.dtype.itemsize)
+        self._many = max(1, min(many, data.chunks[0] if data.chunks else 1))
+        self._block = data[:0]
+
+    def __len__(self) -> int:
+        return int(self.shape[0])
+
+    def __getitem__(self, k: int) -> FilmFrame:
+        if not self._first <= k < self._first + len(self._block):
+            self._first, self._block = k, self._data[k : k + self._many]
+        return np.asarray(self._block[k - self._first])
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
+        return np.asarray(self._data[: len(self)], dtype)
 
 
 def _only(path: Path, names: list[str], arrays: Mapping[str, Any], what_to_do: str) -> str:
@@ -75,31 +119,24 @@ def _only(path: Path, names: list[str], arrays: Mapping[str, Any], what_to_do: s
     return names[0]
 
 
-_FACTS = {"rate_hz": (0,), "exposure_s": (0,), "times_s": (1,), "times_ns": (1,), "inputs": (1, 2)}
-"""What may stand beside the frames, and how many axes it has."""
+_OWN = {"rate_hz": (0,), "exposure_s": (0,), "times_s": (1,), "times_ns": (1,), "inputs": (1, 2)}
+"""Names that mean nothing else, and how many axes they have: what they have must be right."""
 
 
-def _known(path: Path, arrays: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
-    known: dict[str, Any] = {}
-    for key in _FACTS.keys() & arrays.keys():
-        found = arrays[key]
-        if found.ndim not in _FACTS[key] or found.dtype.kind not in "iuf" or not np.isfinite(found).all():
-            axes = " or ".join(map(str, _FACTS[key]))
+def _with_facts(path: Path, frames: Any, said: list[Said]) -> Film:
+    """The film of frames with what stands beside them."""
+    film, own = array_film(frames, path.name), {each.name: np.asarray(each.value) for each in said if each.name in _OWN}
+    for name, each in own.items():
+        numbers = each.ndim in _OWN[name] and each.dtype.kind in "iuf" and bool(np.isfinite(each).all())
+        if not numbers or (not each.ndim and each <= 0) or (name.startswith("times") and len(each) != film.count):
             raise ImportingError(
-                f"{path}: {key} is {found.dtype} of shape {found.shape}, expected numbers of {axes} axes"
+                f"{path}: {name} is {each if not each.ndim else f'{each.dtype} of shape {each.shape}'}, expected"
+                f" {'a number above 0' if _OWN[name] == (0,) else f'finite numbers for {film.count} frames'}"
             )
-        if not found.ndim and found <= 0:
-            raise ImportingError(f"{path}: {key} is {found:g}, expected a number above 0")
-        known[key] = found if found.ndim else float(found)
-    if "inputs" in known:
-        known["inputs"] = known["inputs"].reshape(len(known["inputs"]), -1).astype(np.float64)
-    if "times_s" in known:
-        times = known.pop("times_s")
-        whole = np.floor(times)  # so that seconds since 1970 lose no more than they have lost
-        known.setdefault("times_ns", whole.astype(np.int64) * 10**9 + np.rint((times - whole) * 1e9).astype(np.int64))
-    if "times_ns" in known:
-        known["times_ns"] = known["times_ns"].astype(np.int64)
-    return known
+    known, notes = facts([each for each in said if each.name != "inputs"], film.count, every=True)
+    if "inputs" in own:
+        known["inputs"] = own["inputs"].reshape(len(own["inputs"]), -1).astype(np.float64)
+    return replace(film, notes=(*film.notes, *notes), **known)
 
 
 def ser_film(path: Path) -> Film:

@@ -59,6 +59,16 @@ class Film:
     input_times_ns: NDArray[np.int64] | None = None
     """The time at which each row of ``inputs`` was put out, to be held until the next; ns from the start of the first
     exposure. None: there is a row for each frame, or for each fast step from the first exposure on."""
+    numbers: NDArray[np.int64] | None = None
+    """Number of each frame among those that were taken, where some of them are missing, (count,)."""
+    played: bool = False
+    """Whether the times are those of playing, which need not be those of taking."""
+    left_out: int = 0
+    """Frames of the file that are none, and not among these."""
+    account: str = ""
+    """What those are, in words."""
+    share: float = 1.0
+    """Rate of these frames over that of the file's, where the others are copies that come in turn."""
     slopes: bool = False
     """Whether there are no pictures, but slopes alone: a frame is then one row of them, x and y of each spot."""
     nonlinear: str = ""
@@ -158,9 +168,6 @@ def array_film(frames: Any, name: str, **known: Any) -> Film:
         raise ImportingError(
             f"{name} holds {dtype} of shape {tuple(frames.shape)}, expected numbers as (frames, rows, columns)"
         )
-    times = known.get("times_ns")
-    if times is not None and times.shape != (shape[0],):
-        raise ImportingError(f"{name} has {shape[0]} frames and times of shape {times.shape}: give one for each")
     return Film(
         name=name, shape=(int(shape[1]), int(shape[2])), dtype=dtype, count=int(shape[0]), **known,
         pictures=lambda: (np.asarray(frames[k]) for k in range(len(frames))),
@@ -218,3 +225,17 @@ def one_colour(film: Film, colour: str) -> Film:
 
     shape = (film.shape[0] // 2, film.shape[1] // 2) if film.mosaic else film.shape
     return replace(film, pictures=lambda: map(changed, film.pictures()), shape=shape, mosaic="")
+
+
+def other_pixels(film: Film, meant: str) -> Film:
+    """The film of whole numbers of as many bits with or without a sign, or with their bytes in the other order."""
+    if film.dtype.kind not in "iu":
+        raise ImportingError(f"{film.name} has pixels of {film.dtype}, no whole numbers: leave --film pixels out")
+    kind = {"signed": "i", "unsigned": "u", "swapped": film.dtype.kind}[meant]
+    dtype = np.dtype(f"{kind}{film.dtype.itemsize}")
+
+    def changed(picture: FilmFrame) -> FilmFrame:
+        same = picture.byteswap() if meant == "swapped" else picture
+        return same.astype(same.dtype.newbyteorder("=")).view(dtype)
+
+    return replace(film, pictures=lambda: map(changed, film.pictures()), dtype=dtype, top=None)

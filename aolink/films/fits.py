@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import math
+import re
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -14,9 +15,12 @@ import numpy as np
 
 from aolink.errors import ImportingError
 from aolink.extensions import needs_extra
+from aolink.films.facts import Said, facts, meaning
 from aolink.films.film import Film, FilmFrame
 from aolink.limits import check_picture, unpacked
 
+_IN_COMMENT: Any = re.compile(r"[^\[]*\[([^\]]*)\]")
+"""A unit in the comment of a key."""
 _MOSAICS = ("RGGB", "BGGR", "GRBG", "GBRG")
 
 
@@ -64,6 +68,13 @@ def fits_film(path: Path, topic: str | None) -> Film:
         rows, columns = getattr(chosen, "tile_shape", (1, 1))[-2:]
         check_picture(columns, rows, ImportingError)
         count = math.prod(shape[:-2])
+        cards = [card for each in {id(file[0]): file[0], id(chosen): chosen}.values() for card in each.header.cards]
+        said = [Said(card.keyword, card.value, _IN_COMMENT.match(f"{card.comment} []")[1]) for card in cards]
+        said = [each for each in said if meaning(each.name)[0] not in ("start", "times")]
+        for each in file[1:] if not damaged else []:
+            if not each.is_image and hasattr(each, "columns") and each.header["NAXIS2"] == count:
+                columns = [column for column in each.columns if meaning(column.name)[0]]
+                said += [Said(column.name, np.array(each.data[column.name]), column.unit or "") for column in columns]
         along = next((k for k, n in enumerate(shape[:-2]) if n > 1), None)
         at = [tuple(k if axis == along else 0 for axis in range(len(shape) - 2)) for k in range(count)]
     bits = int(own["BITPIX"])
@@ -87,18 +98,20 @@ def fits_film(path: Path, topic: str | None) -> Film:
                     frame = raw.astype(dtype) + np.array(int(zero) % 2**64, np.uint64).astype(dtype)
                 yield np.where(unknown, np.nan, frame) if unknown.any() else frame
 
-    found = {key: _number(own.get(key)) for key in ("EXPTIME", "EXPOSURE", "FRATE", "FRAMRATE", "KINTIME")}
-    numbers = {key: each if each and each > 0 else None for key, each in found.items()}
-    cycle = numbers["KINTIME"]
-    odd = [f"{key} = {own[key]!r} is no time or rate: not used" for key in numbers if key in own and not numbers[key]]
+    known, notes = facts(said, count, longest_s=math.inf)
     several = f"{path.name} holds {len(more) + 1} cubes: the first is taken" if more else ""
     start_ns, unknown = start_of(own)
+    known |= {"start_ns": start_ns} if start_ns is not None else {}
     mosaic = str(own.get("BAYERPAT", own.get("COLORTYP", ""))).strip()
+    if mosaic in _MOSAICS:
+        cells = np.array(list(mosaic)).reshape(2, 2)
+        down = shape[-2] % 2 == 0 and str(own.get("ROWORDER", "")).strip().upper() == "BOTTOM-UP"
+        right, below = (int(_number(own.get(key)) or 0) for key in ("XBAYROFF", "YBAYROFF"))
+        mosaic = "".join(np.roll(cells, (down - below, -right), (0, 1)).flat)
     return Film(
-        name=path.name, shape=(shape[-2], shape[-1]), dtype=dtype.newbyteorder("="), count=count, pictures=pictures,
-        rate_hz=numbers["FRATE"] or numbers["FRAMRATE"] or (1 / cycle if cycle else None),
-        exposure_s=numbers["EXPTIME"] or numbers["EXPOSURE"], start_ns=start_ns,
-        mosaic=mosaic if mosaic in _MOSAICS else "", notes=tuple(filter(None, (several, damaged, unknown, *odd))),
+        name=path.name, shape=(shape[-2], shape[-1]), dtype=dtype, count=count, pictures=pictures,
+        mosaic=mosaic if mosaic in _MOSAICS else "", **known,
+        notes=tuple(filter(None, (several, damaged, unknown, *notes))),
     )  # fmt: skip
 
 
@@ -136,9 +149,12 @@ def _number(value: Any) -> float | None:
 
 def start_of(header: dict[str, Any]) -> tuple[int | None, str]:
     """Start of the exposure by DATE-OBS, which may have its time of day in TIME-OBS, ns since 1970, and a note where it
-    is not known."""
-    text = str(header.get("DATE-OBS", "")).strip().removesuffix("Z")
-    beside = str(header.get("TIME-OBS", "")).strip()
+    is not known. What is called UTC goes before them: they may be local."""
+    text, beside = (
+        str(next((header[key] for key in keys if key in header), "")).strip()
+        for keys in (("DATE-UTC", "DATE-OBS"), ("TIME-UTC", "UTC-OBS", "UT-OBS", "TIME-OBS"))
+    )
+    text = text.removesuffix("Z")
     if not text:
         return None, ""
     if "T" not in text and beside:

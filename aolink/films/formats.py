@@ -6,7 +6,6 @@ start is taken from it; nothing is guessed.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -18,7 +17,9 @@ from numpy.typing import NDArray
 
 from aolink.errors import AolinkError, ImportingError
 from aolink.films import arrays, bags, fits, stills, tiff, video
+from aolink.films.facts import dated
 from aolink.films.film import Film, FilmFrame
+from aolink.films.names import by_number
 from aolink.limits import LOSSY_EXPANSION, check_film
 
 _PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".pgm", ".ppm", ".pbm", ".pnm", ".webp", ".jp2")
@@ -31,6 +32,7 @@ _FORMATS: dict[str, Callable[..., Film]] = {
     **dict.fromkeys(_PICTURES, stills.picture_film),
 }  # fmt: skip
 """Readers by the suffix of the file."""
+_NOTHING: dict[str, Any] = {"exposure_s": None, "start_ns": None, "notes": ()}
 _WITH_TOPICS = (".mcap", ".bag", ".h5", ".hdf5", *_FITS)
 """Formats that may hold several films, one of which the topic names."""
 
@@ -79,6 +81,10 @@ def open_film(source: str | Path, topic: str | None = None) -> Film:
             f"its pixels are under a Bayer mosaic, {film.mosaic}: --film colour=green (or red, blue) takes one colour"
         )
         film = replace(film, notes=(*film.notes, note))
+    if film.start_ns is not None and not dated(film.start_ns):
+        since = f"{np.datetime64(film.start_ns, 'ns')}"
+        note = f"its times begin at {since}, as a clock that counts from the start of a device: they are no dates"
+        film = replace(film, start_ns=None, notes=(*film.notes, note))
     return replace(film, pictures=lambda: _checked(film, path, size))
 
 
@@ -123,11 +129,9 @@ def _checked(film: Film, path: Path, size: int) -> Iterator[FilmFrame]:
 def _folder(path: Path) -> Film:
     """The films of a folder's files, one after the other."""
     found = {each for each in path.iterdir() if _suffix(each) in _FORMATS.keys() - {".mcap", ".bag"}}
-    files = sorted((each for each in found if each.name[0] != "." and each.is_file()), key=_number_order)
+    files = [each for each in found if each.name[0] != "." and (each.is_file() or each.is_symlink())]
     if not files and any(each.suffix in (".db3", ".mcap") for each in path.iterdir()):
         raise ImportingError(f"{path} has no metadata.yaml, as a ROS 2 bag has: `ros2 bag reindex` makes one")
-    if not files:
-        raise ImportingError(f"{path} holds no pictures ({', '.join(_FORMATS)})")
     notes = []
     lossless = [each for each in files if _suffix(each) not in stills.LOSSY]
     if lossless and (left := len(files) - len(lossless)):
@@ -136,23 +140,33 @@ def _folder(path: Path) -> Film:
         notes.append(f"{left} JPEG files beside other pictures are left out, as previews of them")
         files = lossless
     names: dict[str, Path] = {}
-    for each in files:
+    for each in sorted(files):
         if (other := names.setdefault(_name(each), each)) != each:
             raise ImportingError(f"{other} and {each.name} have one name: leave one file for each frame in the folder")
-    parts: dict[Path, Film] = {}
-    read: set[str] = set()
-    for each in files:
+    order, numbers, more = by_number(list(names))
+    files = [list(names.values())[k] for k in order]
+    there = np.array([each.is_file() for each in files], np.bool_)
+    if not there.any():
+        raise ImportingError(f"{path} holds no pictures ({', '.join(_FORMATS)})")
+    if not there.all():
+        notes.append(f"{len(files) - there.sum()} links lead to no file: these frames are missing")
+        numbers = np.arange(len(files)) if numbers is None else numbers
+    numbers = None if numbers is None else numbers[there]
+    files = [each for each, here in zip(files, there, strict=True) if here]
+    first = open_film(files[0])
+    parts: dict[Path, Film] = {files[0]: first}
+    read = set(first.files)
+    for each in files[1:]:
         if each.name in read:  # a stack over several files, which has come as a whole
             continue
-        # Single pictures say nothing about times: they are opened when they are needed.
-        later = bool(parts) and _suffix(each) in _PICTURES
-        parts[each] = next(iter(parts.values())) if later else open_film(each)
+        # Single pictures are opened when they are needed; of the later ones only what they say is read here.
+        single = _suffix(each) in _PICTURES
+        parts[each] = replace(first, **(_NOTHING | stills.said(each)[0])) if single else open_film(each)
         read |= parts[each].files
-    first = parts[files[0]]
 
     def pictures() -> Iterator[FilmFrame]:
         for each, known in parts.items():
-            part = open_film(each) if known is first else known
+            part = open_film(each) if _suffix(each) in _PICTURES else known
             if (part.shape, part.dtype, part.top) != (first.shape, first.dtype, first.top):
                 raise ImportingError(
                     f"{each} has {_described(part)}, those before it have {_described(first)}: a film has frames of"
@@ -160,18 +174,23 @@ def _folder(path: Path) -> Film:
                 )
             yield from part.pictures()
 
-    notes.append(f"pictures in the order of their names, {files[0].name} to {files[-1].name}")
+    notes += [f"pictures in the order of their names, {files[0].name} to {files[-1].name}", *more]
     known = _times_of(list(parts.values()), notes)
     notes += dict.fromkeys(note for part in parts.values() for note in part.notes)
+    if len({each.count for each in parts.values()}) > 1 or len(parts) < len(files):
+        numbers = None
+    elif numbers is not None:  # of stacks, those of their frames
+        numbers = (numbers[:, None] * first.count + np.arange(first.count)).ravel()
     return replace(first, name=path.name, count=sum(each.count for each in parts.values()), files=frozenset(),
-                   pictures=pictures, inputs=None, notes=tuple(notes), **known)  # fmt: skip
+                   pictures=pictures, inputs=None, numbers=numbers, notes=tuple(notes), **known)  # fmt: skip
 
 
 def _times_of(parts: list[Film], notes: list[str]) -> dict[str, Any]:
     """Times of all frames of several films one after the other, where each says its own; notes say what is not used."""
     known: dict[str, Any] = {"times_ns": None}
-    if len({each.exposure_s for each in parts}) > 1:
-        notes.append("exposure times differ from file to file: that of the first is taken")
+    exposures = {each.exposure_s for each in parts}
+    if len(exposures) > 1:
+        notes.append("the exposure time differs from file to file: that of the first is taken")
     times = [each for part in parts if (each := _own_times(part)) is not None]
     if len(times) == len(parts) and sum(part.count for part in parts) > 1:
         joined = np.concatenate(times)
@@ -201,12 +220,6 @@ def _suffix(path: Path) -> str:
 
 def _name(path: Path) -> str:
     return path.name.lower().rpartition(_suffix(path))[0]
-
-
-def _number_order(path: Path) -> tuple[list[tuple[str, int]], str]:
-    """A sort key by which frame2 comes before frame10."""
-    parts = re.findall(r"([^0-9]*)([0-9]*)", path.name)
-    return [(text, int(digits or 0)) for text, digits in parts], path.name
 
 
 def _described(film: Film) -> str:

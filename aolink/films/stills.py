@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import io
+import math
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
+from numbers import Rational
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
@@ -14,6 +16,7 @@ from numpy.typing import NDArray
 
 from aolink.errors import AolinkError, ImportingError
 from aolink.extensions import needs_extra
+from aolink.films.facts import Said, facts
 from aolink.films.film import Film
 from aolink.limits import check_picture
 
@@ -31,10 +34,34 @@ _NETPBM = (b"P1", b"P2", b"P3", b"P4", b"P5", b"P6", b"P7")
 def picture_film(path: Path) -> Film:
     """A film of one picture."""
     pixels, top, lossy = decoded(path.read_bytes())
+    known, notes = said(path)
     return Film(
         name=path.name, shape=pixels.shape[:2], dtype=pixels.dtype, count=1, top=top,
-        pictures=lambda: iter([pixels]), nonlinear=COMPRESSED if lossy else "",
+        pictures=lambda: iter([pixels]), nonlinear=COMPRESSED if lossy else "", notes=notes, **known,
     )  # fmt: skip
+
+
+def said(path: Path) -> tuple[dict[str, Any], tuple[str, ...]]:
+    """What the file of a picture says beside it, by EXIF or in texts, and a note on that."""
+    with path.open("rb") as file:
+        if file.read(2) in _NETPBM:
+            return {}, ()
+    with opened_image(path, ImportingError) as image:
+        from PIL import ExifTags
+
+        tags = {}
+        if image.format != "PNG" or "exif" in image.info:  # it would decode it
+            exif = image.getexif()
+            tags = {**exif, **exif.get_ifd(ExifTags.IFD.Exif)}
+        named = {ExifTags.TAGS.get(key, str(key)): value for key, value in tags.items()}
+        parts = (named.get("DateTimeOriginal"), named.get("SubsecTimeOriginal"), named.get("OffsetTimeOriginal"))
+        found = [Said(str(key), float(each) if isinstance(each, Rational) else each) for key, each in
+                 {**named, **image.info}.items() if isinstance(each, str | Rational | float)]  # fmt: skip
+    found = [each for each in found if each.name != "DateTimeOriginal"]
+    if parts[0]:  # 2026:11:22 09:30:00, with decimals and a zone beside it
+        date = f"{str(parts[0])[:10].replace(':', '-')}T{str(parts[0])[11:]}"
+        found.append(Said("DateTimeOriginal", f"{date}.{parts[1] or 0}{parts[2] or ''}"))
+    return facts(found, 1, longest_s=math.inf)
 
 
 def decoded(data: bytes) -> tuple[NDArray[Any], float | None, bool]:

@@ -7,7 +7,6 @@ import math
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -16,16 +15,15 @@ from numpy.typing import NDArray
 
 from aolink.errors import ImportingError
 from aolink.extensions import needs_extra
+from aolink.films.facts import Said, facts, meaning
 from aolink.films.film import Film, FilmFrame, Stored
 from aolink.films.stills import COMPRESSED
 from aolink.limits import check_picture
 
 _LOSSY = (6, 7)  # JPEG
-_SECONDS = {
-    **dict.fromkeys(("s", "sec", "seconds"), 1.0), **dict.fromkeys(("ms", "msec"), 1e-3), "min": 60.0,
-    **dict.fromkeys(("us", "usec", "\N{MICRO SIGN}s", "\N{GREEK SMALL LETTER MU}s", r"\u00B5s"), 1e-6), "ns": 1e-9,
-}  # fmt: skip
-"""Units of time in the headers of TIFF files."""
+_TAG_OF_MICRO_MANAGER = 51123
+_SIGNED = -32768.0
+"""Where the calibration of ImageJ begins that makes numbers of 16 bits signed."""
 
 
 def tiff_film(path: Path) -> Film:
@@ -39,12 +37,12 @@ def tiff_film(path: Path) -> Film:
         kinds = [(each.shape, each.axes, np.dtype(each.dtype)) for each in file.series]
         first: Any = file.series[0]
         page: Any = file.pages.first
-        imagej, ome = file.imagej_metadata or {}, file.ome_metadata
         names = {Path(each.parent.filehandle.path).name for each in first.pages if each is not None}
         lossy, bits = int(page.compression) in _LOSSY, page.bitspersample
         _, top, dtype = _light(path, page)
-        place, order = first.dataoffset, file.byteorder
         white_is_zero = str(page.photometric.name) == "MINISWHITE"
+        place, order = first.dataoffset, file.byteorder
+        said, notes = _said(file, page, first), list[str]()
     (shape, axes, stored), *others = kinds
     size = tuple(n for n, axis in zip(shape, axes, strict=True) if axis != "S")
     one_by_one = len(size) == 2 and bool(others)  # pictures that were appended
@@ -54,36 +52,51 @@ def tiff_film(path: Path) -> Film:
             " frames of one size and type"
         )
     size = (len(kinds), *size) if len(size) == 2 else size
-    if len(size) != 3 or dtype.kind not in "biuf":
+    planes = np.arange(math.prod(size[:-2])).reshape(size[:-2])
+    colours = axes[: planes.ndim].find("C") if planes.ndim == 2 else -1
+    planes = planes.reshape(-1, 1) if colours < 0 else np.moveaxis(planes, colours, -1)
+    if planes.shape[1] not in (1, 3) or len(planes) != max(size[:-2]) or dtype.kind not in "biuf":
         raise ImportingError(f"{path} holds {stored} of shape {shape}, expected (frames, rows, columns)")
 
     def pictures() -> Iterator[FilmFrame]:
         with _complaints(path), tifffile.TiffFile(path) as file:
             pages: Any = [page for each in file.series for page in each.pages] if one_by_one else file.series[0].pages
-            if len(pages) != size[0]:  # ImageJ keeps a large stack as one page
-                whole = Stored(path, stored.newbyteorder(order), (size[0], *shape[1:]), place)
-                yield from (whole[k] for k in range(size[0]))
-                return
-            for page in pages:
-                if page is None or math.prod(page.chunked) > len(page.dataoffsets):  # it would count them all
-                    raise ImportingError(f"{path} is damaged: a page lacks some of its pixels")
-                check_picture(page.keyframe.tilewidth, page.keyframe.tilelength, ImportingError)
-                handle = page.parent.filehandle
-                handle.open()  # of another file of the stack, it is closed
-                yield _light(path, page.aspage(), read=True)[0]
-                if handle is not file.filehandle:
-                    handle.close()
+            whole = None
+            if len(pages) != planes.size:  # ImageJ keeps a large stack as one page
+                whole = Stored(
+                    path, stored.newbyteorder(order), (planes.size, *shape[planes.ndim - (colours < 0) :]), place
+                )
+            for numbers in planes.tolist():
+                shown = [whole[k] if whole else _page(path, file, pages[k]) for k in numbers]
+                picture = shown[0] if len(shown) == 1 else np.stack(shown, axis=-1)
+                yield (picture.astype(np.int32) + int(_SIGNED)).astype(np.int16) if signed else picture
 
-    notes = [f"{path.name} holds {len(kinds)} stacks: the first is taken"] if others and not one_by_one else []
-    if axes[0] in "CZ" and size[0] > 1 and not one_by_one:
+    if others and not one_by_one:
+        notes.append(f"{path.name} holds {len(kinds)} stacks: the first is taken")
+    if axes[0] in "CZ" and size[0] > 1 and not one_by_one and colours < 0:
         notes.append(f"its axis {axes[0]}, {'channels' if axes[0] == 'C' else 'depths'}, is taken for frames")
-    known = _ome_times(tifffile.xml2dict(ome), size[0], notes) if ome else _imagej_times(imagej)
+    signed = dtype == np.uint16 and any(each.name == "c0" and each.value == _SIGNED for each in said)
+    known, found = facts(said, len(planes), longest_s=math.inf)
+    if "times_ns" in known:
+        known.pop("rate_hz", None)  # times are measured, and a rate is planned
     return Film(
-        name=path.name, shape=(size[1], size[2]), dtype=dtype, count=size[0], pictures=pictures,
+        name=path.name, shape=(size[-2], size[-1]), dtype=np.dtype(np.int16) if signed else dtype, count=len(planes),
         top=top if top is not None or dtype.kind not in "iu" or bits in (8, 16, 32, 64) else float((1 << bits) - 1),
-        nonlinear=COMPRESSED if lossy else "", notes=tuple(notes), white_is_zero=white_is_zero, **known,
-        files=frozenset(names),
+        nonlinear=COMPRESSED if lossy else "", notes=(*notes, *found), white_is_zero=white_is_zero, **known,
+        files=frozenset(names), pictures=pictures,
     )  # fmt: skip
+
+
+def _page(path: Path, file: Any, page: Any) -> NDArray[Any]:
+    if page is None or math.prod(page.chunked) > len(page.dataoffsets):  # it would count them all
+        raise ImportingError(f"{path} is damaged: a page lacks some of its pixels")
+    check_picture(page.keyframe.tilewidth, page.keyframe.tilelength, ImportingError)
+    handle = page.parent.filehandle
+    handle.open()  # of another file of the stack, it is closed
+    light = _light(path, page.aspage(), read=True)[0]
+    if handle is not file.filehandle:
+        handle.close()
+    return light
 
 
 def _light(path: Path, page: Any, read: bool = False) -> tuple[NDArray[Any], float | None, np.dtype[Any]]:
@@ -111,49 +124,47 @@ def _light(path: Path, page: Any, read: bool = False) -> tuple[NDArray[Any], flo
     return np.ascontiguousarray(values.astype(dtype)), top, dtype
 
 
-def _seconds(value: object, unit: object) -> float | None:
-    try:
-        number = float(str(value)) * _SECONDS[str(unit)]
-    except (ValueError, KeyError):
-        return None
-    return number if 0 <= number < math.inf else None
+def _said(file: Any, page: Any, series: Any) -> list[Said]:
+    """What the headers say that OME, ImageJ, Micro-Manager and cameras' programs write, and the tags of EXIF."""
+    said = _of_ome(file.ome_metadata) if file.ome_metadata else []
+    for kind in sorted(file.flags - {"ome"}):
+        found = getattr(file, f"{kind}_metadata", None) or {}
+        for each in found if isinstance(found, list | tuple) else [found]:
+            for part in (each, each.get("Summary", {})) if isinstance(each, dict) else ():
+                interval = str(part.get("tunit", "sec")) if kind == "imagej" else ""
+                said += [Said(str(key), value, interval if key == "finterval" else "") for key, value in part.items()]
+                lines = re.findall(r"^\s*([\w .-]+?)\s*[:=]\s*(.+?)\s*$", str(part.get("Info", "")), re.M)
+                said += [Said(key, value) for key, value in lines]
+    if _TAG_OF_MICRO_MANAGER in page.tags:
+        each_page = [each.aspage().tags.get(_TAG_OF_MICRO_MANAGER) for each in series.pages if each is not None]
+        values = [each.value if each and isinstance(each.value, dict) else {} for each in each_page]
+        names = [name for name in values[0] if all(name in each for each in values)]
+        said += [
+            Said(name, [each[name] for each in values]) for name in names if meaning(name)[0] in ("times", "exposure")
+        ]
+    tags = {tag.name: tag.value for tag in page.tags}
+    exif = tags.get("ExifTag")
+    said += [Said(name, each) for name, each in {**tags, **(exif if isinstance(exif, dict) else {})}.items()]
+    return [each for each in said if str(each.value) not in ("0", "0.0")]  # which stands for nothing
 
 
-def _imagej_times(header: dict[str, Any]) -> dict[str, Any]:
-    interval = _seconds(header.get("finterval"), header.get("tunit", "sec"))
-    return {"rate_hz": 1 / interval} if interval else {}
+def _of_ome(text: str) -> list[Said]:
+    import tifffile
 
-
-def _ome_times(document: dict[str, Any], count: int, notes: list[str]) -> dict[str, Any]:
-    """Rate, exposure time, start and the times of the planes by OME's header; what cannot be used is noted."""
-    image = document.get("OME", {}).get("Image", {})
+    image = tifffile.xml2dict(text).get("OME", {}).get("Image", {})
     image = image[0] if isinstance(image, list) else image
     pixels = image.get("Pixels", {})
     planes = pixels.get("Plane", [])
     planes = sorted(planes if isinstance(planes, list) else [planes], key=lambda each: int(each.get("TheT", 0)))
-    known: dict[str, Any] = {}
-    if interval := _seconds(pixels.get("TimeIncrement"), pixels.get("TimeIncrementUnit", "s")):
-        known["rate_hz"] = 1 / interval
-    exposures = {_seconds(each.get("ExposureTime"), each.get("ExposureTimeUnit", "s")) for each in planes}
-    if exposure := next(iter(exposures), None):
-        known["exposure_s"] = exposure
-        if len(exposures) > 1:
-            notes.append("exposure times differ from frame to frame: that of one of them is taken")
-    times = [_seconds(each.get("DeltaT"), each.get("DeltaTUnit", "s")) for each in planes]
-    stated = [each for each in times if each is not None]
-    if len(stated) == count:
-        known["times_ns"] = np.rint(np.array(stated) * 1e9).astype(np.int64)
-        known.pop("rate_hz", None)  # the planes' own times are measured, and this is planned
-    elif stated:
-        notes.append(f"{len(stated)} of {count} frames have a time of their own (DeltaT): not used")
-    try:
-        moment = datetime.fromisoformat(str(image["AcquisitionDate"]))
-        utc = moment.astimezone(UTC).replace(tzinfo=None) if moment.tzinfo else moment
-        start = np.datetime64(utc, "ns")
-        known["start_ns"] = int(start.astype(np.int64)) + int(known["times_ns"][0] if "times_ns" in known else 0)
-    except (KeyError, ValueError):
-        pass
-    return known
+    planes = [each for each in planes if int(each.get("TheC", 0)) == int(each.get("TheZ", 0)) == 0]
+    said = []
+    for name in ("DeltaT", "ExposureTime"):
+        if values := [float(each[name]) for each in planes if name in each]:
+            said.append(Said(name, values, str(planes[0].get(f"{name}Unit", "s"))))
+    said.append(Said("TimeIncrement", pixels.get("TimeIncrement"), str(pixels.get("TimeIncrementUnit", "s"))))
+    date = str(image.get("AcquisitionDate", ""))
+    zone = "" if re.search(r"Z$|[+-]\d\d:?\d\d$", date) else "Z"
+    return [each for each in (*said, Said("AcquisitionDate", date and date + zone)) if each.value]
 
 
 @contextmanager

@@ -53,7 +53,8 @@ def imported(film: Film, rig: Rig, settings: FilmSettings, account: FilmAccount)
     Raises `ImportingError` where the film does not fit the rig file.
     """
     times = frame_times(film, rig, settings)
-    account.missing = times.missing
+    account.missing, account.left_out = max(0, times.missing - film.left_out), film.account
+    account.frames = film.left_out
     account.notes = (*film.notes, *times.notes, *(() if settings.invert else film.saturation_notes))
     if film.start_ns is None and settings.start_ns is None:
         account.notes += (

@@ -73,7 +73,10 @@ class FilmAccount:
     """Counts and notes for the user about how a film was read."""
 
     frames: int = 0
+    """Frames that became exposures, and those of the file that are none."""
     exposures: int = 0
+    left_out: str = ""
+    """The frames of the file that are none, in words."""
     missing: int = 0
     """Frames that are missing between others, by their times."""
     saturated: int = 0
@@ -84,6 +87,12 @@ class FilmAccount:
     """Those of the clipped pixels that are below zero."""
     pixels: int = 0
     notes: tuple[str, ...] = ()
+
+    @property
+    def said(self) -> str:
+        """How many frames there are, and how many are none or missing, in words."""
+        missing = f", {self.missing} frames are missing" if self.missing else ""
+        return f"{self.frames} frames{f': {self.left_out}' if self.left_out else ''}{missing}"
 
 
 class FilmLight:
@@ -138,16 +147,17 @@ class FrameTimes:
 
 
 def film_times(film: Film, settings: FilmSettings) -> FrameTimes:
-    """The times of a film's frames; without times of their own no frame is missing.
+    """The times of a film's frames. Without times of their own no frame is missing, but for those that are known.
 
-    Raises `ImportingError` where the rate and the times contradict each other, or the times do not follow each other at
-    a steady rate.
+    A rate that is given goes before the times, which then say the order and the gaps alone. Raises `ImportingError`
+    where the film's own rate and times contradict each other, or the times do not follow each other at a steady rate.
     """
     rate, notes = film.rate_hz, []
-    if settings.rate_hz is not None:
-        if rate is not None and abs(rate / settings.rate_hz - 1) > _CLOSE:
-            notes.append(f"the film says {rate:g} frames/s; {settings.rate_hz:g} frames/s as given are taken")
-        rate = settings.rate_hz
+    given = None if settings.rate_hz is None else settings.rate_hz * film.share
+    if given is not None:
+        if rate is not None and abs(rate / given - 1) > _CLOSE:
+            notes.append(f"the film says {rate:g} frames/s; {given:g} frames/s as given are taken")
+        rate = given
     start = settings.start_ns if settings.start_ns is not None else film.start_ns or 0
     if None not in (settings.start_ns, film.start_ns) and settings.start_ns != film.start_ns:
         notes.append(f"the film says that it starts at {_date(film.start_ns)}; {_date(settings.start_ns)} is taken")
@@ -156,8 +166,11 @@ def film_times(film: Film, settings: FilmSettings) -> FrameTimes:
         raise ImportingError(
             f"{film.name} has a start or an end that is not from 1970 to 2262: give the right --film start=DATE"
         )
-    periods = np.arange(film.count, dtype=np.int64)
+    periods = np.arange(film.count) if film.numbers is None else film.numbers - film.numbers[0]
     if film.times_ns is None or film.count < 2:
+        if lost := int(periods[-1]) + 1 - film.count - film.left_out:
+            notes.append(f"{lost} frames are missing by their numbers" if lost > 0 else "")
+        notes = list(filter(None, notes))
         since = np.rint(periods * (1e9 / rate if rate else 0.0)).astype(np.int64)
         return FrameTimes(periods=periods, starts_ns=start + since, rate_hz=rate, notes=tuple(notes))
     gaps = np.diff(film.times_ns) / 1e9
@@ -179,7 +192,12 @@ def film_times(film: Film, settings: FilmSettings) -> FrameTimes:
         )
     periods[1:] = np.cumsum(counts)
     timed = 1 / period
-    if rate is not None and abs(rate / timed - 1) > _CLOSE:
+    starts = start + film.times_ns - film.times_ns[0]
+    if rate is not None and abs(rate / timed - 1) > _CLOSE and (given is not None or film.played):
+        what = "it plays at" if film.played else "its times say"
+        notes.append(f"{what} {timed:.6g} frames/s; {rate:g} frames/s as {'given' if given else 'it says'} are taken")
+        starts, timed = start + np.rint(periods * 1e9 / rate).astype(np.int64), rate
+    elif rate is not None and abs(rate / timed - 1) > _CLOSE:
         raise ImportingError(
             f"{film.name}: {rate:g} frames/s contradict its times, which say {timed:.6g}: give --rate {timed:.6g}, or a"
             " file with the right times"
@@ -188,7 +206,6 @@ def film_times(film: Film, settings: FilmSettings) -> FrameTimes:
         each = ", ".join(f"{counts[k] - 1} after frame {k + 1} ({gaps[k]:.6g} s)" for k in lost[:_SHOWN])
         more = f", and {len(lost) - _SHOWN} gaps more" if len(lost) > _SHOWN else ""
         notes.append(f"{int((counts - 1).sum())} frames are missing by the times of the others: {each}{more}")
-    starts = start + film.times_ns - film.times_ns[0]
     return FrameTimes(periods=periods, starts_ns=starts, rate_hz=timed, notes=tuple(notes))
 
 

@@ -1,0 +1,223 @@
+"""What files say about the times of their frames: one table of names and units for all formats."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterable, Mapping
+from datetime import UTC, datetime
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+NAMES: dict[str, str] = {
+    "times": """times time timestamps timestamp timestampsutc t frametimestamps capturetimes acquisitiontimes frametimes
+        elapsedtime elapsedtimes deltat starttimes exposurestarts ndarraytimestamp relativetime sensortimestamp mjd
+        jd""",
+    "period": """period frameperiod frameinterval interval finterval cycletime framecycletime kineticcycletime kintime
+        kct acquireperiod exposureperiod timeincrement timeinterval timeintervall timeperframe timestep frametime dt
+        tframe samplingperiod""",
+    "rate": """rate framerate fps framespersecond frate framrate frmrate samplingrate samplerate acquisitionrate
+        acquisitionframerate framefrequency imagerate camerafps recordrate recordingrate capturefps
+        comandroidcapturefps framespersec""",
+    "exposure": """exposure exposuretime exptime exposuretimes exposures exp texp expt xposure integrationtime inttime
+        integration itime dit esodetdit shuttertime exposureduration texposure counttime acquiretime tint shutter
+        exposuretimeseconds""",
+    "start": """start starttime dateobs dateutc acquisitiondate acquisitiontime acquisitiondatetime datetimeoriginal
+        creationtime date timeutc receivedtime""",
+}
+"""Names, in small letters and without what is between words, of the times of all frames; of the time from each to the
+next; of frames a second; of the exposure time of each; and of the date of the first."""
+UNITS: dict[float, str] = {
+    1.0: "s sec secs second seconds hz fps", 1e-3: "ms msec msecs millisecond milliseconds millis",
+    1e-6: "us usec usecs microsecond microseconds micros mus u00b5s", 1e-9: "ns nsec nsecs nanosecond nanoseconds",
+    60.0: "min minute minutes", 3600.0: "h hr hour hours", 86400.0: "d day days", 1e3: "khz",
+}  # fmt: skip
+"""Their units, in s or Hz, by the last word of a name or as the file keeps them."""
+_EPOCHS = {"mjd": 40_587.0, "jd": 2_440_587.5}
+"""The year 1970 in days."""
+_FACTS = {name: fact for fact, names in NAMES.items() for name in names.split()}
+_SIZES = {name: size for size, names in UNITS.items() for name in names.split()}
+_WORDS = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+")
+_TAKEN_S = (1.0, 1e-3, 1e-6, 1e-9)
+_USUAL_S = (5e-5, 2.0)
+"""From one frame to the next, where a number without a unit is all there is."""
+_LONGEST_S = 10.0
+"""The longest exposure that a number without a unit says in seconds, where nothing is known of the rate."""
+_DATED_S = (631_152_000, 7_258_118_400)
+"""1990 and 2200, s since 1970: times before count from the start of a camera or a computer."""
+_SAME = 0.01
+_SHOWN = 10
+"""Names of things that are not used, in a note."""
+
+
+class Said(NamedTuple):
+    """One thing that a file says."""
+
+    name: str
+    value: Any
+    unit: str = ""
+
+
+def dated(time_ns: int) -> bool:
+    """Whether a time, ns since 1970, is a date, and not a time since the start of a camera."""
+    return _DATED_S[0] <= time_ns / 1e9 <= _DATED_S[1]
+
+
+def meaning(name: str, unit: str = "") -> tuple[str, str, float | None]:
+    """What a name stands for, empty where that is not known; the name without unit and spaces; the unit, s or Hz."""
+    words = [each.lower() for each in _WORDS.findall(re.sub("[\N{MICRO SIGN}\N{GREEK SMALL LETTER MU}]", "u", name))]
+    size = _SIZES.get(re.sub(r"[\N{MICRO SIGN}\N{GREEK SMALL LETTER MU}]", "u", unit).strip(" []()\\").lower())
+    plain = "".join(words)
+    if plain not in _FACTS and len(words) > 1 and words[-1] in _SIZES:
+        plain, size = "".join(words[:-1]), _SIZES[words[-1]]
+    return _FACTS.get(plain, ""), plain, size
+
+
+def facts(
+    said: Iterable[Said], count: int, *, every: bool = False, longest_s: float = _LONGEST_S
+) -> tuple[dict[str, Any], tuple[str, ...]]:
+    """Fields of `Film` by what a file of ``count`` frames says, and a note on what was found and used or not.
+
+    Without a unit a number is in the largest one in which an exposure is no longer than a frame, and times and rate
+    agree. ``every``: things whose names mean nothing here are noted, too. ``longest_s``: an exposure that is not
+    longer is in seconds where neither is known.
+    """
+    found: dict[str, list[tuple[Said, NDArray[Any], float | None, str]]] = {fact: [] for fact in NAMES}
+    refused, other = dict[str, str](), list[str]()
+    for each in said:
+        fact, plain, unit = meaning(each.name, each.unit)
+        values, own = _numbers(each.value)
+        if fact == "times" and values is not None and values.size == 1 != count:
+            fact = "period" if plain == "frametime" else ""
+        if fact == "start" and (text := _moment(each.value)):
+            values = np.array([text])
+        if not fact:
+            other += [_shown(each)] if every else []
+        elif values is None or not np.isfinite(values).all() or values.size not in (1, count):
+            refused[_shown(each)] = (
+                f" by its size, for {count} frames" if values is not None and values.size > 1 else ""
+            )
+        elif fact in ("period", "rate", "exposure") and (values <= 0).any():
+            refused[_shown(each)] = ""
+        elif fact != "times" or values.size == count:
+            found[fact].append((each, values, own or unit, plain))
+    known, used, period = dict[str, Any](), list[str](), None
+    for fact in ("rate", "period", "times", "exposure", "start"):
+        for each, values, unit, plain in found[fact]:
+            if fact == "rate":
+                size: float | None = unit or 1.0
+            elif fact == "exposure":
+                size = unit or _unit_of_exposure(float(values.max()), period, longest_s)
+            else:
+                step = float(np.median(np.diff(values))) if fact == "times" and count > 1 else float(values[0])
+                size = 86400.0 if plain in _EPOCHS else unit or _unit_of(values, step, period, fact == "start")
+            if size is None:
+                refused[_shown(each)] = f": its unit is not known, name it {each.name}_s, _ms, _us or _ns"
+            elif not _taken(known, fact, values, size, plain):
+                refused[_shown(each)] = ""
+            else:
+                used.append(_shown(each) + ("" if np.ptp(values) <= _SAME * values.max() or fact != "exposure"
+                                            else ", which differs from frame to frame: the first"))  # fmt: skip
+        times = known.get("times_ns")
+        if times is not None and count > 1 and np.median(np.diff(times)) > 0:
+            period = float(np.median(np.diff(times))) / 1e9
+        elif "rate_hz" in known:
+            period = 1 / known["rate_hz"]
+    left = [*(f"{name} (not used{why})" for name, why in refused.items()), *(f"{each} (not used)" for each in other)]
+    parts = [f"{', '.join(used)} (used)"] * bool(used) + left[:_SHOWN]
+    more = f"; and {len(left) - _SHOWN} more (not used)" if len(left) > _SHOWN else ""
+    return known, (f"found: {'; '.join(parts)}{more}",) if parts else ()
+
+
+def _taken(known: dict[str, Any], fact: str, values: NDArray[Any], size: float, plain: str) -> bool:
+    """Add a fact to the known ones; False where it is another one than what is known."""
+    if fact == "times":
+        if "times_ns" in known:
+            return False
+        times = nanoseconds(values - _EPOCHS.get(plain, 0), size)
+        known["times_ns"] = times
+        if dated(int(times[0])):
+            known.setdefault("start_ns", int(times[0]))
+        return True
+    if fact == "start":
+        start = int(nanoseconds(values[:1], size)[0])
+        return dated(start) and known.setdefault("start_ns", start) == start
+    key = "exposure_s" if fact == "exposure" else "rate_hz"
+    value = float(values[0]) * size
+    value = 1 / value if fact == "period" else value
+    return bool(abs(known.setdefault(key, value) / value - 1) <= _SAME)
+
+
+def nanoseconds(values: NDArray[Any], size: float) -> NDArray[np.int64]:
+    """Times in units of ``size`` s as ns, which lose nothing that they have not lost."""
+    if values.dtype.kind in "iu" and size <= 1:
+        return values.astype(np.int64) * round(size * 1e9)
+    whole = np.floor(values * size)
+    return np.asarray(whole.astype(np.int64) * 10**9 + np.rint((values * size - whole) * 1e9).astype(np.int64))
+
+
+def _unit_of(values: NDArray[Any], step: float, period: float | None, start: bool) -> float | None:
+    """The unit of times or of a period, s: by a date in them, by the known period, or by what is usual."""
+    since = [u for u in _TAKEN_S if _DATED_S[0] <= float(values.flat[0]) * u <= _DATED_S[1]]
+    if since and (start or values.size > 1):
+        return since[0]
+    if start or step <= 0:
+        return None
+    if period is not None:
+        return next((u for u in _TAKEN_S if abs(step * u / period - 1) < 0.25), None)
+    usual = [u for u in _TAKEN_S if _USUAL_S[0] <= step * u <= _USUAL_S[1]]
+    if (values.dtype.kind == "f" and 1.0 in usual) or len(usual) == 1:
+        return usual[0]
+    return None
+
+
+def _unit_of_exposure(value: float, period: float | None, longest_s: float) -> float | None:
+    if period is None:
+        return 1.0 if value <= longest_s else None
+    return next((u for u in _TAKEN_S if value * u <= 1.05 * period), None)
+
+
+def _numbers(value: Any) -> tuple[NDArray[Any] | None, float | None]:
+    """Numbers, in one dimension, and their unit where it stands beside them; None where it is none."""
+    if isinstance(value, tuple) and len(value) == 2 and all(isinstance(each, int) for each in value):
+        value = value[0] / value[1] if value[1] else math.nan  # a fraction, as TIFF has them
+    if isinstance(value, bytes):
+        value = value.decode(errors="replace")
+    if isinstance(value, str):
+        match = re.fullmatch(r"\s*([-+.\deEdD]+)(?:\s*/\s*(\d+))?\s*([^\W\d]*)\s*", value.replace(",", "."))
+        try:
+            assert match is not None
+            value = float(match[1].upper().replace("D", "E")) / float(match[2] or 1)
+            return np.array([value]), _SIZES.get(match[3].lower().replace("\N{MICRO SIGN}", "u"))
+        except (AssertionError, ValueError, ZeroDivisionError):
+            return None, None
+    try:
+        array = np.asarray(value)
+    except ValueError:
+        return None, None
+    if array.dtype.kind == "M":
+        return array.astype("datetime64[ns]").astype(np.int64).ravel(), 1e-9
+    if array.dtype.kind not in "iuf" or not array.size or array.ndim > 2 or array.size != max(array.shape, default=1):
+        return None, None
+    return array.ravel(), None
+
+
+def _moment(value: Any) -> int:
+    """A date with its zone in text, ns since 1970, or 0: local time is of no use."""
+    text = value.decode(errors="replace") if isinstance(value, bytes) else value
+    text = text.item() if isinstance(text, np.ndarray | np.generic) and text.size == 1 else text
+    try:
+        moment = datetime.fromisoformat(re.sub(r" ([+-]\d\d:?\d\d)$", r"\1", str(text).strip()))
+    except ValueError:
+        return 0
+    return round(moment.astimezone(UTC).timestamp() * 1e6) * 1000 if moment.tzinfo else 0
+
+
+def _shown(each: Said) -> str:
+    value = np.asarray(each.value) if not isinstance(each.value, str | bytes | Mapping) else each.value
+    if isinstance(value, np.ndarray) and value.size > 2:
+        return f"{each.name} of shape {value.shape}"
+    text = f"{value:g}" if isinstance(value, np.ndarray) and value.ndim == 0 and value.dtype.kind in "iuf" else value
+    return f"{each.name} {str(text)[:24]}".replace("\n", " ")
