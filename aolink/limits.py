@@ -177,7 +177,7 @@ def load_table(path: Path) -> NDArray[np.float64]:
     elif path.suffix == ".csv":
         if (size := path.stat().st_size) > _UNPACKED_BYTES:
             raise exceeded(f"{path} has {size} bytes", _UNPACKED_BYTES, RigError)
-        found = np.loadtxt(path, delimiter=",", ndmin=2)
+        found = np.loadtxt(path, delimiter=",", ndmin=2, encoding="utf-8-sig")
     else:
         found = load_array(path)
     try:

@@ -29,7 +29,7 @@ TIMEOUT_S = 300
 _MODULES = (
     "aolink.cli",
     "aolink.exporting.files",
-    "aolink.films.pictures",
+    "aolink.restoration.films",
     "aolink.importing.recording",
     "aolink.jobs.batch",
     "aolink.jobs.calibrate",

@@ -93,6 +93,10 @@ def _number(recording: "Recording", exposure: int) -> range:
     return range(exposure, exposure + 1)
 
 
+_WIDEST_M, _LONGEST_M = 0.1, 10.0
+"""Pitch and focal length of no lenslet."""
+
+
 @app.command(epilog="Example: aolink slopes frame.fits --reference flat.fits --pitch-m 600e-6 --focal-m 0.04 -o s.npz")
 def slopes(
     frame: Annotated[
@@ -124,6 +128,8 @@ def slopes(
 
     if (pitch_m is None) != (focal_m is None):
         raise typer.BadParameter("give --pitch-m and --focal-m, or neither")
+    if (pitch_m or 0) > _WIDEST_M or (focal_m or 0) > _LONGEST_M:
+        raise typer.BadParameter("--pitch-m and --focal-m are in metres: 600 um are 600e-6, 40 mm are 0.04")
     inputs = [frame, reference]
     output, rrd = _targets(written)
     if output is not None:

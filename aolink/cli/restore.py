@@ -119,9 +119,10 @@ def _deblur_pictures(
     overwrite: bool,
 ) -> None:  # fmt: skip
     from aolink.cli.tables.sessions import adds_error
-    from aolink.films.pictures import read_film, read_psf, write_pictures
+    from aolink.films.pictures import read_film
     from aolink.restoration import find_method
-    from aolink.restoration.films import path_psfs, restored_film
+    from aolink.restoration.films import path_psfs, restored_film, write_pictures
+    from aolink.restoration.texts import read_psf
 
     check_target(out, overwrite=overwrite, sources=[image, blur], error=RestorationError)
     film = read_film(image, RestorationError)

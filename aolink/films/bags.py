@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import io
 import re
 from collections.abc import Callable, Iterator
@@ -18,6 +19,7 @@ from mcap.records import Channel, Schema
 
 from aolink.errors import ImportingError
 from aolink.extensions import needs_extra
+from aolink.films.facts import dated
 from aolink.films.film import Film, FilmFrame
 from aolink.films.stills import COMPRESSED, decoded
 
@@ -140,7 +142,7 @@ def _chosen(types: dict[str, str], topic: str | None, path: Path) -> str:
 
 def _film(path: Path, topic: str, messages: Callable[[], Iterator[_Stamped]]) -> Film:
     first: _Stamped | None = None
-    stamps, arrivals, lossy = [], [], False
+    stamps, arrivals, pictures, lossy = [], [], set[tuple[int, bytes]](), False
     for each in messages():
         first = each if first is None else first
         one, other = first.picture, each.picture
@@ -152,9 +154,10 @@ def _film(path: Path, topic: str, messages: Callable[[], Iterator[_Stamped]]) ->
         stamps.append(each.time_ns)
         arrivals.append(each.arrival_ns)
         lossy |= each.lossy
+        pictures.add((each.time_ns, hashlib.blake2b(other.tobytes(), digest_size=16).digest()))
     if first is None:
         raise ImportingError(f"{path} has no picture on {topic}")
-    stamped, notes = all(stamps) and len(set(stamps)) == len(stamps), []
+    stamped, notes = all(stamps) and len(set(stamps)) == len(pictures), []  # a message may come twice
     if not stamped:
         why = "some pictures have no time of their own" if not all(stamps) else "pictures share a time of their own"
         why = why if any(stamps) else "the pictures have no times of their own"
@@ -166,10 +169,16 @@ def _film(path: Path, topic: str, messages: Callable[[], Iterator[_Stamped]]) ->
             for k in np.flatnonzero(np.abs(jumps) > _JUMP_NS)[:3]
         ]
     times = np.array(stamps if stamped else arrivals, dtype=np.int64)
+    start = int(times[0])
+    if stamped and not dated(start) and dated(arrivals[0]):
+        start = arrivals[0]
+        notes.append(
+            "the stamps count from the start of a clock, not from 1970: the first picture has its arrival's date"
+        )
     rows, columns = first.picture.shape[:2]
     return Film(
         name=f"{path.name}:{topic}", shape=(int(rows), int(columns)), dtype=first.picture.dtype, count=len(times),
-        pictures=lambda: (each.picture for each in messages()), start_ns=int(times[0]), times_ns=times,
+        pictures=lambda: (each.picture for each in messages()), start_ns=start, times_ns=times,
         nonlinear=COMPRESSED if lossy else "", top=first.top, mosaic=first.mosaic, notes=tuple(notes),
     )  # fmt: skip
 

@@ -39,7 +39,8 @@ _EPOCHS = {"mjd": 40_587.0, "jd": 2_440_587.5}
 """The year 1970 in days."""
 _FACTS = {name: fact for fact, names in NAMES.items() for name in names.split()}
 _SIZES = {name: size for size, names in UNITS.items() for name in names.split()}
-_WORDS = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+")
+_UNIT = re.compile(r"[\W_]+[A-Za-z]+[\W_]*$|(?<=[a-z])[A-Z][a-z]+$")
+"""The last word of a name."""
 _TAKEN_S = (1.0, 1e-3, 1e-6, 1e-9)
 _USUAL_S = (5e-5, 2.0)
 """From one frame to the next, where a number without a unit is all there is."""
@@ -67,11 +68,12 @@ def dated(time_ns: int) -> bool:
 
 def meaning(name: str, unit: str = "") -> tuple[str, str, float | None]:
     """What a name stands for, empty where that is not known; the name without unit and spaces; the unit, s or Hz."""
-    words = [each.lower() for each in _WORDS.findall(re.sub("[\N{MICRO SIGN}\N{GREEK SMALL LETTER MU}]", "u", name))]
-    size = _SIZES.get(re.sub(r"[\N{MICRO SIGN}\N{GREEK SMALL LETTER MU}]", "u", unit).strip(" []()\\").lower())
-    plain = "".join(words)
-    if plain not in _FACTS and len(words) > 1 and words[-1] in _SIZES:
-        plain, size = "".join(words[:-1]), _SIZES[words[-1]]
+    name, unit = (re.sub("[\N{MICRO SIGN}\N{GREEK SMALL LETTER MU}]", "u", each) for each in (name, unit))
+    size = _SIZES.get(unit.strip(" []()\\").lower())
+    plain = re.sub(r"[\W_]", "", name).lower()
+    if plain not in _FACTS and (found := _UNIT.search(name)) and found[0].strip(" _-.()[]").lower() in _SIZES:
+        plain = re.sub(r"[\W_]", "", name[: found.start()]).lower()
+        size = _SIZES[found[0].strip(" _-.()[]").lower()]
     return _FACTS.get(plain, ""), plain, size
 
 
@@ -104,8 +106,11 @@ def facts(
         elif fact != "times" or values.size == count:
             found[fact].append((each, values, own or unit, plain))
     known, used, period = dict[str, Any](), list[str](), None
-    for fact in ("rate", "period", "times", "exposure", "start"):
-        for each, values, unit, plain in found[fact]:
+    planned = [each for each in found["period"] if each[2]]  # they say more than a rate, which may be that of playing
+    found["period"] = [each for each in found["period"] if not each[2]]
+    first = [("period", planned), *((fact, found[fact]) for fact in ("rate", "period", "times", "exposure", "start"))]
+    for fact, these in first:
+        for each, values, unit, plain in these:
             if fact == "rate":
                 size: float | None = unit or 1.0
             elif fact == "exposure":

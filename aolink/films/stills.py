@@ -49,14 +49,14 @@ def said(path: Path) -> tuple[dict[str, Any], tuple[str, ...]]:
     with opened_image(path, ImportingError) as image:
         from PIL import ExifTags
 
-        tags = {}
+        tags: dict[Any, Any] = {}
         if image.format != "PNG" or "exif" in image.info:  # it would decode it
             exif = image.getexif()
-            tags = {**exif, **exif.get_ifd(ExifTags.IFD.Exif)}
+            tags.update({**exif, **exif.get_ifd(ExifTags.IFD.Exif)})
         named = {ExifTags.TAGS.get(key, str(key)): value for key, value in tags.items()}
         parts = (named.get("DateTimeOriginal"), named.get("SubsecTimeOriginal"), named.get("OffsetTimeOriginal"))
         found = [Said(str(key), float(each) if isinstance(each, Rational) else each) for key, each in
-                 {**named, **image.info}.items() if isinstance(each, str | Rational | float)]  # fmt: skip
+                 [*named.items(), *image.info.items()] if isinstance(each, str | Rational | float)]  # fmt: skip
     found = [each for each in found if each.name != "DateTimeOriginal"]
     if parts[0]:  # 2026:11:22 09:30:00, with decimals and a zone beside it
         date = f"{str(parts[0])[:10].replace(':', '-')}T{str(parts[0])[11:]}"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -12,12 +13,15 @@ from numpy.typing import NDArray
 
 from aolink.errors import ImportingError
 from aolink.extensions import needs_extra
+from aolink.films.facts import Said, facts, meaning
 from aolink.films.film import Film
 from aolink.films.stills import COMPRESSED
 from aolink.limits import LOSSY_EXPANSION, check_film, check_picture
 
 _LINEAR = ("ffv1", "huffyuv", "rawvideo", "utvideo", "png", "tiff", "ffvhuff")
 """Codecs that lose nothing."""
+_SHORTER = 0.02
+"""Share of the frames by which a header may announce too many."""
 
 
 def video_film(path: Path) -> Film:
@@ -26,6 +30,12 @@ def video_film(path: Path) -> Film:
     def decoded() -> Iterator[Any]:
         with _opened(path) as file:
             for frame in file.decode(file.streams.video[0]):
+                if frame.interlaced_frame:
+                    raise ImportingError(
+                        f"{path} is interlaced: a frame is two of half the rows, half a period apart. `ffmpeg -i {path}"
+                        " -vf separatefields -c:v ffv1 fields.mkv` makes a film of these; where frames are whole in"
+                        f" truth, `ffmpeg -i {path} -vf setfield=prog -c:v ffv1 whole.mkv`"
+                    )
                 if frame.is_corrupt:
                     raise ImportingError(f"{path} is damaged: a frame cannot be decoded")
                 yield frame
@@ -39,6 +49,11 @@ def video_film(path: Path) -> Film:
         shape = (stream.codec_context.height, stream.codec_context.width)
         check_picture(shape[1], shape[0], ImportingError)
         tick, codec, rate = stream.time_base, stream.codec_context.name, stream.guessed_rate
+        lasts = stream.duration * tick if stream.duration and tick else None
+        if lasts is None and file.duration and len(file.streams) == 1:
+            lasts = Fraction(file.duration, 10**6)
+        announced = stream.frames or (round(lasts * rate) if lasts and rate else 0)
+        said = [Said(name, value) for name, value in {**file.metadata, **stream.metadata}.items()]
     shown: list[int | None] = []
     first = None
     for frame in decoded():
@@ -48,8 +63,8 @@ def video_film(path: Path) -> Film:
     if first is None:
         raise ImportingError(f"{path} has no pictures")
     pixels = _pixels(first)
+    known, notes = facts([each for each in said if meaning(each.name)[0] in ("rate", "exposure")], len(shown))
     bits = _bits(first)
-    known: dict[str, Any] = {}
     times = [each * tick for each in shown if each is not None and tick is not None]
     if tick is not None and len(times) == len(shown):
         if rate:  # what a container has rounded to its ticks is meant to be at whole frames
@@ -57,14 +72,21 @@ def video_film(path: Path) -> Film:
             if all(abs(each - times[0] - k / rate) <= tick for each, k in zip(times, numbers, strict=True)):
                 times = [k / rate for k in numbers]
         known["times_ns"] = np.array([round(each * 10**9) for each in times], np.int64)
+        there = round((times[-1] - times[0]) * rate) + 1 if rate else len(times)
+        if max(there, len(times)) < announced - max(2, _SHORTER * announced):
+            raise ImportingError(
+                f"{path} is cut off: it announces {announced} frames and has {len(times)}. `ffmpeg -i {path} -c copy"
+                " rest.mkv` writes what is left as a film"
+            )
     elif rate:
-        known["rate_hz"] = float(rate)
+        known.setdefault("rate_hz", float(rate))
     linear = codec in _LINEAR and not first.format.name.startswith("yuv")
     mosaic = first.format.name.removeprefix("bayer_")[:4].upper() if first.format.name.startswith("bayer") else ""
     return Film(
         name=path.name, shape=(int(pixels.shape[0]), int(pixels.shape[1])), dtype=pixels.dtype, count=len(shown),
         pictures=lambda: map(_pixels, decoded()), nonlinear="" if linear else COMPRESSED,
-        mosaic=mosaic, top=float((1 << bits) - 1) if bits not in (8, 16, 32) else None, **known,
+        top=float((1 << bits) - 1) if bits not in (8, 16, 32) else None,
+        mosaic=mosaic, played=True, notes=notes, **known,
     )  # fmt: skip
 
 
@@ -89,6 +111,18 @@ def _bits(frame: Any) -> int:
 
 
 def _pixels(frame: Any) -> NDArray[Any]:
+    """A frame's numbers as a player would turn them."""
+    pixels = _unturned(frame)
+    found = next((bytes(each) for each in frame.side_data if each.type.name == "DISPLAYMATRIX"), None)
+    if found is None:
+        return pixels
+    a, b, _, c, d = np.frombuffer(found, "<i4", 5).tolist()
+    if abs(a) < abs(b):
+        pixels, a, d = pixels.swapaxes(0, 1), c, b
+    return np.ascontiguousarray(pixels[:: -1 if d < 0 else 1, :: -1 if a < 0 else 1])
+
+
+def _unturned(frame: Any) -> NDArray[Any]:
     """A frame's numbers as they are; colours that are no red, green and blue are made these, of as many bits."""
     name, bits = frame.format.name, _bits(frame)
     if name.startswith(("gray", "bayer", "gbrp", "rgb24", "rgb48")) and not name.startswith(("gray8a", "grayf")):

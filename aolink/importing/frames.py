@@ -168,9 +168,8 @@ def film_times(film: Film, settings: FilmSettings) -> FrameTimes:
         )
     periods = np.arange(film.count) if film.numbers is None else film.numbers - film.numbers[0]
     if film.times_ns is None or film.count < 2:
-        if lost := int(periods[-1]) + 1 - film.count - film.left_out:
-            notes.append(f"{lost} frames are missing by their numbers" if lost > 0 else "")
-        notes = list(filter(None, notes))
+        if (gone := int(periods[-1]) + 1 - film.count - film.left_out) > 0:
+            notes.append(f"by their numbers frames are missing: {gone}")
         since = np.rint(periods * (1e9 / rate if rate else 0.0)).astype(np.int64)
         return FrameTimes(periods=periods, starts_ns=start + since, rate_hz=rate, notes=tuple(notes))
     gaps = np.diff(film.times_ns) / 1e9
@@ -184,7 +183,9 @@ def film_times(film: Film, settings: FilmSettings) -> FrameTimes:
     period = float(gaps[gaps < 1.5 * usual].mean())  # times may be rounded, so that the median is not exact
     counts = np.rint(gaps / period).astype(np.int64)
     off = np.abs(gaps / period - counts)
-    if (counts < 1).any() or (off > _IRREGULAR).any():
+    if film.played and given is not None:
+        counts = np.maximum(counts, 1)  # a player may come early or late
+    elif (counts < 1).any() or (off > _IRREGULAR).any():
         worst = int(np.argmax(np.where(counts < 1, np.inf, off)))
         raise ImportingError(
             f"{film.name}: frame {worst + 1} comes {gaps[worst]:.4g} s after the one before, at a frame period of"
@@ -196,7 +197,7 @@ def film_times(film: Film, settings: FilmSettings) -> FrameTimes:
     if rate is not None and abs(rate / timed - 1) > _CLOSE and (given is not None or film.played):
         what = "it plays at" if film.played else "its times say"
         notes.append(f"{what} {timed:.6g} frames/s; {rate:g} frames/s as {'given' if given else 'it says'} are taken")
-        starts, timed = start + np.rint(periods * 1e9 / rate).astype(np.int64), rate
+        starts, timed = np.int64(start) + np.rint(periods * 1e9 / rate).astype(np.int64), rate
     elif rate is not None and abs(rate / timed - 1) > _CLOSE:
         raise ImportingError(
             f"{film.name}: {rate:g} frames/s contradict its times, which say {timed:.6g}: give --rate {timed:.6g}, or a"

@@ -46,11 +46,14 @@ def import_film(
         raise ImportingError(
             f"{film.name} has {film.count} frames: not enough for an exposure of {settings.frames_per_exposure}"
         )
+    none = (
+        f"; {film.left_out} of its {film.count + film.left_out} frames are none: {film.account}" if film.account else ""
+    )
     facts = {
         "aolink_version": version("aolink"),
         "rig": rig.name,
         "rig_digest": rig.digest,
-        "camera": f"{'slopes without pictures, ' if film.slopes else ''}imported from {film.name}",
+        "camera": f"{'slopes without pictures, ' if film.slopes else ''}imported from {film.name}{none}",
         "mirror": "none" if film.inputs is None else f"imported from {film.name}",
         "import_settings": str(settings),
     }

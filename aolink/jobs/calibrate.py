@@ -251,11 +251,12 @@ def film_row_time(rig: Rig, path: Path, blink_hz: float) -> RowTime:
         The film cannot be read, or its times contradict each other.
     """
     from aolink.films.formats import open_film
+    from aolink.films.whole import whole_frames
     from aolink.importing.frames import FilmSettings, film_times
 
     if not 0 < blink_hz < math.inf:
         raise CalibrationError(f"blink_hz={blink_hz:g} must be the light's blinks in a second, above 0")
-    film = open_film(path, None)
+    film = whole_frames(open_film(path))
     if film.slopes:
         raise CalibrationError(f"{film.name} has slopes and no pictures")
     times = film_times(film, FilmSettings())

@@ -234,7 +234,7 @@ def look(
             f" rms, is below a third of the kernel, {sd:.2g} pixels: expose longer"
         )
     models = [each.found.model if each.found else None for each in directions]
-    doubts = tuple(_doubts(spots, directions, sd, given=kernel is not None, thorough=thorough))
+    doubts = tuple(_doubts(film, spots, directions, sd, given=kernel is not None, thorough=thorough))
     return Looked(
         spots=spots, rate_hz=rate, exposure_s=exposure_s, sd=sd, together=together, directions=tuple(directions),
         text=scene.text(sd, models, together=together), cut=scene.cut(sd), settings=scene.settings,
@@ -446,8 +446,12 @@ def _assumed(film: Film, settings: FilmSettings, scene: Scene, kernel: float | N
         yield f"the first {len(spots.light)} of {film.count} frames are looked at: later motion may be another"
 
 
-def _doubts(spots: Spots, directions: Sequence[Direction], sd: float, *, given: bool, thorough: bool) -> Iterator[str]:
+def _doubts(
+    film: Film, spots: Spots, directions: Sequence[Direction], sd: float, *, given: bool, thorough: bool
+) -> Iterator[str]:
     """Reasons to mistrust what was found, and what would help."""
+    if film.account:
+        yield f"{film.left_out} of {film.count + film.left_out} frames are none: {film.account}"
     if not given and min(each.least_blur for each in directions) >= LEAST_BLUR * sd:
         yield (
             f"no frame shows the spot as narrow as its kernel, {sd:.2g} pixels, along x or along y: this width is known"

@@ -3,8 +3,9 @@ strain gauge."""
 
 from __future__ import annotations
 
+import io
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -12,13 +13,17 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from aolink.errors import ImportingError, RestorationError
+from aolink.extensions import needs_extra
+from aolink.files import writing
 from aolink.films.film import Film, saturation
-from aolink.numerics.arrays import FloatArray
+from aolink.films.stills import encoded
 from aolink.optics.sensor import Kernel
 from aolink.restoration.method import Restored
 from aolink.restoration.psf import Psf, motion_psf
 from aolink.restoration.restore import restore
+from aolink.restoration.texts import read_log
 
+_TIFF, _FITS = (".tif", ".tiff"), (".fits", ".fit", ".fts")
 _STEPS = 1000
 """Moments of an exposure at which the log is interpolated."""
 _SHARP = 0.01
@@ -79,7 +84,7 @@ def path_psfs(path: Path, clock: PathClock, film: Film) -> list[Psf]:
     at the log's first time; without an exposure time the whole log is one exposure. Displacements are from the mean of
     an exposure. Raises `RestorationError` where the log cannot be read or does not cover an exposure.
     """
-    times, places = _log(path)
+    times, places = read_log(path)
     times = times + clock.offset_s
     exposure_s = clock.exposure_s or film.exposure_s
     since = np.zeros(1)
@@ -108,20 +113,40 @@ def path_psfs(path: Path, clock: PathClock, film: Film) -> list[Psf]:
     return found
 
 
-def _log(path: Path) -> tuple[FloatArray, FloatArray]:
-    """Times, (rows,), and places, (2, rows), of a log, whose first row may name its columns."""
+def write_pictures(
+    path: Path, made: list[NDArray[Any]], film: Film, *, overwrite: bool = False, sources: Iterable[Path] = ()
+) -> None:
+    """Write what was made of the pictures of a film so that a reader of that film reads it, of its type and with its
+    meaning of black and white; ``sources`` are files that it never replaces.
+
+    Raises `RestorationError` where the file exists and ``overwrite`` is False, or it cannot be written, or its format
+    cannot hold the pictures.
+    """
+    stack = np.asarray(made)
+    if len(made) == 1 and film.count == 1:
+        stack = stack[0]
+    data, suffix = io.BytesIO(), path.suffix.lower()
     try:
-        lines = [
-            line.split("#")[0].replace(",", " ").replace(";", " ").split() for line in path.read_text().splitlines()
-        ]
-        rows = [line for line in lines if line]
-        if rows and not rows[0][0].lstrip("+-.")[:1].isdigit():
-            rows = rows[1:]
-        table = np.array([[float(cell) for cell in row] for row in rows])
-    except (OSError, ValueError) as error:
-        raise RestorationError(f"{path} cannot be read as a log of time, x and y ({error})") from None
-    if table.ndim != 2 or table.shape[1] not in (2, 3) or len(table) < 2 or not np.isfinite(table).all():
-        raise RestorationError(f"{path} has a table of shape {table.shape}, expected rows of time, x and y")
-    if (steps := np.diff(table[:, 0])).min() <= 0:
-        raise RestorationError(f"{path}: row {int(steps.argmin()) + 2} is not later than the one before")
-    return table[:, 0], np.column_stack([table[:, 1:], np.zeros(len(table))])[:, :2].T
+        if suffix == ".npy":
+            np.save(data, stack)
+        elif suffix in _TIFF:
+            with needs_extra("films", RestorationError):
+                import tifffile
+            dark = film.white_is_zero and stack.dtype.kind == "u"
+            light = "rgb" if stack.shape[-1] in (3, 4) and made[0].ndim == 3 else "minisblack"
+            most = (film.full_scale - stack).astype(stack.dtype) if dark else stack
+            tifffile.imwrite(data, most, photometric="miniswhite" if dark else light)
+        elif suffix in _FITS:
+            with needs_extra("films", RestorationError):
+                from astropy.io import fits
+            fits.PrimaryHDU(stack).writeto(data)
+        elif len(made) > 1:
+            raise ValueError(f"it holds one picture, and there are {len(made)}; .tif and .npy hold several")
+        else:
+            data.write(encoded(path, made[0], film.top))
+    except (ValueError, TypeError, KeyError, OSError) as error:
+        raise RestorationError(
+            f"{path} cannot be written ({error}): a picture of type {stack.dtype} fits in a .npy file"
+        ) from error
+    with writing(path, overwrite=overwrite, sources=sources, error=RestorationError) as partial:
+        partial.write_bytes(data.getbuffer())

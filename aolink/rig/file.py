@@ -139,7 +139,7 @@ def load_rig(path_or_name: str | Path) -> Rig:
         text = path.read_text()
     else:
         try:
-            with path.open() as file:
+            with path.open(encoding="utf-8-sig") as file:  # a byte order mark is none of it
                 text = file.read(_LONGEST + 1)
         except OSError as error:
             if path.name.removesuffix(".toml") in builtin_rigs() and path.parent == Path():

@@ -17,7 +17,15 @@ from tests.kinds import must_be
 
 @pytest.mark.parametrize("command", _TAKEN)
 def test_a_command_takes_the_film_options_that_its_help_names_and_no_other(command: str) -> None:
-    values = {"gamma": "2.2", "topic": "/a", "colour": "red", "sum": "8", "scale": "300", "start": "2026-11-22"}
+    values = {
+        "gamma": "2.2",
+        "topic": "/a",
+        "colour": "red",
+        "pixels": "signed",
+        "sum": "8",
+        "scale": "300",
+        "start": "2026-11-22",
+    }
     values["row_time"] = "1e-5"
     forms = [f"{name}={values[name]}" if "=" in form else name for form in _FILM for name in [form.partition("=")[0]]]
     taken, others = forms[: _TAKEN[command]], forms[_TAKEN[command] :]

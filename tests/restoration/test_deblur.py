@@ -21,9 +21,11 @@ from aolink.cli.tables.sessions import deblurred_lines
 from aolink.errors import RestorationError
 from aolink.films.film import array_film
 from aolink.films.formats import open_film
-from aolink.films.pictures import read_picture, read_psf, write_pictures
+from aolink.films.pictures import read_picture
 from aolink.recording.deblur import RestoredCounts
 from aolink.restoration import restore
+from aolink.restoration.films import write_pictures
+from aolink.restoration.texts import read_psf
 from tests.restoration.scenes import UNIFORM, blocks, blurred
 
 Run = Callable[..., "subprocess.CompletedProcess[str]"]
