@@ -161,6 +161,7 @@ def _inside(pool: ProcessPoolExecutor) -> Any:
 def _end(pool: ProcessPoolExecutor, calls: int) -> None:
     """End the processes of a pool, whose calls wait in the pipe ``calls``."""
     running, manager = list((pool._processes or {}).values()), _inside(pool)._executor_manager_thread
+    results = _inside(pool)._result_queue
     for process in running:
         process.terminate()
     pool.shutdown(wait=False, cancel_futures=True)
@@ -169,6 +170,7 @@ def _end(pool: ProcessPoolExecutor, calls: int) -> None:
         process.join(max(0.0, deadline - time.monotonic()))
         process.kill()
         process.join(_PATIENCE_S)
+    results._writer.close()  # or the pool waits for ever for the rest of a result whose sender has ended
     # The pool's own threads end when all calls are in the pipe. One that is larger than the pipe would keep them from
     # that for ever, for nobody reads (Python before 3.11.5): so it is read here, by a descriptor that only we close.
     deadline, poll = time.monotonic() + _PATIENCE_S, select.poll()

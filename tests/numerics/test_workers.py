@@ -148,6 +148,20 @@ def test_a_pool_ends_with_calls_waiting_that_are_larger_than_a_pipe(tmp_path: Pa
 
 
 @pytest.mark.slow
+def test_a_pool_ends_while_a_result_is_on_its_way_that_is_larger_than_a_pipe(tmp_path: Path) -> None:
+    """A worker that is ended in the middle of it: nobody sends the rest."""
+    program = (
+        "import select\nfrom aolink.numerics.workers import processes\n"
+        "if __name__ == '__main__':\n    with processes(1) as pool:\n"
+        "        pool.submit(bytes, 400_000_000)\n"
+        "        select.select([pool._result_queue._reader], [], [])\n"
+        "        raise SystemExit(7)\n"
+    )
+    (tmp_path / "program.py").write_text(program)
+    assert subprocess.run([sys.executable, "program.py"], cwd=tmp_path, timeout=_PATIENCE_S).returncode == 7
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP])
 def test_what_a_terminal_sends_to_all_is_for_the_parent_alone(
     recorded: Session, tmp_path: Path, number: signal.Signals
