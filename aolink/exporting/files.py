@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -60,9 +61,9 @@ def _write_npz(series: Series, names: Sequence[str], path: Path, progress: Progr
 def _write_netcdf(series: Series, names: Sequence[str], path: Path, progress: Progress) -> None:
     for module in ("h5py", "h5netcdf"):
         needed(module, "tables", "NetCDF (.nc)")
-    dataset = to_xarray(series, names, progress)
-    with path.open("r+b") as file:  # given the name, HDF5 would lock the file, which is locked already
-        dataset.to_netcdf(file, engine="h5netcdf")
+    dataset, file = to_xarray(series, names, progress), io.BytesIO()
+    dataset.to_netcdf(file, engine="h5netcdf")
+    path.write_bytes(file.getbuffer())  # HDF5 itself ends the process where a disk is full
 
 
 def no_formula(cell: Any) -> Any:

@@ -30,14 +30,18 @@ def new_rrd(
         The file exists and not ``overwrite``, is one of the ``sources``, or cannot be written.
     """
     stream = rr.RecordingStream(application, recording_id=identity)
+    failed = ViewerError(f"cannot write {path}: Rerun could not finish the file; is the disk full?")
     with writing(path, overwrite=overwrite, sources=sources, suffix=".rrd", error=ViewerError) as partial:
         try:
-            stream.save(partial)
+            try:
+                stream.save(partial)
+            except RuntimeError:
+                raise failed from None
             yield stream
         finally:
             stream.disconnect()
         if not _is_whole(partial):
-            raise ViewerError(f"cannot write {path}: Rerun could not finish the file; is the disk full?")
+            raise failed
 
 
 def _is_whole(path: Path) -> bool:

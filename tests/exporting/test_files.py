@@ -4,7 +4,11 @@ from __future__ import annotations
 
 import csv
 import json
+import re
+import resource
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +17,7 @@ from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from mcap_protobuf.writer import Writer
 
 import aolink
-from aolink.errors import ExportError
+from aolink.errors import ExportError, ViewerError
 from aolink.exporting.arrays import arrays
 from aolink.exporting.files import WRITERS, export, no_formula
 from aolink.recording import topics
@@ -97,6 +101,24 @@ def test_nothing_is_left_where_nothing_can_be_written(suffix: str, tmp_path: Pat
     with pytest.raises(ExportError, match="no exposure"):
         export(empty, tmp_path / f"out{suffix}")
     assert [each.name for each in tmp_path.iterdir()] == ["empty.mcap"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("suffix", [*WRITERS, ".rrd"])
+@pytest.mark.parametrize("size", [0, 4000])
+def test_a_full_disk_is_one_line(suffix: str, size: int, tmp_path: Path) -> None:
+    """A library may end the process itself. The limit of a file's size is to a program what a full disk is."""
+    source = write_small(tmp_path / "a.mcap", 3)
+    write = "view" if suffix == ".rrd" else "export"
+    done = subprocess.run(
+        [sys.executable, "-m", "aolink", write, source, "-o", f"out{suffix}"], cwd=tmp_path, capture_output=True,
+        text=True, preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (size, size)),
+    )  # fmt: skip
+    if done.returncode:  # a short table may go in
+        assert done.returncode in (ExportError.exit_code, ViewerError.exit_code)
+        assert re.search(r"^aolink: cannot write out.* (limit|disk|temporary)", done.stderr, re.MULTILINE), done.stderr
+        assert "Traceback" not in done.stderr
+    assert (tmp_path / f"out{suffix}").exists() is not bool(done.returncode)
 
 
 @pytest.mark.parametrize("suffix", WRITERS)

@@ -399,12 +399,13 @@ def test_a_file_that_cannot_be_written_is_one_clear_error_and_leaves_nothing(
     with pytest.raises(ViewerError, match="folder"):
         save_rrd(recording, tmp_path / "absent" / "session.rrd")
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, before[1]))
-    try:
-        with pytest.raises(ViewerError, match="disk full"):
-            save_rrd(recording, tmp_path / "session.rrd")
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    for size in (0, 100_000):
+        resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+        try:
+            with pytest.raises(ViewerError, match="disk full"):
+                save_rrd(recording, tmp_path / "session.rrd")
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, before)
     assert list(tmp_path.iterdir()) == []
 
 
