@@ -177,13 +177,13 @@ class NewFile:
             os.fsync(new.fileno())
         return copy
 
-    def close(self) -> None:
-        """Close it; one that is still beside the old file is removed. Raises nothing."""
+    def close(self, *, remove: bool = False) -> None:
+        """Close it; one that is still beside the old file is removed, with ``remove`` any. Raises nothing."""
         if self._closed:
             return
         self._closed = True
         with suppress(OSError):
-            if self.is_aside and self.is_there():
+            if (remove or self.is_aside) and self.is_there():
                 self.path.unlink()
         with suppress(OSError):
             os.close(self.descriptor)
@@ -211,10 +211,10 @@ def create(target: Path, *, overwrite: bool = False, error: type[AolinkError] = 
             held = list[Path]()
             try:
                 partial, descriptor = _begun(target, error, held)
-                return NewFile(partial, target, descriptor, error)
             except BaseException:
                 _remove(held)
                 raise
+            return NewFile(partial, target, descriptor, error)
         descriptor = os.open(target, flags, 0o666)
         try:
             if not _lock(descriptor) or _others_write(target):
@@ -296,12 +296,19 @@ def _begun(target: Path, error: type[AolinkError], held: list[Path]) -> tuple[Pa
         if os.path.lexists(partial):
             continue
         held[:] = [partial]
-        descriptor = _open_new(partial, target)
-        # Another command that looks for dead files may take ours for one before it is locked.
-        good = _lock(descriptor) and _is_open_as(partial, descriptor)
-        good = good and not _others_write(target, but=partial)
-        if good and not (target.exists() and _locked_by_another(target)):
-            return partial, descriptor
+        # A private file must not be open to others even for a moment.
+        mode = 0o600 if os.path.lexists(target) else 0o666
+        descriptor = os.open(partial, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, mode)
+        try:
+            _make_like(target, descriptor)
+            # Another command that looks for dead files may take ours for one before it is locked.
+            good = _lock(descriptor) and _is_open_as(partial, descriptor)
+            good = good and not _others_write(target, but=partial)
+            if good and not (target.exists() and _locked_by_another(target)):
+                return partial, descriptor
+        except BaseException:
+            os.close(descriptor)
+            raise
         _remove(held)
         os.close(descriptor)
     raise error(_in_use(target))
@@ -312,20 +319,15 @@ def _prefix_of(target: Path) -> str:
     return f".{os.fsdecode(os.fsencode(target.name)[:_LONGEST_NAME])}."
 
 
-def _open_new(partial: Path, target: Path) -> int:
-    """Create the unfinished file, with the owner and permissions of ``target`` where there is one."""
+def _make_like(target: Path, descriptor: int) -> None:
+    """Give an unfinished file the owner and permissions of ``target`` where there is one."""
     try:
         old = target.lstat()
     except FileNotFoundError:
-        old = None
-    # A private file must not be open to others even for a moment.
-    mode = 0o666 if old is None else 0o600
-    descriptor = os.open(partial, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, mode)
-    if old is not None:
-        with suppress(PermissionError):  # only the superuser may change the owner
-            os.fchown(descriptor, old.st_uid, old.st_gid)
-        os.fchmod(descriptor, old.st_mode & 0o777)
-    return descriptor
+        return
+    with suppress(PermissionError):  # only the superuser may change the owner
+        os.fchown(descriptor, old.st_uid, old.st_gid)
+    os.fchmod(descriptor, old.st_mode & 0o777)
 
 
 def _lock(descriptor: int) -> bool:

@@ -67,7 +67,11 @@ class RecordingCopy:
         self._schemas: dict[str, Schema] = {}
         self._file = McapFile(path, AT_LEISURE, descriptor=open_unfinished(path))
         attachments = source.attachments if attachments is None else attachments
-        begin_recording(self._file, source.rig, notes, source.start_ns, attachments)
+        try:
+            begin_recording(self._file, source.rig, notes, source.start_ns, attachments)
+        except BaseException:
+            self._file.cut_back()
+            raise
 
     def __enter__(self) -> Self:
         return self

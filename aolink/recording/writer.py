@@ -142,9 +142,7 @@ class RecordingWriter:
         try:
             self._begin(start_ns)
         except OSError as error:
-            self._give_up(error)
-            self._closed = True
-            raise self._error or RecordingError(str(error)) from None
+            raise RecordingError(f"cannot write {self.path}: {files.why_not(error)}") from None
         self._thread = threading.Thread(target=self._run, name="aolink-recorder", daemon=True)
         self._thread.start()
 
@@ -251,11 +249,15 @@ class RecordingWriter:
             path = self._part_path(self._part)
             metadata = metadata | {topics.PART: str(self._part), topics.PART_OF: self.path.name}
         self._place = files.create(path, overwrite=self._overwrite and not self._has_exposure, error=RecordingError)
-        self._file = McapFile(path, self._options, descriptor=os.dup(self._place.descriptor))
+        self._part_start_ns = start_ns
+        with contextlib.ExitStack() as undo:  # without its beginning it is no recording
+            undo.callback(self._place.close, remove=True)
+            self._file = McapFile(path, self._options, descriptor=os.dup(self._place.descriptor))
+            undo.callback(self._file.cut_back)
+            begin_recording(self._file, self._rig, metadata, start_ns, self._attachments)
+            undo.pop_all()
         if not self._place.is_aside:
             self.paths.append(path)
-        self._part_start_ns = start_ns
-        begin_recording(self._file, self._rig, metadata, start_ns, self._attachments)
 
     def _take_place(self) -> None:
         """Put the file in the place of the old one, and remove the parts of the older session: there is an exposure."""
