@@ -1,5 +1,5 @@
-"""One MCAP file that is being written: it has a channel for each topic and chunks divided by time, and is whole up to a
-known byte."""
+"""One MCAP file that is being written: it has a channel for each topic and schema and chunks divided by time, and is
+whole up to a known byte."""
 
 from __future__ import annotations
 
@@ -134,7 +134,8 @@ class McapFile:
             compression=COMPRESSIONS[options.compression],
             enable_data_crcs=True,
         )
-        self._channels: dict[str, int] = {}
+        self._channels: dict[tuple[str, str], int] = {}
+        """Channels by topic and name of the schema."""
         self._schemas: dict[str, int] = {}
         self._chunk_start_ns: int | None = None
         self._whole = 0
@@ -177,9 +178,9 @@ class McapFile:
     ) -> None:  # fmt: skip
         """Add a message; the chunk before it goes to the file if it is old enough by the messages' own times."""
         self._file.is_begun = True
-        channel = self._channels.get(topic)
+        channel = self._channels.get((topic, schema.name))
         if channel is None:
-            channel = self._channels[topic] = self._register(topic, schema, encoding)
+            channel = self._channels[topic, schema.name] = self._register(topic, schema, encoding)
         if self._chunk_start_ns is None:
             self._chunk_start_ns = log_time_ns
         elif log_time_ns - self._chunk_start_ns >= self._flush_ns:

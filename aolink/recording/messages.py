@@ -172,7 +172,8 @@ class RecordedMessages:
         self.note_metadata(noted)
         for channel_id, number in held.items():
             if channel_id in self.channels:
-                self.counts[self.channels[channel_id][0]] = number
+                topic, _ = self.channels[channel_id]
+                self.counts[topic] = self.counts.get(topic, 0) + number
         attached = self.attachments.get(topics.RIG_ATTACHMENT)
         return self._second_rig_text if attached is None else attached.decode(errors="replace")
 

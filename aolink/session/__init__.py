@@ -223,6 +223,8 @@ def record(
                     report.ended = f"error: {error}"
             except Exception as unsafe:  # also one of a driver
                 report.warnings.append(str(unsafe))
+                if isinstance(error, AolinkError):
+                    error.args = (f"{error}; the mirror may not be parked: {unsafe}",)
             with contextlib.suppress(Exception):
                 loop.close_account()
             with contextlib.suppress(Exception):

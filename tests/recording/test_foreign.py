@@ -14,7 +14,7 @@ import pytest
 from mcap.records import Schema
 
 from aolink.recording import topics
-from aolink.recording.editing import cut
+from aolink.recording.editing import cut, recover
 from aolink.recording.mcap_file import McapFile, WriteOptions, schema_of
 from aolink.recording.reader import Recording
 from aolink.recording.reestimate import first_difference, reestimate, write_reestimated
@@ -105,6 +105,23 @@ def test_messages_of_other_software_come_along(recorded: Session, tmp_path: Path
         assert (after.encodings["/weather"], after.encodings[topics.IMAGE]) == ("json", "protobuf")
         assert after.schemas["weather"].encoding == "jsonschema"
     assert first_difference(Recording(tmp_path / "b.mcap").estimates("o3"), source.estimates("o3")) is None
+
+
+def test_a_topic_may_have_two_kinds_of_messages(recorded: Session, tmp_path: Path) -> None:
+    """Each is counted, and copied with its own schema."""
+    source, kinds = Recording(recorded.path), ("weather", "forecast")
+    file = McapFile(tmp_path / "a.mcap", WriteOptions())
+    begin_recording(file, source.rig, source.metadata, source.start_ns, {})
+    for number in range(5):
+        schema = Schema(id=0, name=kinds[number % 2], encoding="jsonschema", data=b"{}")
+        file.add("/weather", schema, b"{}", source.start_ns + number, number + 1, "json")
+    file.finish()
+    recover(tmp_path / "a.mcap", tmp_path / "b.mcap")
+    for name in ("a", "b"):
+        for check in (False, True):
+            found = Recording(tmp_path / f"{name}.mcap", check=check)
+            assert found.counts["/weather"] == 5
+            assert [raw.schema for raw in found.raw_messages("/weather")] == [kinds[k % 2] for k in range(5)]
 
 
 def test_the_page_for_other_software_is_right(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
