@@ -33,7 +33,7 @@ from aolink.rig import load_rig, parse_rig
 from aolink.session import record
 from aolink.simulation.model import simulate
 from tests.commands import command_server, simulated_rig
-from tests.importing.test_blurred import shaken
+from tests.jobs.test_look_spots import shaken
 from tests.kinds import must_be
 from tests.needs import needed
 

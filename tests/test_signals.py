@@ -27,7 +27,7 @@ from aolink.recording.editing import cut
 from aolink.recording.reader import Recording
 from tests.commands import simulated_rig
 from tests.conftest import Session
-from tests.importing.test_blurred import shaken
+from tests.jobs.test_look_spots import shaken
 from tests.kinds import must_be
 
 SIGNALS = {signal.SIGINT: 130, signal.SIGTERM: 143, signal.SIGHUP: 129}

@@ -60,12 +60,11 @@ def hdf5_film(path: Path, topic: str | None) -> Film:
         wanted = frames if topic is None else [name for name in found if name == f"/{topic.strip('/')}"]
         chosen = found.pop(_only(path, wanted, found, "say with --film topic=NAME which one has the frames"))
         if chosen.external or chosen.is_virtual:
-            raise ImportingError(
-                f"{path} keeps the pixels of {chosen.name} in other files, which are not read: write them into the file"
-            )
+            raise ImportingError(f"{path} keeps pixels in other files, which are not read: write them into the file")
         check_picture(math.prod(chosen.chunks or (1,)) * chosen.dtype.itemsize // 8, 1, ImportingError)
         said, group = [Said(key, value) for key, value in chosen.attrs.items()], chosen.parent
-        beside = {name: each for name, each in found.items() if each.ndim < 3 and not each.external}
+        inside = {name: each for name, each in found.items() if not (each.external or each.is_virtual)}
+        beside = {name: each for name, each in inside.items() if each.ndim < 3 and each.size < _BLOCK_BYTES // 8}
         for name, each in sorted(beside.items(), key=lambda one: one[1].parent != group):
             if each.parent == group or meaning(name.rpartition("/")[2])[0]:
                 unit = each.attrs.get("units", each.attrs.get("unit", ""))
@@ -129,10 +128,8 @@ def _with_facts(path: Path, frames: Any, said: list[Said]) -> Film:
     for name, each in own.items():
         numbers = each.ndim in _OWN[name] and each.dtype.kind in "iuf" and bool(np.isfinite(each).all())
         if not numbers or (not each.ndim and each <= 0) or (name.startswith("times") and len(each) != film.count):
-            raise ImportingError(
-                f"{path}: {name} is {each if not each.ndim else f'{each.dtype} of shape {each.shape}'}, expected"
-                f" {'a number above 0' if _OWN[name] == (0,) else f'finite numbers for {film.count} frames'}"
-            )
+            wanted = "a number above 0" if _OWN[name] == (0,) else f"finite numbers for {film.count} frames"
+            raise ImportingError(f"{path}: {name} is {each.dtype} of shape {each.shape}, expected {wanted}")
     known, notes = facts([each for each in said if each.name != "inputs"], film.count, every=True)
     if "inputs" in own:
         known["inputs"] = own["inputs"].reshape(len(own["inputs"]), -1).astype(np.float64)

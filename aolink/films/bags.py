@@ -49,10 +49,7 @@ def mcap_film(path: Path, topic: str | None) -> Film:
 
     with path.open("rb") as file:
         if _is_cut_off(file):
-            raise ImportingError(
-                f"{path} has no end: it was cut off, or is still being written. `mcap recover` saves what is whole"
-                " of it (`aolink copy`, where it is a recording of aolink)"
-            )
+            raise ImportingError(f"{path} has no end: `mcap recover` (of a recording `aolink copy`) saves the rest")
         summary = make_reader(file, validate_crcs=True).get_summary()
         kinds = set[tuple[str, str]]()
         disordered = set[str]()
@@ -147,10 +144,8 @@ def _film(path: Path, topic: str, messages: Callable[[], Iterator[_Stamped]]) ->
         first = each if first is None else first
         one, other = first.picture, each.picture
         if (one.shape, one.dtype, first.mosaic) != (other.shape, other.dtype, each.mosaic):
-            raise ImportingError(
-                f"{path}: pictures on {topic} change from {one.dtype} of shape {one.shape} to {other.dtype} of shape"
-                f" {other.shape}: a film has frames of one size and type"
-            )
+            change = f"{one.dtype} of shape {one.shape} to {other.dtype} of shape {other.shape}"
+            raise ImportingError(f"{path}: pictures on {topic} change from {change}: a film has frames of one kind")
         stamps.append(each.time_ns)
         arrivals.append(each.arrival_ns)
         lossy |= each.lossy
@@ -172,9 +167,7 @@ def _film(path: Path, topic: str, messages: Callable[[], Iterator[_Stamped]]) ->
     start = int(times[0])
     if stamped and not dated(start) and dated(arrivals[0]):
         start = arrivals[0]
-        notes.append(
-            "the stamps count from the start of a clock, not from 1970: the first picture has its arrival's date"
-        )
+        notes.append("the stamps count from the start of a clock: the first picture has the date of its arrival")
     rows, columns = first.picture.shape[:2]
     return Film(
         name=f"{path.name}:{topic}", shape=(int(rows), int(columns)), dtype=first.picture.dtype, count=len(times),

@@ -4,41 +4,20 @@ from __future__ import annotations
 
 import math
 import re
+import tomllib
 from collections.abc import Iterable, Mapping
 from datetime import UTC, datetime
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-NAMES: dict[str, str] = {
-    "times": """times time timestamps timestamp timestampsutc t frametimestamps capturetimes acquisitiontimes frametimes
-        elapsedtime elapsedtimes deltat starttimes exposurestarts ndarraytimestamp relativetime sensortimestamp mjd
-        jd""",
-    "period": """period frameperiod frameinterval interval finterval cycletime framecycletime kineticcycletime kintime
-        kct acquireperiod exposureperiod timeincrement timeinterval timeintervall timeperframe timestep frametime dt
-        tframe samplingperiod""",
-    "rate": """rate framerate fps framespersecond frate framrate frmrate samplingrate samplerate acquisitionrate
-        acquisitionframerate framefrequency imagerate camerafps recordrate recordingrate capturefps
-        comandroidcapturefps framespersec""",
-    "exposure": """exposure exposuretime exptime exposuretimes exposures exp texp expt xposure integrationtime inttime
-        integration itime dit esodetdit shuttertime exposureduration texposure counttime acquiretime tint shutter
-        exposuretimeseconds""",
-    "start": """start starttime dateobs dateutc acquisitiondate acquisitiontime acquisitiondatetime datetimeoriginal
-        creationtime date timeutc receivedtime""",
-}
-"""Names, in small letters and without what is between words, of the times of all frames; of the time from each to the
-next; of frames a second; of the exposure time of each; and of the date of the first."""
-UNITS: dict[float, str] = {
-    1.0: "s sec secs second seconds hz fps", 1e-3: "ms msec msecs millisecond milliseconds millis",
-    1e-6: "us usec usecs microsecond microseconds micros mus u00b5s", 1e-9: "ns nsec nsecs nanosecond nanoseconds",
-    60.0: "min minute minutes", 3600.0: "h hr hour hours", 86400.0: "d day days", 1e3: "khz",
-}  # fmt: skip
-"""Their units, in s or Hz, by the last word of a name or as the file keeps them."""
+_TABLE = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
 _EPOCHS = {"mjd": 40_587.0, "jd": 2_440_587.5}
 """The year 1970 in days."""
-_FACTS = {name: fact for fact, names in NAMES.items() for name in names.split()}
-_SIZES = {name: size for size, names in UNITS.items() for name in names.split()}
+_FACTS = {name: fact for fact, names in _TABLE["names"].items() for name in names.split()}
+_SIZES = {name: float(size) for size, names in _TABLE["units"].items() for name in names.split()}
 _UNIT = re.compile(r"[\W_]+[A-Za-z]+[\W_]*$|(?<=[a-z])[A-Z][a-z]+$")
 """The last word of a name."""
 _TAKEN_S = (1.0, 1e-3, 1e-6, 1e-9)
@@ -86,7 +65,7 @@ def facts(
     agree. ``every``: things whose names mean nothing here are noted, too. ``longest_s``: an exposure that is not
     longer is in seconds where neither is known.
     """
-    found: dict[str, list[tuple[Said, NDArray[Any], float | None, str]]] = {fact: [] for fact in NAMES}
+    found: dict[str, list[tuple[Said, NDArray[Any], float | None, str]]] = {fact: [] for fact in _TABLE["names"]}
     refused, other = dict[str, str](), list[str]()
     for each in said:
         fact, plain, unit = meaning(each.name, each.unit)
@@ -98,9 +77,7 @@ def facts(
         if not fact:
             other += [_shown(each)] if every else []
         elif values is None or not np.isfinite(values).all() or values.size not in (1, count):
-            refused[_shown(each)] = (
-                f" by its size, for {count} frames" if values is not None and values.size > 1 else ""
-            )
+            refused[_shown(each)] = "" if values is None or values.size == 1 else f", for {count} frames"
         elif fact in ("period", "rate", "exposure") and (values <= 0).any():
             refused[_shown(each)] = ""
         elif fact != "times" or values.size == count:
@@ -123,8 +100,8 @@ def facts(
             elif not _taken(known, fact, values, size, plain):
                 refused[_shown(each)] = ""
             else:
-                used.append(_shown(each) + ("" if np.ptp(values) <= _SAME * values.max() or fact != "exposure"
-                                            else ", which differs from frame to frame: the first"))  # fmt: skip
+                differs = fact == "exposure" and np.ptp(values) > _SAME * values.max()
+                used.append(_shown(each) + (", which differs from frame to frame: the first" if differs else ""))
         times = known.get("times_ns")
         if times is not None and count > 1 and np.median(np.diff(times)) > 0:
             period = float(np.median(np.diff(times))) / 1e9
@@ -141,17 +118,13 @@ def _taken(known: dict[str, Any], fact: str, values: NDArray[Any], size: float, 
     if fact == "times":
         if "times_ns" in known:
             return False
-        times = nanoseconds(values - _EPOCHS.get(plain, 0), size)
-        known["times_ns"] = times
-        if dated(int(times[0])):
-            known.setdefault("start_ns", int(times[0]))
-        return True
+        known["times_ns"] = nanoseconds(values - _EPOCHS.get(plain, 0), size)
+        return _taken(known, "start", known["times_ns"][:1], 1e-9, "") or True
     if fact == "start":
         start = int(nanoseconds(values[:1], size)[0])
         return dated(start) and known.setdefault("start_ns", start) == start
     key = "exposure_s" if fact == "exposure" else "rate_hz"
-    value = float(values[0]) * size
-    value = 1 / value if fact == "period" else value
+    value = (float(values[0]) * size) ** (-1 if fact == "period" else 1)
     return bool(abs(known.setdefault(key, value) / value - 1) <= _SAME)
 
 
@@ -173,9 +146,7 @@ def _unit_of(values: NDArray[Any], step: float, period: float | None, start: boo
     if period is not None:
         return next((u for u in _TAKEN_S if abs(step * u / period - 1) < 0.25), None)
     usual = [u for u in _TAKEN_S if _USUAL_S[0] <= step * u <= _USUAL_S[1]]
-    if (values.dtype.kind == "f" and 1.0 in usual) or len(usual) == 1:
-        return usual[0]
-    return None
+    return usual[0] if (values.dtype.kind == "f" and 1.0 in usual) or len(usual) == 1 else None
 
 
 def _unit_of_exposure(value: float, period: float | None, longest_s: float) -> float | None:

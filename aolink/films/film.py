@@ -165,9 +165,7 @@ def array_film(frames: Any, name: str, **known: Any) -> Film:
         shape = frames.shape
         known["notes"] = (*known.get("notes", ()), f"the films of {spots} spots stand side by side in one picture")
     if len(shape) != 3 + colours or min(shape) < 1 or dtype.kind not in "biuf":
-        raise ImportingError(
-            f"{name} holds {dtype} of shape {tuple(frames.shape)}, expected numbers as (frames, rows, columns)"
-        )
+        raise ImportingError(f"{name} holds {dtype} of shape {shape}, expected numbers as (frames, rows, columns)")
     return Film(
         name=name, shape=(int(shape[1]), int(shape[2])), dtype=dtype, count=int(shape[0]), **known,
         pictures=lambda: (np.asarray(frames[k]) for k in range(len(frames))),

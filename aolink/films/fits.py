@@ -58,10 +58,7 @@ def fits_film(path: Path, topic: str | None) -> Film:
         cubes = len(shape) > 2
         more = [each for _, each in arrays[1:] if (len(each.shape) > 2 if cubes else each.shape == shape)]
         if more and not cubes:
-            raise ImportingError(
-                f"{path} holds {len(more) + 1} arrays of shape {shape}, and which of them are frames is not known:"
-                " stack the frames in one array (frames, rows, columns)"
-            )
+            raise ImportingError(f"{path} holds {len(more) + 1} arrays of shape {shape}: stack the frames in one array")
         # As cameras with several windows write it, there may be axes of length one.
         if math.prod(shape[:-2]) != max(shape[:-2], default=1):
             raise ImportingError(f"{path} holds an array of shape {shape}, expected (frames, rows, columns)")

@@ -77,13 +77,10 @@ def open_film(source: str | Path, topic: str | None = None) -> Film:
         more = {"expansion": LOSSY_EXPANSION} if film.nonlinear else {}
         check_film(film.shape, film.dtype.itemsize, film.count, size, ImportingError, **more)
     if film.mosaic:
-        note = (
-            f"its pixels are under a Bayer mosaic, {film.mosaic}: --film colour=green (or red, blue) takes one colour"
-        )
+        note = f"its pixels are under a Bayer mosaic, {film.mosaic}: --film colour=green takes one colour"
         film = replace(film, notes=(*film.notes, note))
     if film.start_ns is not None and not dated(film.start_ns):
-        since = f"{np.datetime64(film.start_ns, 'ns')}"
-        note = f"its times begin at {since}, as a clock that counts from the start of a device: they are no dates"
+        note = f"its times begin at {np.datetime64(film.start_ns, 'ns')}, as since a device began: no dates"
         film = replace(film, start_ns=None, notes=(*film.notes, note))
     return replace(film, pictures=lambda: _checked(film, path, size))
 
@@ -114,10 +111,8 @@ def _checked(film: Film, path: Path, size: int) -> Iterator[FilmFrame]:
     with _one_error(path):
         for picture in film.pictures():
             if picture.shape[:2] != film.shape or channels not in (None, picture.shape[2:]):
-                raise ImportingError(
-                    f"{path}: frame {count} is {' x '.join(map(str, picture.shape))} pixels, those before it"
-                    f" {' x '.join(map(str, (*film.shape, *(channels or ()))))}: a film has frames of one size"
-                )
+                before = (*film.shape, *(channels or ()))
+                raise ImportingError(f"{path}: frame {count} has the shape {picture.shape}, those before it {before}")
             if path.is_file() and path.stat().st_size < size:  # for what lacks then, HDF5 gives zeros
                 raise ImportingError(f"{path} has become shorter while it was read")
             yield picture
@@ -168,10 +163,7 @@ def _folder(path: Path) -> Film:
         for each, known in parts.items():
             part = open_film(each) if _suffix(each) in _PICTURES else known
             if (part.shape, part.dtype, part.top) != (first.shape, first.dtype, first.top):
-                raise ImportingError(
-                    f"{each} has {_described(part)}, those before it have {_described(first)}: a film has frames of"
-                    " one size and type"
-                )
+                raise ImportingError(f"{each} has {_described(part)}, those before it have {_described(first)}")
             yield from part.pictures()
 
     notes += [f"pictures in the order of their names, {files[0].name} to {files[-1].name}", *more]

@@ -51,9 +51,7 @@ def aot_film(path: Path, uid: str | None = None) -> Film:
         series, what = detector.pixel_intensities, f"pictures of the wavefront sensor {sensor.uid}"
         frames = np.asarray(series.data)
         if frames.ndim != 3:
-            raise ImportingError(
-                f"{path} has pictures of shape {frames.shape} of {_which(sensor.uid)}, expected (frames, rows, columns)"
-            )
+            raise ImportingError(f"{path} has pictures of shape {frames.shape}, expected (frames, rows, columns)")
         if left := [each.replace("_", " ") for each in _NOT_APPLIED if getattr(detector, each) is not None]:
             more.append(f"not applied to the pictures: the detector's {', '.join(left)}")
     else:
@@ -148,9 +146,7 @@ def _commands(loops: list[Any], known: dict[str, Any], count: int, start_s: floa
     delayed = f", {delay:g} {'frame' if delay == 1 else 'frames'} later, as the loop's delay says" if after_ns else ""
     if first is not None and start_s is not None:
         if (late := np.flatnonzero(np.diff(first) <= 0)).size:
-            raise ImportingError(
-                f"command {int(late[0]) + 1} of the loop {loops[0].uid} is not later than the one before"
-            )
+            raise ImportingError(f"command {int(late[0]) + 1} of {loops[0].uid} is not later than the one before")
         known["input_times_ns"] = np.round((first - start_s) * 1e9).astype(np.int64)
         how = "by its own time"
     elif n != count and rate:

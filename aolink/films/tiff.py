@@ -47,10 +47,8 @@ def tiff_film(path: Path) -> Film:
     size = tuple(n for n, axis in zip(shape, axes, strict=True) if axis != "S")
     one_by_one = len(size) == 2 and bool(others)  # pictures that were appended
     if one_by_one and (other := next((kind for kind in others if kind != kinds[0]), None)):
-        raise ImportingError(
-            f"{path} holds pictures of {stored} of shape {shape} and of {other[2]} of shape {other[0]}: a film has"
-            " frames of one size and type"
-        )
+        each = f"{stored} of shape {shape} and of {other[2]} of shape {other[0]}"
+        raise ImportingError(f"{path} holds pictures of {each}: a film has frames of one size and type")
     size = (len(kinds), *size) if len(size) == 2 else size
     planes = np.arange(math.prod(size[:-2])).reshape(size[:-2])
     colours = axes[: planes.ndim].find("C") if planes.ndim == 2 else -1

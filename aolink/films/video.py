@@ -74,10 +74,7 @@ def video_film(path: Path) -> Film:
         known["times_ns"] = np.array([round(each * 10**9) for each in times], np.int64)
         there = round((times[-1] - times[0]) * rate) + 1 if rate else len(times)
         if max(there, len(times)) < announced - max(2, _SHORTER * announced):
-            raise ImportingError(
-                f"{path} is cut off: it announces {announced} frames and has {len(times)}. `ffmpeg -i {path} -c copy"
-                " rest.mkv` writes what is left as a film"
-            )
+            raise ImportingError(f"{path} is cut off: `ffmpeg -i {path} -c copy rest.mkv` makes a film of the rest")
     elif rate:
         known.setdefault("rate_hz", float(rate))
     linear = codec in _LINEAR and not first.format.name.startswith("yuv")

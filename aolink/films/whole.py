@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
@@ -21,6 +21,8 @@ from aolink.numerics.arrays import BoolArray
 
 _COPY, _TWICE = "a copy of a frame before", "a message that came twice"
 _EMPTY, _LOST = "of one value, as if never written", "without most of its pixels"
+_BUFFERS = 4
+"""Frames before among which a copy is looked for, as many as drivers keep."""
 _LONGEST_TURN = 12
 """The longest period, in frames, of copies that come in turn."""
 _STEPS, _DARKEST = 4, 0.02
@@ -84,7 +86,7 @@ def _turn(copy: list[bool]) -> int:
 
 def _looked_at(film: Film) -> tuple[list[str], dict[int, BoolArray]]:
     """Why each frame is none, empty where it is one; and the pixels that it lacks, by its number."""
-    why, seen, zeros, before = list[str](), set[bytes](), list[int](), None
+    why, seen, zeros, before = list[str](), deque[bytes](maxlen=_BUFFERS), list[int](), None
     stale, dark, always = dict[int, BoolArray](), dict[int, NDArray[np.uint8]](), np.ones(film.shape, np.bool_)
     least, lowest, ground, step = math.inf, 0.0, 0.0, 0.0
     for k, each in enumerate(film.pictures()):
@@ -97,11 +99,11 @@ def _looked_at(film: Film) -> tuple[list[str], dict[int, BoolArray]]:
         same = digest in seen and film.times_ns is not None and film.times_ns[k] == film.times_ns[k - 1]
         empty = not values.size or values.min() == values.max()
         why.append(_EMPTY if empty else _TWICE if same else _COPY if digest in seen else "")
-        seen.add(digest)
+        seen.append(digest)
         zeros.append(int(zero.sum()))
         if why[-1]:
             continue
-        if len(seen) <= _SAMPLES and not film.nonlinear and film.top is None and light.dtype.kind in "iu":
+        if k < _SAMPLES and not film.nonlinear and film.top is None and light.dtype.kind in "iu":
             _check_bits(film, light)
         if not ground:
             ground = float(np.median(values))
@@ -135,23 +137,15 @@ def _check_bits(film: Film, light: NDArray[Any]) -> None:
     if light.dtype.kind == "u":
         high, low = ((values >= full // 16 * 15) & (values < full - 1)).mean(), (values < full // 16).mean()
         if min(high, low) > _FEW and ((values >= full // 4) & (values < full // 4 * 3)).mean() < high / 10:
-            raise ImportingError(
-                f"{film.name} has values near 0 and near {full} and few between, as numbers below zero that lost their"
-                " sign: give --film pixels=signed,background"
-            )
+            raise ImportingError(f"{film.name} has values that lost their sign: give --film pixels=signed,background")
     elif 0 < (values < -full // 4).mean() < 0.5 and np.median(values) > 0:
-        raise ImportingError(
-            f"{film.name} has values of {values.min()} to {values.max()}, as numbers that got a sign which they have"
-            " not: give --film pixels=unsigned"
-        )
+        raise ImportingError(f"{film.name} has values that got a wrong sign: give --film pixels=unsigned")
     swapped = light.byteswap().view(np.dtype("u2").newbyteorder(light.dtype.byteorder)) if full == 1 << 16 else None
     if swapped is not None and (
         (swapped.max() < 1 << 14 <= values.max() and len(np.unique(swapped & 255)) > 16)
         or _rough(light) > _ROUGH > 3 * _rough(swapped)
     ):
-        raise ImportingError(
-            f"{film.name} has 16 bits whose bytes seem to be in the other order: give --film pixels=swapped"
-        )
+        raise ImportingError(f"{film.name} has 16 bits in the other order of bytes: give --film pixels=swapped")
 
 
 def _rough(picture: NDArray[Any]) -> float:

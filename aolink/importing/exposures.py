@@ -57,23 +57,18 @@ def imported(film: Film, rig: Rig, settings: FilmSettings, account: FilmAccount)
     account.frames = film.left_out
     account.notes = (*film.notes, *times.notes, *(() if settings.invert else film.saturation_notes))
     if film.start_ns is None and settings.start_ns is None:
-        account.notes += (
-            "when the film was taken is not known: its times count from 1970 unless --film start=DATE is given",
-        )
+        account.notes += ("when it was taken is not known: its times count from 1970 without --film start=DATE",)
     if film.nonlinear and settings.gamma == 1.0:
         account.notes += (nonlinear_note(film),)
     if rig.sensor.row_time_s is None and film.shape[0] > 1 and not film.slopes:
         account.notes += (
-            "it is not known whether the film's rows were exposed one after the other: say so with --film row_time=S,"
-            " or row_time=0",
+            "whether its rows were exposed one after the other is not known: give --film row_time=S, or 0",
         )
     if film.slopes:
         yield from _of_slopes(film, rig, settings, times, account)
         return
     if settings.scale is not None and settings.scale < 0:
-        raise ImportingError(
-            f"--film scale={settings.scale:g} must be above 0 for pictures: dark objects need --film invert"
-        )
+        raise ImportingError(f"--film scale={settings.scale:g} must be above 0 for pictures; there is --film invert")
     light = FilmLight(film, settings)
     cut = _windows(film, rig, settings.places)
     defects = find_defects(film, light, math.sqrt(rig.sensor.kernel.variance) / rig.sensor.pixel_width)
@@ -87,19 +82,17 @@ def imported(film: Film, rig: Rig, settings: FilmSettings, account: FilmAccount)
     groups = grouped(film, settings.frames_per_exposure, times.periods, lambda frame: cut(*light.of(frame)))
     shine = _brightness([_spot_light(offset + scale * group.mean, ~group.bad, rig) for group in groups])
     if len(shine) and (change := change_of(shine)):
+        shown = f"from {shine[0]:.2f} to {shine[-1]:.2f} of the rig file's"
         account.notes += (
-            f"the light of the spots {change} over the film, from {shine[0]:.2f} to {shine[-1]:.2f} of the rig file's:"
-            " exposures are scaled to the rig file's light",
+            f"the light of the spots {change} over the film, {shown}: exposures are scaled to the latter",
         )
     black = rig.sensor.black_level
     groups = grouped(film, settings.frames_per_exposure, times.periods, lambda frame: cut(*light.of(frame)))
     for group, bright in zip(groups, shine.tolist(), strict=True):
         mean = group.mean
         if settings.scale is None and film.dtype.kind == "f" and mean.max() > 1.0:
-            raise ImportingError(
-                f"{film.name} has floating-point values up to {mean.max():.6g}, where 1.0 would be full scale: say with"
-                " --film scale=COUNTS how many counts a value of one is"
-            )
+            what = f"floating-point values up to {mean.max():.6g}, where 1.0 would be full scale"
+            raise ImportingError(f"{film.name} has {what}: say with --film scale=COUNTS how many counts one is")
         counts = offset + scale * mean
         if bright != 1.0:
             counts = black + (counts - black) / bright
@@ -119,15 +112,11 @@ def _windows(
     sensor, (height, width) = rig.sensor, film.shape
     if not places:
         if film.shape != sensor.shape:
-            raise ImportingError(
-                f"{film.name} has frames of {height} x {width} pixels, the rig file {rig.name} describes"
-                f" {sensor.shape[0]} x {sensor.shape[1]}: change its [sensor], or say where its spots are with --at X,Y"
-            )
+            own = f"the rig file {rig.name} {' x '.join(map(str, sensor.shape))}: change its [sensor], or give --at X,Y"
+            raise ImportingError(f"{film.name} has frames of {height} x {width} pixels, {own}")
         return lambda *frame: frame
     if len(places) != sensor.spots:
-        raise ImportingError(
-            f"--at gives {len(places)} places, the rig file {rig.name} has {sensor.spots} spots: give one for each"
-        )
+        raise ImportingError(f"--at gives {len(places)} places, the rig file {rig.name} has {sensor.spots} spots")
     if sensor.row_starts_s.any():
         raise ImportingError("with --at the rows of the sensor are not the film's: leave out row_time")
     rows, columns = (pixels // windows for pixels, windows in zip(sensor.shape, sensor.grid, strict=True))
@@ -135,10 +124,8 @@ def _windows(
     for x, y in places:
         left, top = round(x - (columns - 1) / 2), round(y - (rows - 1) / 2)
         if not (0 <= left <= width - columns and 0 <= top <= height - rows):
-            raise ImportingError(
-                f"{film.name}: the window of {columns} x {rows} pixels about --at {x:g},{y:g} is not inside its"
-                f" pictures of {width} x {height} pixels"
-            )
+            window = f"window of {columns} x {rows} pixels about --at {x:g},{y:g}"
+            raise ImportingError(f"{film.name}: the {window} is not inside its pictures of {width} x {height} pixels")
         cuts.append(np.s_[top : top + rows, left : left + columns])
 
     def cut(light: FloatArray, bad: BoolArray) -> tuple[FloatArray, BoolArray]:
@@ -192,14 +179,10 @@ def _of_slopes(
 ) -> Iterator[ImportedExposure]:
     """The exposures of a film without pictures: all of their pixels are missing."""
     if settings.places or settings.invert or settings.subtract_median or settings.gamma != 1.0:
-        raise ImportingError(
-            f"{film.name} has slopes and no pictures: --at, and --film invert, background and gamma, need pixels"
-        )
+        raise ImportingError(f"{film.name} has slopes: --at, and --film invert, background and gamma, need pictures")
     if film.shape[1] != rig.n_outputs:
-        raise ImportingError(
-            f"{film.name} has {film.shape[1]} slopes in each frame, the rig file {rig.name} {rig.n_outputs}: change its"
-            " [plant] and [sensor]"
-        )
+        own = f"the rig file {rig.name} {rig.n_outputs}: change its [plant] and [sensor]"
+        raise ImportingError(f"{film.name} has {film.shape[1]} slopes in each frame, {own}")
     pixels, mask = np.zeros(rig.sensor.shape, np.uint16), np.zeros(rig.sensor.shape, np.bool_)
     inputs = _Inputs(film, rig, settings, times)
     account.notes += inputs.notes
@@ -233,10 +216,8 @@ class _Inputs:
         if film.inputs is None:
             return
         if film.inputs.shape[1] != rig.n_inputs:
-            raise ImportingError(
-                f"{film.name} has {film.inputs.shape[1]} inputs in each step, the rig file {rig.name} {rig.n_inputs}:"
-                " change its [plant]"
-            )
+            own = f"the rig file {rig.name} {rig.n_inputs}: change its [plant]"
+            raise ImportingError(f"{film.name} has {film.inputs.shape[1]} inputs in each step, {own}")
         timing, K = rig.timing, settings.frames_per_exposure
         firsts = times.periods * (timing.frame_period_steps // K)  # first step of each frame
         end = int(firsts[-1]) + (timing.exposure_steps if K == 1 else 1)
@@ -246,10 +227,8 @@ class _Inputs:
             steps = np.diff(firsts, append=firsts[-1] + timing.frame_period_steps // K)
             self._rows = np.repeat(film.inputs, steps, axis=0)
         elif len(film.inputs) < end:
-            raise ImportingError(
-                f"{film.name} has inputs of {len(film.inputs)} steps: give one for each of its {film.count} frames, or"
-                f" one for each of its {end} fast steps"
-            )
+            wanted = f"give one for each of its {film.count} frames, or one for each of its {end} fast steps"
+            raise ImportingError(f"{film.name} has inputs of {len(film.inputs)} steps: {wanted}")
 
     def _at_times(
         self, film: Film, firsts: NDArray[np.int64], times: FrameTimes, rig: Rig, end: int
@@ -269,10 +248,8 @@ class _Inputs:
         first = np.rint(at).astype(np.int64)
         period = float(np.median(np.diff(times_ns))) / 1e9 if len(rows) > 1 else np.inf
         if period < _FASTER * rig.timing.fast_step_s:
-            raise ImportingError(
-                f"{name} has a command every {period:.6g} s, the rig file {rig.name} a fast step every"
-                f" {rig.timing.fast_step_s:.6g} s, which holds only one: change timing.fast_step_s"
-            )
+            own = f"the rig file {rig.name} a fast step every {rig.timing.fast_step_s:.6g} s: change timing.fast_step_s"
+            raise ImportingError(f"{name} has a command every {period:.6g} s, {own}")
         held = np.searchsorted(first, np.arange(end), side="right") - 1
         known = np.where((held >= 0)[:, None], rows[np.maximum(held, 0)], self._park)
         early, late = int(np.count_nonzero(first < 0)), int(np.count_nonzero(first >= end))
@@ -302,10 +279,8 @@ def exposures(
     values = np.asarray(frames)
     if values.ndim != 3 or values.dtype.kind not in "biuf" or values.shape[1:] != rig.sensor.shape or not len(values):
         rows, columns = rig.sensor.shape
-        raise ImportingError(
-            f"the frames are {values.dtype} of shape {values.shape}, expected counts of the rig {rig.name} of shape"
-            f" (frames, {rows}, {columns})"
-        )
+        wanted = f"expected counts of the rig {rig.name} of shape (frames, {rows}, {columns})"
+        raise ImportingError(f"the frames are {values.dtype} of shape {values.shape}, {wanted}")
     full = rig.sensor.full_scale
     if not np.isfinite(values).all() or values.min() < 0 or values.max() > full or (values != np.rint(values)).any():
         raise ImportingError(f"frames are counts of the rig's camera: whole numbers from 0 to {full}")
@@ -315,10 +290,8 @@ def exposures(
         starts.shape != (count,) or starts.dtype.kind not in "iu" or starts[0] < 0
         or (np.diff(starts.astype(np.int64)) < timing.exposure_steps).any()
     ):  # fmt: skip
-        raise ImportingError(
-            f"start_steps must be {count} fast steps, from 0 on, each at least {timing.exposure_steps} (one exposure)"
-            " after the one before"
-        )
+        apart = f"each at least {timing.exposure_steps} (one exposure) after the one before"
+        raise ImportingError(f"start_steps must be {count} fast steps, from 0 on, {apart}")
     end = int(starts[-1]) + rig.timing.exposure_steps
     held = np.tile(rig.mirror.park, (end, 1)) if inputs is None else np.asarray(inputs, dtype=np.float64)
     if held.ndim != 2 or held.shape[1] != rig.n_inputs or len(held) < end:

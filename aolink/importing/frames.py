@@ -163,9 +163,7 @@ def film_times(film: Film, settings: FilmSettings) -> FrameTimes:
         notes.append(f"the film says that it starts at {_date(film.start_ns)}; {_date(settings.start_ns)} is taken")
     lasts = film.count * 1e9 / (rate or 1.0) if film.times_ns is None else int(film.times_ns[-1] - film.times_ns[0])
     if not 0 <= start < _LATEST_NS - lasts - _DAY_NS:
-        raise ImportingError(
-            f"{film.name} has a start or an end that is not from 1970 to 2262: give the right --film start=DATE"
-        )
+        raise ImportingError(f"{film.name} has a start or an end that is not from 1970 to 2262: give --film start=DATE")
     periods = np.arange(film.count) if film.numbers is None else film.numbers - film.numbers[0]
     if film.times_ns is None or film.count < 2:
         if (gone := int(periods[-1]) + 1 - film.count - film.left_out) > 0:
@@ -176,10 +174,7 @@ def film_times(film: Film, settings: FilmSettings) -> FrameTimes:
     usual = float(np.median(gaps))
     if usual <= 0 or (gaps <= 0).any():
         late = int(np.argmax(gaps <= 0)) + 1
-        raise ImportingError(
-            f"{film.name}: frame {late} is not later than the one before: frames are not in the order of their times,"
-            " or the times are damaged"
-        )
+        raise ImportingError(f"{film.name}: frame {late} is not later than the one before: its order or time is wrong")
     period = float(gaps[gaps < 1.5 * usual].mean())  # times may be rounded, so that the median is not exact
     counts = np.rint(gaps / period).astype(np.int64)
     off = np.abs(gaps / period - counts)
@@ -187,10 +182,8 @@ def film_times(film: Film, settings: FilmSettings) -> FrameTimes:
         counts = np.maximum(counts, 1)  # a player may come early or late
     elif (counts < 1).any() or (off > _IRREGULAR).any():
         worst = int(np.argmax(np.where(counts < 1, np.inf, off)))
-        raise ImportingError(
-            f"{film.name}: frame {worst + 1} comes {gaps[worst]:.4g} s after the one before, at a frame period of"
-            f" {period:.4g} s: exposures must follow at a steady rate, only whole frames may be missing"
-        )
+        comes = f"frame {worst + 1} comes {gaps[worst]:.4g} s after the one before, at a frame period of {period:.4g} s"
+        raise ImportingError(f"{film.name}: {comes}: only whole frames may be missing")
     periods[1:] = np.cumsum(counts)
     timed = 1 / period
     starts = start + film.times_ns - film.times_ns[0]
@@ -199,10 +192,8 @@ def film_times(film: Film, settings: FilmSettings) -> FrameTimes:
         notes.append(f"{what} {timed:.6g} frames/s; {rate:g} frames/s as {'given' if given else 'it says'} are taken")
         starts, timed = np.int64(start) + np.rint(periods * 1e9 / rate).astype(np.int64), rate
     elif rate is not None and abs(rate / timed - 1) > _CLOSE:
-        raise ImportingError(
-            f"{film.name}: {rate:g} frames/s contradict its times, which say {timed:.6g}: give --rate {timed:.6g}, or a"
-            " file with the right times"
-        )
+        said = f"{rate:g} frames/s contradict its times, which say {timed:.6g}"
+        raise ImportingError(f"{film.name}: {said}: give --rate {timed:.6g}, or another that is right")
     if (lost := np.flatnonzero(counts > 1)).size:
         each = ", ".join(f"{counts[k] - 1} after frame {k + 1} ({gaps[k]:.6g} s)" for k in lost[:_SHOWN])
         more = f", and {len(lost) - _SHOWN} gaps more" if len(lost) > _SHOWN else ""
@@ -228,26 +219,18 @@ def frame_times(film: Film, rig: Rig, settings: FilmSettings) -> FrameTimes:
         each = f"{K} frames" if K > 1 else "a frame"
         whole = round(rate / own)
         summed = f"give --film sum={whole} as the rig file has it, " if K == 1 < whole == timing.exposure_steps else ""
-        raise ImportingError(
-            f"{film.name} has {rate:.6g} frames/s, and the rig file {rig.name} wants {each} every"
-            f" {timing.frame_period_steps * timing.fast_step_s:.6g} s, {own:.6g} frames/s: {summed}change its"
-            " [timing], or give the right --rate"
+        wanted = (
+            f"wants {each} every {K / own:.6g} s, {own:.6g} frames/s: {summed}change its [timing], or give the right"
         )
+        raise ImportingError(f"{film.name} has {rate:.6g} frames/s, and the rig file {rig.name} {wanted} --rate")
     elif abs(rate / own - 1) > _EQUAL:
-        notes.append(
-            f"the frames came at {rate:.6g} a second, {rate / own - 1:+.2%} from the rig file's {own:.6g}: exposures"
-            " keep their own times"
-        )
+        off = f"{rate / own - 1:+.2%} from the rig file's {own:.6g}"
+        notes.append(f"the frames came at {rate:.6g} a second, {off}: exposures keep their own times")
     if K > 1 and settings.exposure_s is not None:
-        raise ImportingError(
-            f"--exposure {settings.exposure_s:g} is not used with --film sum={K}, where each frame is a whole fast"
-            " step: leave it out"
-        )
+        raise ImportingError(f"--exposure {settings.exposure_s:g} is not used with --film sum={K}: leave it out")
     if K > 1 and (timing.exposure_steps, timing.frame_period_steps) != (K, K):
-        raise ImportingError(
-            f"--film sum={K} makes exposures of {K} fast steps without dead time: set timing.exposure_steps = {K} and"
-            f" frame_period_steps = {K} in the rig file {rig.name}"
-        )
+        wanted = f"set timing.exposure_steps = {K} and frame_period_steps = {K} in the rig file {rig.name}"
+        raise ImportingError(f"--film sum={K} makes exposures of {K} fast steps without dead time: {wanted}")
     exposure_s = film.exposure_s
     if settings.exposure_s is not None:
         if exposure_s is not None and abs(exposure_s / settings.exposure_s - 1) > _CLOSE:
@@ -256,10 +239,8 @@ def frame_times(film: Film, rig: Rig, settings: FilmSettings) -> FrameTimes:
     if exposure_s is not None and K == 1:
         own_s = timing.exposure_steps * timing.fast_step_s
         if abs(exposure_s / own_s - 1) > _CLOSE:
-            raise ImportingError(
-                f"{film.name} was exposed for {exposure_s:.6g} s a frame, the rig file {rig.name} says {own_s:.6g} s:"
-                " change timing.exposure_steps, or give the right --exposure"
-            )
+            own_is = f"the rig file {rig.name} says {own_s:.6g} s: change timing.exposure_steps, or give --exposure"
+            raise ImportingError(f"{film.name} was exposed for {exposure_s:.6g} s a frame, {own_is}")
     return replace(times, notes=tuple(notes))
 
 

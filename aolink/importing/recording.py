@@ -43,9 +43,7 @@ def import_film(
     made = imported(film, rig, settings, account)
     first = next(made, None)  # errors of the whole film show before the file is made
     if first is None:
-        raise ImportingError(
-            f"{film.name} has {film.count} frames: not enough for an exposure of {settings.frames_per_exposure}"
-        )
+        raise ImportingError(f"{film.name} has {film.count} frames: not enough for {settings.frames_per_exposure}")
     none = (
         f"; {film.left_out} of its {film.count + film.left_out} frames are none: {film.account}" if film.account else ""
     )

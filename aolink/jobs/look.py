@@ -1,6 +1,6 @@
 """The job of `aolink look`: what moves in a film of spots, without a rig file.
 
-The spots are found and cut out, their kernel is taken from the frames (`aolink.importing.blurred`), a model of the
+The spots are found and cut out, their kernel is taken from the frames (`aolink.jobs.look_spots`), a model of the
 motion is identified along x and along y, and the path inside each exposure is estimated with it.
 """
 
@@ -21,10 +21,10 @@ from aolink.films.film import Film
 from aolink.identification import FEWEST, Identified, Maximum, Piece, Readings, kinds_of, maxima, readings
 from aolink.identification.likelihood import Likelihood
 from aolink.identification.models import ProcessSum
-from aolink.importing.blurred import Spots, find_spots
 from aolink.importing.frames import FilmSettings, film_times, nonlinear_note
 from aolink.jobs.identify import IdentifiedModel, Wanted, from_readings, space_wanted
 from aolink.jobs.look_scene import LEAST_MOTION, Scene
+from aolink.jobs.look_spots import Spots, find_spots
 from aolink.numerics.arrays import FloatArray
 from aolink.rig import Rig, parse_rig
 

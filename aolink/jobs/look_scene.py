@@ -13,9 +13,9 @@ from aolink.exposure import Exposure
 from aolink.films.film import Film
 from aolink.identification.models import ProcessSum
 from aolink.identification.rig_text import as_table
-from aolink.importing.blurred import Spots
 from aolink.importing.exposures import film_series
 from aolink.importing.frames import FilmSettings, FrameTimes
+from aolink.jobs.look_spots import Spots
 from aolink.numerics.arrays import FloatArray
 from aolink.rig import Rig, parse_rig
 from aolink.rig.edit import with_tables

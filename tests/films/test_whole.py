@@ -29,7 +29,7 @@ FRAMES[:, 6:10, 6:10] += 2000
 
 def with_copies(frames):
     film = frames.copy()
-    film[5], film[9] = film[4], film[2]
+    film[5], film[9] = film[4], film[7]
     return film
 
 

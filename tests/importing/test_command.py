@@ -54,9 +54,8 @@ def test_notes_and_warnings_are_printed(aolink, rig, tmp_path):
     made = aolink("import", source, "-o", "a.mcap", "--rig", rig)
     assert made.stdout.splitlines() == [
         "note: the film does not state its frame rate: that of the rig file is assumed, 50 frames/s",
-        "note: when the film was taken is not known: its times count from 1970 unless --film start=DATE is given",
-        "note: it is not known whether the film's rows were exposed one after the other: say so with --film"
-        " row_time=S, or row_time=0",
+        "note: when it was taken is not known: its times count from 1970 without --film start=DATE",
+        "note: whether its rows were exposed one after the other is not known: give --film row_time=S, or 0",
         "warning: 4 pixels (0.89%) are saturated in the film, hot or dead, or no numbers: they are masked",
         "a.mcap: 7 exposures of 7 frames",
     ]
@@ -179,7 +178,7 @@ def missing(folder: Path) -> Path:
         (mixed, [], 11, "frame99.png has 6 x 9 pixels of uint8, those before it have 8 x 8 pixels"),
         (timed, [], 11, "50 frames/s contradict its times, which say 40"),
         (good, ["--rate", "60"], 11, "change its [timing], or give the right --rate"),
-        (bright, ["--rate", "50"], 11, "where 1.0 would be full scale: say with --film scale=COUNTS how many counts"),
+        (bright, ["--rate", "50"], 11, "where 1.0 would be full scale: say with --film scale=COUNTS"),
         (good, ["--rate", "0"], 11, "--rate 0 must be above 0"),
         (good, ["--rate", "inf"], 11, "--rate inf must be above 0 and finite"),
         (good, ["--rate", "nan"], 11, "--rate nan must be above 0"),

@@ -111,7 +111,7 @@ def test_scale_makes_slopes_of_another_unit(tmp_path: Path) -> None:
     ("rig", "settings", "says"),
     [
         ("sh-4x4", {}, "has 2 slopes in each frame, the rig file sh-4x4 32"),
-        ("single-lenslet", {"places": ((3.0, 3.0),)}, "no pictures: --at"),
+        ("single-lenslet", {"places": ((3.0, 3.0),)}, "--at"),
     ],
 )
 def test_slopes_that_are_not_the_rigs_are_refused(

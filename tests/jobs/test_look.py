@@ -18,14 +18,14 @@ from aolink.estimation.verdict import Fit, Verdict
 from aolink.films.film import array_film
 from aolink.identification import readings
 from aolink.identification.models import Process, ProcessSum
-from aolink.importing.blurred import find_spots
 from aolink.importing.frames import FilmSettings, film_times
 from aolink.jobs.look import heeding, line_left, look
 from aolink.jobs.look_scene import Scene
+from aolink.jobs.look_spots import find_spots
 from aolink.jobs.look_words import paragraph
 from aolink.recording.reader import Recording
 from aolink.rig import load_rig, parse_rig
-from tests.importing.test_blurred import FRAMES, shaken
+from tests.jobs.test_look_spots import FRAMES, shaken
 
 RATE, EXPOSURE = 50.0, 0.67 / 37.3
 """With .67 cycles in an exposure and .746 from frame to frame: 37.3 Hz at 50 frames a second."""

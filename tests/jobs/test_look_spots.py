@@ -10,8 +10,8 @@ import pytest
 
 from aolink.errors import ImportingError
 from aolink.films.film import Film, array_film
-from aolink.importing.blurred import find_spots
 from aolink.importing.frames import FilmSettings
+from aolink.jobs.look_spots import find_spots
 from aolink.optics.kernel import pixel_masses
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
