@@ -21,8 +21,9 @@ _SIZES = {name: float(size) for size, names in _TABLE["units"].items() for name 
 _UNIT = re.compile(r"[\W_]+[A-Za-z]+[\W_]*$|(?<=[a-z])[A-Z][a-z]+$")
 """The last word of a name."""
 _TAKEN_S = (1.0, 1e-3, 1e-6, 1e-9)
+_NAMED = {1e-3: "ms", 1e-6: "us", 1e-9: "ns"}
 _USUAL_S = (5e-5, 2.0)
-"""From one frame to the next, where a number without a unit is all there is."""
+"""From one frame to the next, in the largest unit that gives it, where a number without one is all there is."""
 _LONGEST_S = 10.0
 """The longest exposure that a number without a unit says in seconds, where nothing is known of the rate."""
 _DATED_S = (631_152_000, 7_258_118_400)
@@ -101,7 +102,10 @@ def facts(
                 refused[_shown(each)] = ""
             else:
                 differs = fact == "exposure" and np.ptp(values) > _SAME * values.max()
-                used.append(_shown(each) + (", which differs from frame to frame: the first" if differs else ""))
+                guessed = "" if unit or size not in _NAMED else f" in {_NAMED[size]}"
+                used.append(
+                    _shown(each) + guessed + (", which differs from frame to frame: the first" if differs else "")
+                )
         times = known.get("times_ns")
         if times is not None and count > 1 and np.median(np.diff(times)) > 0:
             period = float(np.median(np.diff(times))) / 1e9
@@ -143,10 +147,9 @@ def _unit_of(values: NDArray[Any], step: float, period: float | None, start: boo
         return since[0]
     if start or step <= 0:
         return None
-    if period is not None:
-        return next((u for u in _TAKEN_S if abs(step * u / period - 1) < 0.25), None)
-    usual = [u for u in _TAKEN_S if _USUAL_S[0] <= step * u <= _USUAL_S[1]]
-    return usual[0] if (values.dtype.kind == "f" and 1.0 in usual) or len(usual) == 1 else None
+    if period is not None and (agree := [u for u in _TAKEN_S if abs(step * u / period - 1) < 0.25]):
+        return agree[0]
+    return next((u for u in _TAKEN_S if _USUAL_S[0] <= step * u <= _USUAL_S[1]), None)
 
 
 def _unit_of_exposure(value: float, period: float | None, longest_s: float) -> float | None:

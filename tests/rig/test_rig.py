@@ -406,3 +406,8 @@ def test_the_rigs_that_come_along_are_listed(aolink: Callable[..., subprocess.Co
     lines = " ".join(aolink("rig", "--list").stdout.split())
     assert all(f"{name} " in lines for name in builtin_rigs())
     assert "The paper's example" in lines
+
+
+def test_a_byte_order_mark_is_none_of_a_rig_file(tmp_path):
+    (tmp_path / "a.toml").write_text(load_rig("single-lenslet").toml, encoding="utf-8-sig")
+    assert load_rig(tmp_path / "a.toml").digest == load_rig("single-lenslet").digest
