@@ -47,9 +47,9 @@ def dated(time_ns: int) -> bool:
 
 
 def meaning(name: str, unit: str = "") -> tuple[str, str, float | None]:
-    """What a name stands for, empty where that is not known; the name without unit and spaces; the unit, s or Hz."""
+    """What a name stands for, or nothing; the name without its unit; and the unit, s or Hz, NaN where it is another."""
     name, unit = (re.sub("[\N{MICRO SIGN}\N{GREEK SMALL LETTER MU}]", "u", each) for each in (name, unit))
-    size = _SIZES.get(unit.strip(" []()\\").lower())
+    size = _SIZES.get(unit.strip(" []()\\").lower(), math.nan) if unit else None
     plain = re.sub(r"[\W_]", "", name).lower()
     if plain not in _FACTS and (found := _UNIT.search(name)) and found[0].strip(" _-.()[]").lower() in _SIZES:
         plain = re.sub(r"[\W_]", "", name[: found.start()]).lower()
@@ -96,7 +96,7 @@ def facts(
             else:
                 step = float(np.median(np.diff(values))) if fact == "times" and count > 1 else float(values[0])
                 size = 86400.0 if plain in _EPOCHS else unit or _unit_of(values, step, period, fact == "start")
-            if size is None:
+            if size is None or math.isnan(size):
                 refused[_shown(each)] = f": its unit is not known, name it {each.name}_s, _ms, _us or _ns"
             elif not _taken(known, fact, values, size, plain):
                 refused[_shown(each)] = ""

@@ -67,7 +67,8 @@ def fits_film(path: Path, topic: str | None) -> Film:
         count = math.prod(shape[:-2])
         cards = [card for each in {id(file[0]): file[0], id(chosen): chosen}.values() for card in each.header.cards]
         said = [Said(card.keyword, card.value, _IN_COMMENT.match(f"{card.comment} []")[1]) for card in cards]
-        said = [each for each in said if meaning(each.name)[0] not in ("start", "times")]
+        said = [each for each in said if meaning(each.name)[0] in ("rate", "period", "exposure")]
+        said = [each if (meaning(*each[::2])[2] or 0) > 0 else each._replace(unit="") for each in said]
         for each in file[1:] if not damaged else []:
             if not each.is_image and hasattr(each, "columns") and each.header["NAXIS2"] == count:
                 columns = [column for column in each.columns if meaning(column.name)[0]]
