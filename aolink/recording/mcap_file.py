@@ -156,11 +156,15 @@ class McapFile:
         return self._chunk_start_ns is not None
 
     @property
-    def was_shortened(self) -> bool:
-        """Whether another program has emptied or shortened the file: what comes afterwards is in it all the same."""
-        if not (self._closed or self._file.was_shortened):
+    def loss(self) -> RecordingError | None:
+        """What to raise where another program has emptied or shortened the file. Raises OSError."""
+        if not self._closed:
             self._file.check_size()
-        return self._file.was_shortened
+        if not self._file.was_shortened:
+            return None
+        return RecordingError(
+            f"{self.path} was emptied or shortened by another program: what it held until then is lost"
+        )
 
     def add_attachment(self, name: str, media_type: str, data: bytes, time_ns: int) -> None:
         self.flush()
@@ -209,13 +213,22 @@ class McapFile:
         os.fsync(self._file.descriptor)
 
     def finish(self, *, sync: bool = False) -> None:
-        """Write the index and close; with ``sync``, wait until it is on the disk."""
+        """Write the index and close; with ``sync``, wait until it is on the disk.
+
+        Raises
+        ------
+        RecordingError
+            Another program has emptied or shortened the file.
+        """
         self.flush()
         self._writer.finish()
         if sync:
             self.sync()
+        loss = self.loss
         self._closed = True
         self._file.close()
+        if loss is not None:
+            raise loss
 
     def cut_back(self) -> None:
         """Cut the file back to its last whole part, and close it. Raises nothing."""

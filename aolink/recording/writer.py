@@ -280,11 +280,7 @@ class RecordingWriter:
         """End the session where the file's name is no longer its own, or its content is gone."""
         if self._error is None and not self._place.is_there():
             self._error = RecordingError(f"{self._place.path} was removed, renamed or replaced by another program")
-        if self._error is None and self._file.was_shortened:
-            self._error = RecordingError(
-                f"{self._place.path} was emptied or shortened by another program: what it held is lost, what came"
-                " afterwards is in it"
-            )
+        self._error = self._error or self._file.loss
 
     def _run(self) -> None:
         options = self._options
@@ -358,7 +354,10 @@ class RecordingWriter:
     def _finish(self, end_metadata: dict[str, str]) -> None:
         if end_metadata:
             self._file.add_metadata(topics.END_METADATA, end_metadata)
-        self._file.finish(sync=not self._deterministic)
+        try:
+            self._file.finish(sync=not self._deterministic)
+        except RecordingError as error:
+            self._error = self._error or error
         self._look()
         if not (self._place.is_there() or self._place.is_aside):
             self._busy_since = None  # a copy may take long, and nothing waits for it but the session's end

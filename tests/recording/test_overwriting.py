@@ -16,6 +16,7 @@ from foxglove_schemas_protobuf.Log_pb2 import Log
 from aolink.errors import RecordingError
 from aolink.files import create
 from aolink.recording import topics
+from aolink.recording.editing import recover
 from aolink.recording.mcap_file import WriteOptions
 from aolink.recording.reader import Recording
 from aolink.recording.writer import RecordingWriter
@@ -274,3 +275,18 @@ def test_a_file_that_is_emptied_or_shortened_ends_the_session_and_has_what_came_
     assert frames[-EXPOSURES:] == list(range(1, EXPOSURES + 1))
     assert len(frames) < 4 * EXPOSURES
     assert found.losses
+
+
+def test_a_copy_that_is_shortened_while_it_is_written_is_an_error(recorded: Session, tmp_path: Path) -> None:
+    def empty(done: int) -> None:
+        if done == EXPOSURES:
+            for path in (tmp_path / "copy").iterdir():
+                os.truncate(path, 0)
+
+    (tmp_path / "copy").mkdir()
+    one = WriteOptions(flush_s=0.001, chunk_bytes=1 << 10)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("aolink.recording.editing.AT_LEISURE", one)  # so that something is written until then
+        with pytest.raises(RecordingError, match="shortened"):
+            recover(recorded.path, tmp_path / "copy/a.mcap", progress=empty)
+    assert not list((tmp_path / "copy").iterdir())

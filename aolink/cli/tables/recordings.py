@@ -50,7 +50,14 @@ def summary(values: Mapping[str, Any]) -> Table:
         "steps": _steps(values["commands"]),
         "answers": "; ".join(Commands.of(values["commands"]).lines()),
         "estimates": ", ".join(f"{name} {each['count']}" for name, each in values["estimates"].items()) or "none",
-        "unused": "\n".join(_unused(values["estimates"])),
+        "unused": "\n".join(
+            f"{name}: {Unused(**each).text(of['count'])}"
+            for name, of in values["estimates"].items()
+            for each in of["unused"]
+        ),
+        "verdict": "\n".join(
+            f"{name}: {of['verdict']['text']}" for name, of in values["estimates"].items() if of.get("verdict")
+        ),
         "damage": values["damage"],
         "odd": ", ".join(f"{name.replace('_', ' ')} {value}" for name, value in odd.items()),
         "ended": "" if session.get("ended", "complete") == "complete" else str(session["ended"]),
@@ -65,12 +72,6 @@ def summary(values: Mapping[str, Any]) -> Table:
 
 def _steps(commands: Mapping[str, Any]) -> str:
     return ", ".join(f"{name.replace('_', ' ')} {count}" for name in STEPS if (count := commands[name]))
-
-
-def _unused(estimates: Mapping[str, Any]) -> list[str]:
-    """Why estimators could not use some exposures, and their verdicts on the model."""
-    lines = [f"{name}: {Unused(**each).text(of['count'])}" for name, of in estimates.items() for each in of["unused"]]
-    return lines + [f"{name}: {of['verdict']['text']}" for name, of in estimates.items() if of.get("verdict")]
 
 
 def batch(rows: Sequence[Mapping[str, Any]]) -> Table:
