@@ -1,14 +1,25 @@
 """The errors that aolink raises on purpose, with one class for each kind.
 
 Every message says what was found, what was expected and what to do; the command line prints it as
-one line and exits with the class's ``exit_code``.
+one line and exits with its ``exit_code``.
 """
+
+from typing import TypeVar
 
 
 class AolinkError(Exception):
     """Base of every error that aolink raises on purpose."""
 
     exit_code = 1
+
+
+_Error = TypeVar("_Error", bound=AolinkError)
+
+
+def wrong_usage(error: _Error) -> _Error:
+    """The same error with the exit code of a wrong argument, for a name that does not exist."""
+    error.exit_code = RigError.exit_code
+    return error
 
 
 class RigError(AolinkError):

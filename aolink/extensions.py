@@ -13,7 +13,7 @@ from typing import Any, Protocol, TypeVar
 from urllib.parse import urlsplit
 from urllib.request import url2pathname
 
-from aolink.errors import AolinkError
+from aolink.errors import AolinkError, wrong_usage
 
 
 class _Named(Protocol):
@@ -61,7 +61,7 @@ def row_named(name: str, ours: Mapping[str, Row], group: str, kind: str, error: 
         known = names_with(ours, group)
         like = get_close_matches(name.lower(), known, 1)
         meant = f"did you mean {like[0]}? There is" if like else "use one of"
-        raise error(f"there is no {kind} {name!r}: {meant} {', '.join(known)}")
+        raise wrong_usage(error(f"there is no {kind} {name!r}: {meant} {', '.join(known)}"))
     row, expected = loaded(point, kind, error), type(next(iter(ours.values())))
     if not isinstance(row, expected) or row.name != name:
         raise error(f"{described(point, kind)} is {row!r}, expected a row of this name, {expected.__name__}")

@@ -1,6 +1,7 @@
 """The signals that end a command from outside: Ctrl-C, SIGTERM and SIGHUP, handled in the same way for every command.
 
-Only the standard library is imported here, so that this works while the rest of a command is still being loaded.
+Hardly more than the standard library is imported here, so that this works while the rest of a command is still being
+loaded.
 """
 
 from __future__ import annotations
@@ -16,6 +17,8 @@ from contextlib import contextmanager
 from functools import partial
 from types import FrameType
 from typing import Any
+
+from aolink.errors import AolinkError
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _ECHO_S = 0.5
@@ -132,9 +135,21 @@ def ending_the_command() -> Iterator[None]:
     try:
         with StopRequest(at_once=True).installed():
             yield
-    except Interrupted as interrupted:
+    except BaseException as error:
+        interrupted = _interruption(error)
+        if interrupted is None:
+            raise
+        sys.unraisablehook = lambda ignored: None  # what could not be closed is tried again while the process ends
         print(f"aolink: {interrupted}", file=sys.stderr)
         sys.exit(interrupted.exit_code)
+
+
+def _interruption(error: BaseException | None) -> Interrupted | None:
+    """The interruption that an error is, or that a library was closing something for when it raised the error: a ZIP
+    file, for one, whose entry was being opened."""
+    while error is not None and not isinstance(error, Interrupted):
+        error = None if isinstance(error, SystemExit | AolinkError) else error.__context__
+    return error
 
 
 def _leave_lost_terminal() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
+import gc
 import itertools
 import os
 import pty
@@ -14,6 +15,7 @@ import subprocess
 import sys
 import termios
 import time
+import zipfile
 from collections.abc import Callable, Iterator
 from io import TextIOBase
 from pathlib import Path
@@ -25,6 +27,7 @@ import pytest
 from aolink.cli.common import app
 from aolink.recording.editing import cut
 from aolink.recording.reader import Recording
+from aolink.signals import ending_the_command
 from tests.commands import simulated_rig
 from tests.conftest import Session
 from tests.jobs.test_look_spots import shaken
@@ -270,3 +273,24 @@ def test_nohup_is_respected(tmp_path: Path, places: dict[str, str]) -> None:
         size = (started.folder / "a.mcap").stat().st_size
         assert started.wait_until(lambda: (started.folder / "a.mcap").stat().st_size > size + 30_000), "it goes on"
         assert started.end(signal.SIGTERM) == (143, "aolink: interrupted by SIGTERM\n")
+
+
+def test_a_signal_while_an_entry_of_a_zip_file_is_opened_is_one_line(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The ZIP file then cannot be closed, and raises an error of its own."""
+    opened = zipfile.ZipFile.open
+
+    def interrupted(*arguments: Any, **options: Any) -> Any:
+        entry = opened(*arguments, **options)
+        os.kill(os.getpid(), signal.SIGTERM)
+        return entry
+
+    monkeypatch.setattr(zipfile.ZipFile, "open", interrupted)
+    monkeypatch.setattr(sys, "unraisablehook", sys.unraisablehook)  # it is another one when a command has ended
+    with pytest.raises(SystemExit) as ended, ending_the_command():
+        np.savez(tmp_path / "a.npz", a=np.arange(5))
+    assert ended.value.code == 128 + signal.SIGTERM
+    del ended
+    gc.collect()
+    assert capsys.readouterr().err == "aolink: interrupted by SIGTERM\n"

@@ -1,11 +1,13 @@
 """Code that the commands share: the consoles, common options, opening files."""
 
+import os
 import re
 import shutil
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
+from glob import escape, glob
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -14,6 +16,7 @@ from typer.core import TyperGroup
 
 from aolink.cli.terminal import PlainConsole, progress_bar
 from aolink.errors import EstimatorError, RigError
+from aolink.units import quantity
 
 if TYPE_CHECKING:
     from aolink.estimation import Score
@@ -22,6 +25,30 @@ if TYPE_CHECKING:
     from aolink.rig import Rig
 
 
+def _known(parameter: str) -> tuple[str, ...]:
+    """The names that an option or argument takes."""
+    if parameter == "rig":
+        from aolink.rig import builtin_rigs
+
+        return tuple(builtin_rigs())
+    if parameter == "estimator":
+        from aolink.estimation import ESTIMATOR_NAMES
+
+        return ESTIMATOR_NAMES
+    from aolink.control.registry import controller_names
+
+    return controller_names()
+
+
+def _completed(context: Any, parameter: Any, begun: str) -> list[str]:
+    """What the shell offers for the beginning of a name; for a rig also files and folders."""
+    found = [name for name in _known(parameter.name) if name.startswith(begun)]
+    if parameter.name == "rig":
+        found += [each + "/" * os.path.isdir(each) for each in glob(f"{escape(begun)}*")]
+    return found
+
+
+_COMPLETED = ("rig", "estimator", "control")
 _GROUPS = {
     "A session": ("record", "info", "view", "estimate", "report"),
     "Your own film": ("look", "import"),
@@ -47,6 +74,8 @@ class _Commands(TyperGroup):
                 parameter.metavar = " "  # a switch takes no value, and its help names none
             elif parameter.param_type_name == "argument":
                 parameter.display_type = lambda _: ""  # its name tells more than a type of Python
+            if parameter.name in _COMPLETED:
+                parameter._custom_shell_complete = _completed  # here for all commands at once
         return found
 
 
@@ -56,16 +85,15 @@ app = typer.Typer(
     add_completion=True,
     pretty_exceptions_enable=False,
     rich_markup_mode="rich",
+    context_settings={"help_option_names": ["-h", "--help"]},
     help="A logged hardware-in-the-loop pipeline for adaptive optics and any loop closed through a slow camera.",
 )
 stdout = PlainConsole(highlight=False, soft_wrap=True, width=None if sys.stdout.isatty() else 120)
 stderr = PlainConsole(stderr=True, highlight=False, soft_wrap=True)
 
+
 _opened: "list[tuple[Recording, str]]" = []
 """The recordings that this command has opened, and their damage as it was known then."""
-RigArgument = Annotated[str, typer.Argument(help="A rig file, or the name of a rig that comes with aolink.")]
-
-
 FileArgument = Annotated[Path, typer.Argument(help="A recording.", metavar="FILE")]
 EstimatorOption = Annotated[
     list[str] | None,
@@ -86,6 +114,23 @@ LensletOption = Annotated[
     str | None, typer.Option(metavar="I,J", help="Row and column of the lenslet to draw, counted from 0.")
 ]
 OutputOption = Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="The recording to write.")]
+
+
+def as_seconds(text: Any) -> float:
+    """A time that was typed, or an option's default, s."""
+    return _as(text, "s")
+
+
+def as_rate(text: Any) -> float:
+    """A rate that was typed, Hz."""
+    return _as(text, "Hz")
+
+
+def _as(text: Any, unit: str) -> float:
+    try:
+        return quantity(str(text), unit)
+    except ValueError as error:
+        raise typer.BadParameter(str(error)) from None
 
 
 def warn(text: str) -> None:

@@ -7,33 +7,27 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
-from aolink.cli.common import OutputOption, OverwriteOption, app, progress, stdout
+from aolink.cli.common import OutputOption, OverwriteOption, app, as_rate, as_seconds, progress, stdout
 from aolink.errors import ImportingError
+from aolink.units import quantity
 
 if TYPE_CHECKING:
     from aolink.films.film import Film
     from aolink.importing.frames import FilmSettings
 
 
-def _fraction(text: str) -> float:
-    """A number, or two with a stroke between them."""
-    over, _, under = str(text).partition("/")
-    try:
-        return float(over) / float(under or 1)
-    except (ValueError, ZeroDivisionError):
-        raise typer.BadParameter(f"{text} is no number") from None
-
-
 RateOption = Annotated[
     float | None,
     typer.Option(
-        "--rate", metavar="HZ", parser=_fraction, help="Frames a second, also as 30000/1001; it goes before the film's."
+        "--rate", metavar="HZ", parser=as_rate, help="Frames a second, also as 30000/1001; it goes before the film's."
     ),
 ]
 
 ExposureOption = Annotated[
     float | None,
-    typer.Option("--exposure", metavar="S", parser=_fraction, help="Exposure time of a frame, s, also as 1/250."),
+    typer.Option(
+        "--exposure", metavar="S", parser=as_seconds, help="Exposure time of a frame, s, also as 1/250 or 4ms."
+    ),
 ]
 _FILM = {
     "gamma=2.2": ("gamma", "undo a gamma curve, which most JPEG and video have"),
@@ -112,8 +106,10 @@ def _value(name: str, text: str) -> Any:
     if name in ("topic", "colour", "pixels"):
         return text
     try:
-        value = float(text)
-    except ValueError:
+        value = quantity(text, "s") if name == "row_time" else float(text)
+    except ValueError as error:
+        if name == "row_time":
+            raise ImportingError(f"--film row_time: {error}") from None
         value = math.nan
     if name == "gamma" and not 0.1 <= value <= 10:
         raise ImportingError(f"--film gamma={text}: give a number from 0.1 to 10")
@@ -140,10 +136,10 @@ def film_settings(
     """The options of a command as settings. Raises ImportingError for an invalid place, rate or time."""
     from aolink.importing.frames import FilmSettings
 
-    if exposure is not None and not 0 < exposure < math.inf:
-        raise ImportingError(f"--exposure {exposure:g} must be above 0{' and finite' if exposure > 0 else ''}")
-    if rate is not None and not 0 < rate < math.inf:
-        raise ImportingError(f"--rate {rate:g} must be above 0{' and finite' if rate > 0 else ''}")
+    if exposure is not None and exposure <= 0:
+        raise ImportingError(f"--exposure {exposure:g} must be above 0")
+    if rate is not None and rate <= 0:
+        raise ImportingError(f"--rate {rate:g} must be above 0")
     places = []
     for text in at or []:
         try:

@@ -14,6 +14,7 @@ from aolink.cli.common import (
     OutputOption,
     OverwriteOption,
     app,
+    as_seconds,
     open_recording,
     progress,
     stdout,
@@ -24,7 +25,9 @@ if TYPE_CHECKING:
     from aolink.recording.reader import Recording
 
 
-CutTime = Annotated[float | None, typer.Option(metavar="S", help="Seconds from the recording's start.")]
+CutTime = Annotated[
+    float | None, typer.Option(metavar="S", parser=as_seconds, help="Seconds from the recording's start; also 2min.")
+]
 
 
 @app.command(epilog="Example: aolink info session.mcap --json")

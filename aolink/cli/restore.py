@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from aolink.cli import common
-from aolink.cli.common import OverwriteOption, app, check_measured, open_recording, stdout
+from aolink.cli.common import OverwriteOption, app, as_seconds, check_measured, open_recording, stdout
 from aolink.errors import RestorationError
 from aolink.files import check_target
 
@@ -62,11 +62,18 @@ def deblur(
         ),
     ] = None,
     offset: Annotated[
-        float, typer.Option(metavar="S", help="Seconds by which the log's clock is behind that of the pictures.")
+        float,
+        typer.Option(
+            metavar="S", parser=as_seconds, help="Seconds by which the log's clock is behind that of the pictures."
+        ),
     ] = 0.0,
     exposure: Annotated[
         float | None,
-        typer.Option(metavar="S", help="With --path: exposure time of the pictures, where their file lacks it."),
+        typer.Option(
+            metavar="S",
+            parser=as_seconds,
+            help="With --path: exposure time of the pictures, where their file lacks it.",
+        ),
     ] = None,
     method: Annotated[
         str,

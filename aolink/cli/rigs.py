@@ -12,7 +12,7 @@ import typer
 from rich.markup import escape
 
 from aolink.cli import common
-from aolink.cli.common import JsonOption, RigArgument, app, load_checked, program, stdout
+from aolink.cli.common import JsonOption, app, load_checked, program, stdout
 from aolink.cli.terminal import input_ended
 from aolink.errors import AolinkError, RigError
 from aolink.signals import StopRequest
@@ -20,8 +20,10 @@ from aolink.signals import StopRequest
 if TYPE_CHECKING:
     from aolink.rig import Rig
 
+RigArgument = Annotated[str, typer.Argument(help="A rig file, or the name of a rig that comes with aolink.")]
 
-@app.command(epilog="Example: aolink rig section-vi --check")
+
+@app.command(epilog="Example: aolink rig section-vi > my.toml  |  aolink rig my.toml --check")
 def rig(
     rig: RigArgument = "",
     check: Annotated[bool, typer.Option("--check", help="Check the rig file, print the findings, and end.")] = False,
@@ -31,8 +33,9 @@ def rig(
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Check a rig file, or list the rigs that come along."""
+    """Check a rig file, list the rigs that come along, or print one to begin with."""
     from aolink.rig import builtin_rigs, load_rig
+    from aolink.rig.edit import with_value
 
     if listed:
         for name in builtin_rigs():
@@ -46,7 +49,9 @@ def rig(
     if exposure_scan:
         _print_scan(load_rig(rig), as_json)
         return
-    raise typer.BadParameter(f"say what of {rig}: --check it, or serve it with `aolink sim {rig}`")
+    loaded = load_rig(rig)
+    copied = f"copy of {loaded.name}" if rig in builtin_rigs() else loaded.name  # changed, it is another rig
+    print(with_value(loaded.toml, "name", copied), end="")
 
 
 def _print_scan(loaded: "Rig", as_json: bool) -> None:

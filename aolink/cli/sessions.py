@@ -54,7 +54,10 @@ def record(
     exposures: Annotated[
         int | None, typer.Option(min=1, max=MOST_EXPOSURES, metavar="N", help="How many exposures.")
     ] = None,
-    duration: Annotated[float | None, typer.Option(metavar="S", help="How long to record, s of device time.")] = None,
+    duration: Annotated[
+        float | None,
+        typer.Option(metavar="S", parser=common.as_seconds, help="How long to record, s of device time; also 10min."),
+    ] = None,
     note: Annotated[str, typer.Option(metavar="TEXT", help="A text to keep in the recording.")] = "",
     calibration: Annotated[
         CalibrationLight | None,
@@ -78,10 +81,8 @@ def record(
         list[str] | None,
         typer.Option(
             "--input",
-            metavar="KIND:NAME=VALUE,...|FILE",
-            help="Play this, not the rig's drive: sine:amplitude=0.2,frequency=5; chirp:amplitude=0.2,from=1,to=40;"
-            " prbs:amplitude=0.2,to=40,seed=3; step:amplitude=0.2,at=1; column=0 for one input only;"
-            " or inputs from a .npy or .mcap file.",
+            metavar="INPUT|FILE",
+            help="Play this, not the rig's drive; or inputs from a .npy or .mcap file.",
         ),
     ] = None,
     reconnect: Annotated[
@@ -103,6 +104,8 @@ def record(
 
     In real time an estimator that is slower than the camera skips exposures; the recording has them all.
     Without --exposures or --duration it records until Ctrl-C; the recording stays whole either way.
+    An INPUT is sine:amplitude=0.2,frequency=5 or chirp:amplitude=0.2,from=1,to=40 or prbs:amplitude=0.2,to=40,seed=3
+    or step:amplitude=0.2,at=1; with column=0 it is for one input only.
     """
     from aolink import session
     from aolink.recording.mcap_file import WriteOptions

@@ -53,11 +53,17 @@ def check_driver(kind: DeviceKind, table: DeviceTable, rig: Rig) -> tuple[Callab
     if forms := getattr(make, "triggers", ()):
         trigger = Trigger.of(options.pop("trigger", FREE_RUNNING.kind), forms)
         options |= {"trigger": trigger} if len(forms) > 1 else {}
-    try:
-        with suppress(ValueError):  # one that is not written in Python may have no signature
-            inspect.signature(make).bind(rig, **options)
-    except TypeError as error:
-        raise RigError(f"devices.{kind}: the driver {table.driver} cannot take these keys: {error}") from None
+    with suppress(ValueError):  # one that is not written in Python may have no signature
+        signature = inspect.signature(make)
+        try:
+            signature.bind(rig, **options)
+        except TypeError as error:
+            keys = [*signature.parameters][1:]
+            strange = [each for each in options if each not in keys]
+            what = f"has no key {strange[0]}" if strange else f"cannot take these keys: {error}"
+            raise RigError(
+                f"devices.{kind}: the driver {table.driver} {what}; it takes {', '.join(keys) or 'none'}"
+            ) from None
     hints: dict[str, Any] = {}
     with suppress(Exception):  # another package's annotations may be anything
         hints = {each.name: each.annotation for each in inspect.signature(make, eval_str=True).parameters.values()}

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
-from aolink.errors import EstimatorError
+from aolink.errors import EstimatorError, wrong_usage
 
 Engine = Literal["aolink", "filterpy"]
 
@@ -34,15 +34,19 @@ def with_options(text: str) -> tuple[str, dict[str, Any]]:
     """
     name, colon, listed = text.partition(":")
     if colon and not listed:
-        raise EstimatorError(f"there is no estimator {text!r}: after the colon come options, as in o3:second_order")
+        raise _wrong(f"there is no estimator {text!r}: after the colon come options, as in o3:second_order")
     options: dict[str, Any] = {}
     for each in listed.split(",") if listed else []:
         key, given, value = each.partition("=")
         field = Options.__dataclass_fields__.get(key)
         if field is None:
-            raise EstimatorError(f"{text}: {_no_option(key)}")
+            raise _wrong(f"{text}: {_no_option(key)}")
         options[key] = _read(text, key, field.default, value if given else "true")
     return name, options
+
+
+def _wrong(text: str) -> EstimatorError:
+    return wrong_usage(EstimatorError(text))
 
 
 def _no_option(key: str) -> str:
@@ -52,7 +56,7 @@ def _no_option(key: str) -> str:
 def _read(text: str, key: str, default: object, value: str) -> object:
     if isinstance(default, bool):
         if value not in ("true", "false"):
-            raise EstimatorError(f"{text}: {key} = {value!r}, expected true or false")
+            raise _wrong(f"{text}: {key} = {value!r}, expected true or false")
         return value == "true"
     return value
 
@@ -61,11 +65,11 @@ def checked_options(**options: Any) -> Options:
     """Options by their names. Raises EstimatorError: there is no such option, or it cannot have this value."""
     for key in options:
         if key not in _NAMES:
-            raise EstimatorError(_no_option(key))
+            raise _wrong(_no_option(key))
     chosen = Options(**options)
     for key, kind in get_type_hints(Options).items():
         if get_origin(kind) is Literal and getattr(chosen, key) not in (values := get_args(kind)):
-            raise EstimatorError(f"{key} = {getattr(chosen, key)!r} is not known: use one of {', '.join(values)}")
+            raise _wrong(f"{key} = {getattr(chosen, key)!r} is not known: use one of {', '.join(values)}")
     if chosen.second_order and chosen.engine == "filterpy":
         raise EstimatorError("second_order is not for the engine 'filterpy', whose filters are of first order")
     return chosen

@@ -80,13 +80,14 @@ def check_devices(rig: Rig) -> Iterator[Finding]:
             if table.driver == NATIVE:
                 native_port(kind, table)
                 continue
-            said = rig.sensor.row_time_s is not None
             lacking = lacks_of(check_driver(kind, table, rig)[0])
-            lacks = "; ".join(each for each in lacking if each != Lacks.ROWS or not said) or "nothing"
+            lacks = "; ".join(each for each in lacking if each != Lacks.ROWS) or "nothing"
         except AolinkError as error:
-            yield _error(key, str(error))
+            yield _error(key, str(error).removeprefix(f"{key}: "))
             continue
         yield _info(key, f"the driver {table.driver}; what its device lacks: {lacks}")
+        if Lacks.ROWS in lacking and rig.sensor.row_time_s is None:
+            yield _warning("sensor.row_time_s", f"is missing, and a camera of the driver {table.driver} {Lacks.ROWS}")
     if rig.devices and "mirror" not in rig.devices:
         yield _info("devices.mirror", "no mirror is named: without --mirror the camera is recorded alone")
 

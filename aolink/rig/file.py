@@ -146,10 +146,9 @@ def load_rig(path_or_name: str | Path) -> Rig:
                 return load_rig(path.name.removesuffix(".toml"))
             like = get_close_matches(path.name.removesuffix(".toml"), builtin_rigs(), 1)
             meant = f"did you mean {like[0]}? Otherwise " if like else ""
-            raise RigError(
-                f"cannot read the rig file {path}: {error.strerror};"
-                f" {meant}give a TOML file or one of: {', '.join(builtin_rigs())}"
-            ) from None
+            no_rig = isinstance(error, FileNotFoundError) and path.suffix != ".toml"
+            what = f"there is no rig {path}" if no_rig else f"cannot read the rig file {path}: {error.strerror}"
+            raise RigError(f"{what}; {meant}give a TOML file or one of: {', '.join(builtin_rigs())}") from None
         except UnicodeDecodeError:
             raise RigError(f"{path} is not a rig file: it is not text") from None
     try:

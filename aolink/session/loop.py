@@ -39,6 +39,8 @@ ANSWER_NS = 200_000_000
 """How long the start waits for the answer to one clock query."""
 _GRACE_S = 1.5
 """In real time, how long a frame may take after its exposure's end before it counts as lost, s."""
+_FIRST_FRAME_S = 5.0
+"""In real time, how long a camera may take until its first frame, s: some start slowly, above all on a busy machine."""
 _HELD_UP_S = 1.0
 """In real time, a turn of the loop that takes longer is one in which this process did not run, s."""
 _KEEP_ALIVES = 3
@@ -341,11 +343,14 @@ class SessionLoop:
         if self._end_step is not None:
             late_step = self._end_step + _GRACE_S * 1e9 / self._step_ns
             is_late = self._commanding.device_step() > late_step
-            if self.report.exposures >= exposures or (is_late and not self._was_held_up()):
+            if self.report.exposures >= exposures:
+                return True
+            if is_late and self.report.frames_received and not self._was_held_up():
                 return True
         patience_ns = 3 * timing.frame_period_steps * self._step_ns + (_GRACE_S + _START_DELAY_S) * 1e9
         # A camera and a mirror of one device are held up together, and the mirror is waited for that long.
         patience_ns = max(patience_ns, _OUTAGE_WATCHDOGS * self._rig.mirror.watchdog_s * 1e9)
+        patience_ns = max(patience_ns, 0 if self.report.frames_received else _FIRST_FRAME_S * 1e9)
         if now - self._last_frame_ns > patience_ns:
             raise DeviceError(
                 f"the camera has sent no frame for {(now - self._last_frame_ns) / 1e9:.1f} s: is it still connected?"

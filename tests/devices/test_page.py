@@ -67,7 +67,7 @@ def test_both_are_recorded_in_a_session(amplifiers: tuple[int, str], tmp_path: P
     ("keys", "says"),
     [
         ('level = "high"', "devices.camera.level: expected a whole number, found 'high'"),
-        ("levels = 3", "devices.camera: the driver page cannot take these keys"),
+        ("levels = 3", "devices.camera: the driver page has no key levels; it takes "),
         ('trigger = "hardware:Line1"', "devices.camera.trigger: expected 'free-running' with this driver, found 'hard"),
     ],
 )

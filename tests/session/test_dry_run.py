@@ -76,7 +76,7 @@ def test_the_devices_are_asked_who_they_are_and_what_time_it_is_and_nothing_else
     [
         (["--rig", "jitter"], 4, "does not match the device"),
         (["--rig", "section-vi", "--mirror", "/dev/nowhere"], 3, "there is no port /dev/nowhere"),
-        (["--rig", "section-vi", "-e", "o9"], 6, "o9"),
+        (["--rig", "section-vi", "-e", "o9"], 2, "o9"),
         (["--rig", "section-vi", "--input", "sine:amplitude=9,frequency=1"], 4, "beyond the mirror's limits"),
         (["--rig", "section-vi", "--exposures", "4000000000"], 5, "record fewer, or to another disk"),
         (["--rig", "section-vi", "-o", "taken.mcap"], 5, "taken.mcap exists"),

@@ -114,6 +114,16 @@ def test_a_camera_that_sends_nothing_more_is_still_an_error(tmp_path: Path) -> N
     assert "the camera has sent no frame for 4.0 s: is it still connected?" in str(run.error)
 
 
+def test_a_short_session_without_a_single_frame_is_an_error(tmp_path: Path) -> None:
+    def unplug(hub: JumpingHub) -> None:
+        hub.to_host["camera"].cut = True
+
+    run = session(tmp_path, RIG, unplug, at=0, exposures=3)
+    assert isinstance(run.error, DeviceError)
+    assert "no frame" in str(run.error)
+    assert Recording(run.path).complete
+
+
 @pytest.mark.slow
 def test_each_of_several_is_said(tmp_path: Path) -> None:
     left = [80, 50, 20]

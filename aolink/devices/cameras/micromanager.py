@@ -19,6 +19,9 @@ _LABEL = "Camera"
 _LOOK_S = 0.0005
 """Time between two looks for a frame, s."""
 _PATH = "MICROMANAGER_PATH"
+_MOST_WAITING = 1024
+"""Frames that Micro-Manager keeps for us, if its own limit has room for them. It makes room for as many as that limit
+takes, a million small ones, which holds up the first frame for seconds on a busy machine."""
 
 
 class MicroManagerCamera(ThreadCamera):
@@ -103,6 +106,8 @@ class MicroManagerCamera(ThreadCamera):
                 f"{self._name} gives {core.getNumberOfComponents()} colour(s) of {core.getImageBitDepth()} bits, the"
                 f" rig file's sensor has one of {sensor.bit_depth}: set devices.camera.properties, such as PixelType"
             )
+        frames_mib = 1 + (_MOST_WAITING * height * width * core.getBytesPerPixel() >> 20)
+        core.setCircularBufferMemoryFootprint(min(core.getCircularBufferMemoryFootprint(), frames_mib))
         core.setExposure(timing.exposure_ns / 1e6)
         self._exposure_ns = round(core.getExposure() * 1e6)
         check_timing(timing, self._name, self._exposure_ns)
