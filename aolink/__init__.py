@@ -84,9 +84,11 @@ def read(path: str | Path, side: Sequence[str | Path] = (), *, rig: Rig | str | 
     RigError
         The rig file cannot be read, or cannot stand in for the recording's own.
     """
+    from aolink.arguments import path as path_of
     from aolink.recording.reader import Recording
+    from aolink.rig import rig_of
 
-    return Recording(path, side=side, rig=None if rig is None else _rig(rig))
+    return Recording(path_of(path, "path"), side=side, rig=None if rig is None else rig_of(rig))
 
 
 def simulate(rig: Rig | str | Path, n_exposures: int, seed: int | None = None) -> Series:
@@ -110,11 +112,13 @@ def simulate(rig: Rig | str | Path, n_exposures: int, seed: int | None = None) -
     RigError
         The rig file cannot be read or cannot work.
     """
+    from aolink.arguments import whole_number
+    from aolink.rig import rig_of
     from aolink.series import in_memory
     from aolink.simulation.model import simulate as simulate_exposures
 
-    rig = _rig(rig)
-    return in_memory(rig, simulate_exposures(rig, n_exposures, seed))
+    rig, count = rig_of(rig), whole_number(n_exposures, "n_exposures")
+    return in_memory(rig, simulate_exposures(rig, count, None if seed is None else whole_number(seed, "seed")))
 
 
 def exposures(
@@ -148,8 +152,9 @@ def exposures(
         The rig file cannot be read or cannot work.
     """
     from aolink.importing.exposures import exposures as made
+    from aolink.rig import rig_of
 
-    return made(frames, _rig(rig), inputs, start_steps)
+    return made(frames, rig_of(rig), inputs, start_steps)
 
 
 def estimate(exposures: Series | str | Path, estimators: str | Sequence[str]) -> Series:
@@ -176,12 +181,12 @@ def estimate(exposures: Series | str | Path, estimators: str | Sequence[str]) ->
     RecordingError
         ``exposures`` is a path, and no recording can be read from it.
     """
+    from aolink.arguments import names
     from aolink.estimation import run
     from aolink.series import with_estimates
 
     series = _opened(exposures)
-    names = [estimators] if isinstance(estimators, str) else list(dict.fromkeys(estimators))
-    return with_estimates(series, run(series.rig, series, names))
+    return with_estimates(series, run(series.rig, series, names(estimators, "estimators")))
 
 
 def smooth(series: Series | str | Path, lag: int | None = None, *, estimators: str | Sequence[str] = ()) -> Series:
@@ -209,16 +214,17 @@ def smooth(series: Series | str | Path, lag: int | None = None, *, estimators: s
     RecordingError
         There are no such estimates, or no recording can be read from the path.
     """
+    from aolink.arguments import names as names_of
     from aolink.errors import EstimatorError
     from aolink.estimation import smooth as smooth_estimates
     from aolink.series import with_estimates
 
-    if isinstance(lag, Sequence):
+    if lag is not None and not isinstance(lag, int):
         raise EstimatorError(
             "smooth takes a series with its estimates, as estimate gives it: aolink.smooth(series, lag=3)"
         )
     opened = _opened(series)
-    names = opened.named(([estimators] if isinstance(estimators, str) else list(estimators)) or None)
+    names = opened.named(names_of(estimators, "estimators") or None)
     walked = list(opened.walk(names))
     of_each = {name: [found[name] for _, found in walked if name in found] for name in names}
     plant, all_exposures = opened.rig.plant, [exposure for exposure, _ in walked]
@@ -226,12 +232,6 @@ def smooth(series: Series | str | Path, lag: int | None = None, *, estimators: s
         name: smooth_estimates(plant, all_exposures, estimates, lag) for name, estimates in of_each.items()
     }
     return with_estimates(opened, made)
-
-
-def _rig(rig: Rig | str | Path) -> Rig:
-    from aolink.rig import Rig, load_rig
-
-    return rig if isinstance(rig, Rig) else load_rig(rig)
 
 
 def _opened(exposures: Series | str | Path) -> Series:

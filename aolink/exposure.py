@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from aolink.plain import plain_data
+from aolink.plain import plain_data, shapes_shown
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@dataclass(frozen=True, kw_only=True, eq=False, repr=False)
 class Truth:
     """The true states and path of one exposure, from a simulated rig.
 
@@ -32,13 +32,15 @@ class Truth:
     """Output at each fast step of the exposure, slope units, (n_outputs, n_steps); of its own interval, see
     `Exposure`."""
 
+    __repr__ = shapes_shown
+
     @property
     def known(self) -> NDArray[np.bool_]:
         """Which outputs have a known path, (n_outputs,)."""
         return np.asarray(np.isfinite(self.path).all(axis=1))
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@dataclass(frozen=True, kw_only=True, eq=False, repr=False)
 class Picture:
     """The picture of the picture sensor in one exposure."""
 
@@ -46,6 +48,8 @@ class Picture:
     """Counts, (rows, columns)."""
     mask: NDArray[np.bool_]
     """True where the pixel arrived, (rows, columns)."""
+
+    __repr__ = shapes_shown
 
 
 @plain_data

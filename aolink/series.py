@@ -273,7 +273,7 @@ class Series(Sequence[Exposure]):
         return {
             "exposures": f"{len(self)} of {timing.exposure_steps} fast steps ({length}), one every {period}",
             "frames": f"{rows} x {columns} pixels",
-            "rig": f"{self.rig.name}: {self.rig.n_inputs} inputs, {self.rig.n_outputs} outputs",
+            "rig": f"{self.rig.name}: {self.rig.size()}",
             "estimates": ", ".join(self.estimators) or "none",
             "truth": "known" if self.has_truth else "not known",
         }

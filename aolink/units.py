@@ -40,6 +40,11 @@ def with_unit(value: float, unit: str) -> str:
     return f"{value / 10.0**exponent:.4g} {_PREFIXES[exponent]}{unit}"
 
 
+def counted(count: int, noun: str) -> str:
+    """``1 input``, ``2 inputs``."""
+    return f"{count} {noun}" + "s" * (count != 1)
+
+
 def duration(seconds: float) -> str:
     """A length of time: ``12.5 s``, ``3 min 20 s``, ``2 h 5 min``."""
     if seconds < 60:

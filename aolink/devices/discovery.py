@@ -12,6 +12,7 @@ from aolink.devices.gate import printable
 from aolink.devices.identity import identify, new_nonce
 from aolink.devices.interfaces import lacks_of
 from aolink.errors import AolinkError
+from aolink.units import counted
 from aolink.wire import messages_pb2 as pb
 from aolink.wire.hub import Hub
 from aolink.wire.port import SerialPort
@@ -101,7 +102,7 @@ def identify_port(port: str) -> FoundDevice:
         )
     else:
         parked = ", parked by its watchdog" if mirror.latched else ", parked" if mirror.parked else ""
-        geometry = f"{mirror.n_inputs} inputs, queue of {mirror.queue_steps} steps{parked}"
+        geometry = f"{counted(mirror.n_inputs, 'input')}, queue of {mirror.queue_steps} steps{parked}"
     return FoundDevice(
         port=port, kind=pb.Identity.Kind.Name(identity.kind).lower(), model=identity.model,
         serial_number=identity.serial_number, firmware=identity.firmware, protocol_version=identity.protocol_version,

@@ -65,7 +65,7 @@ def open_film(source: str | Path, topic: str | None = None) -> Film:
         read: Callable[..., Film] | None = folder if path.is_dir() else _FORMATS.get(suffix)
         if read is None:
             known = ", ".join(_FORMATS)
-            raise ImportingError(f"{path} is no kind of film that is known: give {known} or a folder of pictures")
+            raise ImportingError(f"{path} is not a film that aolink can read: give {known} or a folder of pictures")
         if is_bag or (path.is_file() and suffix in _WITH_TOPICS):
             film = read(path, topic)
         elif topic is None:

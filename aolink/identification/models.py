@@ -53,7 +53,7 @@ class Process:
 
     def __post_init__(self) -> None:
         if self.kind not in PARAMETERS:
-            raise IdentificationError(f"{self.kind!r} is no kind of process: use one of {', '.join(PARAMETERS)}")
+            raise IdentificationError(f"{self.kind!r} is not a kind of process: use one of {', '.join(PARAMETERS)}")
         if len(self.values) != len(self.names) or not all(0 < value < math.inf for value in self.values):
             raise IdentificationError(f"{self.kind} has {', '.join(self.names)}, each above 0, not {self.values}")
 
@@ -247,6 +247,6 @@ def kinds_of(name: str) -> tuple[str, ...]:
     kinds = tuple(part.strip() for part in name.split("+"))
     if wrong := [kind for kind in kinds if kind not in PARAMETERS]:
         raise IdentificationError(
-            f"{wrong[0]!r} is no kind of process: use one of {', '.join(PARAMETERS)}, or sums of them"
+            f"{wrong[0]!r} is not a kind of process: use one of {', '.join(PARAMETERS)}, or sums of them"
         )
     return kinds

@@ -293,7 +293,10 @@ def exposures(
         apart = f"each at least {timing.exposure_steps} (one exposure) after the one before"
         raise ImportingError(f"start_steps must be {count} fast steps, from 0 on, {apart}")
     end = int(starts[-1]) + rig.timing.exposure_steps
-    held = np.tile(rig.mirror.park, (end, 1)) if inputs is None else np.asarray(inputs, dtype=np.float64)
+    held = np.tile(rig.mirror.park, (end, 1)) if inputs is None else np.asarray(inputs)
+    if held.dtype.kind not in "iuf":
+        raise ImportingError(f"inputs must be numbers, found {held.dtype}")
+    held = held.astype(np.float64, copy=False)
     if held.ndim != 2 or held.shape[1] != rig.n_inputs or len(held) < end:
         raise ImportingError(f"inputs must be ({end} fast steps or more, {rig.n_inputs}), found {held.shape}")
     if not np.isfinite(held).all():

@@ -17,6 +17,7 @@ from aolink.numerics.arrays import FloatArray
 from aolink.recording.reader import Recording
 from aolink.recording.reestimate import check_has_exposures
 from aolink.rig import Rig, parse_rig
+from aolink.units import counted
 
 _MOST_OUTPUTS = 24
 """The most outputs that a model is fitted to; from more outputs, as many are taken at equal distances."""
@@ -128,7 +129,8 @@ def _check_plant(rig: Rig, wanted: Wanted) -> None:
     if wanted.plant and 1 < rig.plant.n_outputs <= _APART:
         raise IdentificationError(
             f"a plant is identified where one input moves one output of a copy of it: this rig's has"
-            f" {rig.plant.n_inputs} inputs and {rig.plant.n_outputs} outputs; leave --fit of a plant out"
+            f" {counted(rig.plant.n_inputs, 'input')} and {counted(rig.plant.n_outputs, 'output')}; leave --fit of a plant"
+            " out"
         )
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from heapq import merge
+from pathlib import Path
 from textwrap import shorten
 from typing import Any, NamedTuple
 
@@ -15,7 +16,7 @@ from google.protobuf.wrappers_pb2 import BytesValue
 from aolink.errors import RecordingError
 from aolink.exporting.common import Progress, no_progress
 from aolink.recording import topics
-from aolink.recording.reader import Recording
+from aolink.recording.reader import Recording, opened
 from aolink.wire import messages_pb2 as wire
 
 _WAITING_BYTES = 64 << 20
@@ -67,10 +68,11 @@ class _Named(NamedTuple):
 
 
 def compare(
-    first: Recording, second: Recording, *, relative: float = 1e-9, absolute: float = 1e-12, only: Sequence[str] = (),
+    first: Recording | str | Path, second: Recording | str | Path, *, relative: float = 1e-9,
+    absolute: float = 1e-12, only: Sequence[str] = (),
     progress: Progress = no_progress,
 ) -> dict[str, TopicComparison]:  # fmt: skip
-    """Compare two recordings by topic.
+    """Compare two recordings, or the files of two, by topic.
 
     Messages are matched by the exposure or command block that they belong to, or else by their number in the topic, not
     by their place in the file. Two numbers are the same if they differ by no more than ``absolute`` plus ``relative``
@@ -80,6 +82,7 @@ def compare(
 
     Raises RecordingError where neither recording has any of the topics.
     """
+    first, second = opened(first), opened(second)
     names = {topic for recording in (first, second) for topic in recording.counts if is_wanted(topic, only)}
     if not names:
         asked = f" of {', '.join(only)}" if only else ""

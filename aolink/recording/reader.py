@@ -15,6 +15,7 @@ from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from google.protobuf.message import DecodeError, Message
 from numpy.typing import NDArray
 
+from aolink.arguments import path as path_of
 from aolink.errors import RecordingError, RigError
 from aolink.estimation import ExposureModel, exposure_model
 from aolink.limits import load_array
@@ -32,6 +33,11 @@ from aolink.wire.runs_pb2 import Run
 
 if TYPE_CHECKING:
     from aolink.restoration import RestoredPictures
+
+
+def opened(recording: Recording | str | Path) -> Recording:
+    """A recording, or the one of a path. Raises AolinkError for anything else."""
+    return recording if isinstance(recording, Recording) else Recording(path_of(recording, "a recording"))
 
 
 class Recording(RecordedMessages, Series):

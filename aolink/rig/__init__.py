@@ -6,7 +6,7 @@ doubtful in `aolink.jobs.check_rig`. Then ``tools/pages`` writes KEYS.md.
 """
 
 from aolink.optics.sensor import Kernel, Sensor, SpotSensor
-from aolink.rig.file import Rig, builtin_rigs, load_rig, parse_rig
+from aolink.rig.file import Rig, builtin_rigs, load_rig, parse_rig, rig_of
 from aolink.rig.parts import (
     Control,
     Drive,
@@ -24,5 +24,5 @@ from aolink.rig.tables import with_faults
 __all__ = [
     "CalibrationTable", "Control", "Drive", "Faults", "Kernel", "Light", "MirrorDriver", "Plant", "Rig", "Sensor",
     "Simulation", "SpotSensor", "Timing", "builtin_rigs", "load_rig", "parse_light",
-    "parse_rig", "with_faults",
+    "parse_rig", "rig_of", "with_faults",
 ]  # fmt: skip

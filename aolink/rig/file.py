@@ -33,6 +33,7 @@ from aolink.rig.rows import output_delays, readout_steps, with_delays
 from aolink.rig.scene_table import named_file, read_scene
 from aolink.rig.sensor_tables import CalibrationTable, read_sensor
 from aolink.rig.tables import read_control, read_drive, read_mirror, read_plant, read_timing, with_disturbance
+from aolink.units import counted
 
 _LONGEST = 16 << 20
 _DEEPEST = 200
@@ -41,7 +42,7 @@ _MOST_KEYS = 20_000
 tables and rows of matrices together, because each takes a while to read."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@dataclass(frozen=True, kw_only=True, eq=False, repr=False)
 class Rig:
     """A whole rig, validated."""
 
@@ -68,6 +69,13 @@ class Rig:
     may not name files, because no user of this machine has chosen it."""
     toml: str
     """The file's text, as read."""
+
+    def __repr__(self) -> str:
+        return f"<Rig {self.name}: {self.size()}>"
+
+    def size(self) -> str:
+        """How many inputs and outputs it has, in words."""
+        return f"{counted(self.n_inputs, 'input')}, {counted(self.n_outputs, 'output')}"
 
     @property
     def digest(self) -> str:
@@ -120,6 +128,11 @@ class Rig:
         return self.plant.axes * self.plant.n_outputs
 
 
+def rig_of(rig: Rig | str | Path) -> Rig:
+    """A rig, or the one of a rig file or a name. Raises `RigError`."""
+    return rig if isinstance(rig, Rig) else load_rig(rig)
+
+
 def load_rig(path_or_name: str | Path) -> Rig:
     """Read and validate a rig file.
 
@@ -133,6 +146,8 @@ def load_rig(path_or_name: str | Path) -> Rig:
     RigError
         The file cannot be read, or its values cannot work; the message names the key.
     """
+    if not isinstance(path_or_name, str | Path):
+        raise RigError(f"give a rig file, or the name of a rig that comes along: found {type(path_or_name).__name__}")
     path = Path(path_or_name)
     if path.suffix != ".toml" and str(path_or_name) in builtin_rigs():
         path = Path(str(resources.files("aolink") / "rigs")) / f"{path_or_name}.toml"

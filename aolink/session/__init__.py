@@ -18,6 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
+from aolink.arguments import names, whole_number
 from aolink.control import check_stable, stability
 from aolink.devices.interfaces import Camera
 from aolink.devices.opening import open_devices
@@ -28,7 +29,7 @@ from aolink.optics.scene import framed
 from aolink.recording import topics
 from aolink.recording.mcap_file import WriteOptions
 from aolink.recording.writer import RecordingWriter
-from aolink.rig import Drive, Rig
+from aolink.rig import Drive, Rig, rig_of
 from aolink.rig.scene_table import read_scene_picture
 from aolink.session.commanding import Inputs
 from aolink.session.controlling import Controlling, facts, served
@@ -86,7 +87,7 @@ def _saved(report: Report, writer: RecordingWriter) -> str:
 
 
 def record(
-    rig: Rig,
+    rig: Rig | str | Path,
     camera_port: str | None,
     mirror_port: str | None,
     path: str | Path,
@@ -115,7 +116,8 @@ def record(
     Parameters
     ----------
     rig:
-        The rig file's description of the devices, which is compared with the identities that they report.
+        The description of the devices, a rig file or the name of one that comes with aolink. It is compared with the
+        identities that the devices report.
     camera_port, mirror_port:
         Anything that pyserial opens: a device path, or an address such as socket://host:port. Where None, the rig
         file's table ``[devices]`` names the device's driver. Where that names no mirror either, the camera alone is
@@ -162,7 +164,8 @@ def record(
         A device, a port, the disk or an estimator failed, by the error's class. The mirror is parked if it can be
         reached, and the recording is closed with the data so far.
     """
-    estimators = served(rig, control, estimators)
+    rig, exposures = rig_of(rig), whole_number(exposures, "exposures")
+    estimators = served(rig, control, names(estimators, "estimators"))
     driver = Driver(rig, estimators)
     controlling, of_control = None, dict[str, str]()
     if control:

@@ -6,16 +6,18 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from aolink.arguments import names as names_of
 from aolink.control import Act, ControlLoop
 from aolink.errors import RecordingError
 from aolink.estimation import Driver, Estimate
 from aolink.exposure import Exposure
 from aolink.recording import topics
-from aolink.recording.reader import Recording
+from aolink.recording.reader import Recording, opened
 from aolink.recording.reestimate import Skipped
 from aolink.wire import messages_pb2 as wire
 
@@ -24,11 +26,12 @@ _NAP_S = 0.1
 
 
 def replay(
-    recording: Recording, names: Sequence[str], *, rate: float = 0.0,
+    recording: Recording | str | Path, names: str | Sequence[str], *, rate: float = 0.0,
     stop: Callable[[], bool] = lambda: False, now_s: Callable[[], float] = time.monotonic,
     sleep: Callable[[float], None] = time.sleep,
 ) -> Iterator[tuple[Exposure, list[Estimate]]]:  # fmt: skip
-    """Run estimators over a recording, exposure by exposure; each skips the exposures that it skipped in the session.
+    """Run estimators over a recording, or its file, exposure by exposure; each skips the exposures that it skipped in
+    the session.
 
     Parameters
     ----------
@@ -37,6 +40,7 @@ def replay(
     now_s, sleep:
         The clock for the pace, in s, and a function that waits for some seconds.
     """
+    recording, names = opened(recording), names_of(names, "names")
     skipped = Skipped(recording, names)
     driver = Driver(recording.rig, names, skipped=skipped.frames)
     step_s = recording.rig.timing.fast_step_s

@@ -8,6 +8,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from aolink.errors import ViewerError
@@ -48,8 +49,10 @@ def fed(server: Server, recording_id: str | None = None) -> Iterator[rr.Recordin
         stream.disconnect()
 
 
-def show(recording: Recording, look: Look | None = None, *, progress: Callable[[int], None] | None = None) -> None:
-    """Open a recording in the native viewer while it is read, and wait until the window is closed.
+def show(
+    recording: Recording | str | Path, look: Look | None = None, *, progress: Callable[[int], None] | None = None
+) -> None:
+    """Open a recording, or its file, in the native viewer while it is read, and wait until the window is closed.
 
     Parameters
     ----------
@@ -63,6 +66,9 @@ def show(recording: Recording, look: Look | None = None, *, progress: Callable[[
     ViewerError
         There is no display, the viewer does not start, or the recording has nothing to show.
     """
+    from aolink.recording.reader import opened
+
+    recording = opened(recording)
     with window() as server:
         _feed(server, recording, look or Look(), progress)
 

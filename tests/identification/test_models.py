@@ -43,7 +43,7 @@ def test_a_walk_takes_steps_of_its_intensity():
     assert space.initial_covariance[0, 0] == 0.5
 
 
-@pytest.mark.parametrize(("wrong", "says"), [("wobble", "no kind of process"), ("resonance+", "no kind of process")])
+@pytest.mark.parametrize(("wrong", "says"), [("wobble", "resonance"), ("resonance+", "resonance")])
 def test_an_unknown_kind_is_refused(wrong, says):
     with pytest.raises(IdentificationError, match=says):
         kinds_of(wrong)

@@ -219,7 +219,7 @@ def test_the_commands_of_a_session_by_hand_work_one_after_the_other(
     with simulated_rig("section-vi") as (camera, mirror):
         listed = aolink("devices", camera, mirror)
         assert f"{camera}: camera section-vi" in listed.stdout
-        assert "1 inputs" in listed.stdout
+        assert "1 input, queue" in listed.stdout
         result = aolink(
             "record", "--camera", camera, "--mirror", mirror, "--rig", "section-vi", "--estimator", "o3", *arguments,
             "--estimator", "o3", "--note", "by hand", "-o", "a.mcap",
