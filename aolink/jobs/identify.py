@@ -128,9 +128,8 @@ def _check_plant(rig: Rig, wanted: Wanted) -> None:
     """Raise IdentificationError for a rig whose plant cannot be identified, before any work."""
     if wanted.plant and 1 < rig.plant.n_outputs <= _APART:
         raise IdentificationError(
-            f"a plant is identified where one input moves one output of a copy of it: this rig's has"
-            f" {counted(rig.plant.n_inputs, 'input')} and {counted(rig.plant.n_outputs, 'output')}; leave --fit of a plant"
-            " out"
+            "a plant is identified where one input moves one output of a copy of it: this rig's has"
+            f" {counted(rig.plant.n_inputs, 'input')} and {counted(rig.plant.n_outputs, 'output')}; leave out --fit"
         )
 
 
