@@ -1,7 +1,8 @@
-"""The job of `aolink look`: what moves in a film of spots, without a rig file.
+"""The job of `aolink look`: what moves in a film, without a rig file.
 
-The spots are found and cut out, their kernel is taken from the frames (`aolink.jobs.look_spots`), a model of the
-motion is identified along x and along y, and the path inside each exposure is estimated with it.
+Spots on a dark ground are cut out and measured as the estimators measure them; anything else is measured by its texture
+(`aolink.jobs.look_texture`). Both give the mean and the covariance of the path in each exposure, and one likelihood
+finds the vibrations in these (`aolink.identification.vibration`).
 """
 
 from __future__ import annotations
@@ -9,160 +10,140 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from itertools import islice
 
 import numpy as np
 
 from aolink.errors import IdentificationError, ImportingError
-from aolink.estimation import run
-from aolink.estimation.score import Score
-from aolink.estimation.verdict import ADVICE, Fit, Verdict
 from aolink.films.film import Film
-from aolink.identification import FEWEST, Identified, Maximum, Piece, Readings, kinds_of, maxima, readings
-from aolink.identification.likelihood import Likelihood
-from aolink.identification.models import ProcessSum
-from aolink.importing.frames import FilmSettings, film_times, nonlinear_note
-from aolink.jobs.identify import IdentifiedModel, Wanted, from_readings, space_wanted
-from aolink.jobs.look_scene import LEAST_MOTION, Scene
+from aolink.identification import FEWEST, Readings, kinds_of, maxima, readings, space_of
+from aolink.identification.models import Process, ProcessSum
+from aolink.identification.vibration import MOST_LINES, SLOWEST, Found, Line, PathMoments, find
 from aolink.jobs.look_spots import Spots, find_spots
-from aolink.numerics.arrays import FloatArray
-from aolink.rig import Rig, parse_rig
+from aolink.importing.frames import FilmLight, FilmSettings, film_times, nonlinear_note
+from aolink.jobs.look_texture import MARGIN, Region, lively, moments_of
+from aolink.jobs.look_scene import LEAST_MOTION, Scene
+from aolink.numerics.arrays import BoolArray, FloatArray
 
-FRAMES = 300
+FRAMES = 500
 """Frames that are looked at, from the first on."""
-_SEARCHED = 96
-"""Exposures that a model is searched with."""
-_SINGLE = ("random-walk", "ornstein-uhlenbeck", "resonance")
-_SUMS = ("ornstein-uhlenbeck+resonance", "random-walk+resonance", "resonance+resonance")
-"""Models that are tried for the first answer, and those that are tried after it."""
-_CERTAIN = 2.0
-"""Motion that chance does not show, in `Direction.sure`: its square is then four standard deviations away."""
-LEAST_BLUR = 1 / 3
-"""Blur, in standard deviations of the kernel, from which on it shows the motion inside an exposure."""
-_SHARPEST = 0.05
-"""Share of the frames that are the sharpest."""
-_NOTHING = 1e6
-"""Variance of readings that say nothing."""
-_SETTLED = 8
-"""Exposures after which an estimator has found the path."""
-_SLOWEST = 50
-"""Frames in a cycle of the slowest vibration that is told from a drift, at most."""
-_CHANCE = 1e-3
-"""Chance of a line in what a model leaves of the places, below which it is taken for one."""
-_MUCH_WIDER = 1.5
-"""Widening of the intervals from which on the verdict that a model does not fit is a doubt."""
-_REFUSED = 0.1
-"""Share of gated exposures from which on a rig file is of no use."""
-_ADVICE = {
-    "pixels": "the kernel, the light or the noise: give the kernel's width with --kernel",
-    "motion": "a vibration that is missing, or the exposure time",
-    "zero": "a drift of where it rests",
-    "": "the kernel, a vibration that is missing, or the exposure time",
-}
-"""What to do about a verdict, by the kind of its evidence."""
 ESTIMATOR = "profile"
-"""The estimator of the paths: `moments` refuses spots that swing fast along a slanted line."""
-DIRECTIONS = ("x", "y")
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Direction:
-    """What is known of the motion along one direction."""
-
-    name: str
-    moved: float
-    """Standard deviation of the spots' mean places in the frames, pixels."""
-    blur: float
-    """Root mean square of the path about its mean in a frame, pixels."""
-    blurred: bool
-    """Whether the blur is large enough against the kernel to be told from it."""
-    least_blur: float
-    """Blur of the sharpest frames, pixels."""
-    sure: float
-    """Root of the standard deviation of the square of ``moved`` by noise alone, pixels."""
-    found: IdentifiedModel | None = None
-    """The model of the motion; None where nothing moves."""
-    known: float = math.nan
-    """Standard deviation of the error of the path inside an exposure, by the pixels, pixels rms."""
-    held: float = math.nan
-    """The same of the centroid, taken for the whole exposure."""
-    path: FloatArray | None = None
-    """The path in each exposure, pixels of the window, (frames, n, steps)."""
-    misfit: str = ""
-    """The estimator's verdict on the model in words; empty unless it does not fit, and by much."""
-    left_hz: float | None = None
-    """Frequency, below half the frame rate, of a line in what the model leaves of the places; None without one."""
-
-    @property
-    def size(self) -> float:
-        """Standard deviation of the path, pixels."""
-        return math.hypot(self.moved, self.blur if self.blurred else 0.0)
-
-    @property
-    def unexplained(self) -> bool:
-        """Whether the model leaves something of the motion."""
-        return bool(self.misfit) or self.left_hz is not None
-
-    @property
-    def moves(self) -> bool:
-        """Whether it moves at all."""
-        return self.moved > self.least or self.blurred
-
-    @property
-    def least(self) -> float:
-        """Motion of the mean places that noise alone could be, pixels rms."""
-        return max(LEAST_MOTION, _CERTAIN * self.sure)
+"""The estimator of the paths of spots."""
+_CERTAIN = 2.0
+"""Motion that chance does not show, in standard deviations."""
+_KERNEL_KNOWN = 0.25
+"""Standard deviation of what is not known of a kernel's variance, as a share of it."""
+_ROUND = 0.3
+"""Smaller half axis of a motion, over the kernel, from which on it makes that look wider."""
+_UNEXPLAINED = 0.3
+"""Share of a vibration's motion that may be left of the means where its path is believed."""
+_MISFIT = 4.0
+"""Mean square of what is left of the blur's covariances, over their noise, from which on the path is not believed."""
+_SATURATED = 0.5
+"""Share of the frames with saturated pixels in a spot from which on there is no answer."""
+_COMPARABLE = 0.2
+"""Size of the last of the most lines that are looked for, over that of the first, from which on more are to be there."""
+_REGIONS = 3
+"""Parts of a picture of anything that are looked at."""
+_HARMONICS = 6
+_SAME = 2.0
+"""Frequencies nearer than so many inverses of the film's length are the same."""
+_WANDERS = ("random-walk", "ornstein-uhlenbeck")
+GRADES = ("believe it", "believe the frequency, not the path", "no answer")
+Tell = Callable[[str, int, int], None]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Looked:
     """What a film shows."""
 
-    spots: Spots
     rate_hz: float
     exposure_s: float
+    frames: int
+    seen: PathMoments
+    """Of the spots, or of the region."""
+    found: Found
+    moved: float
+    """Standard deviation of the places from frame to frame, in all directions, pixels."""
+    blur: float
+    """Root mean square of the path about its mean in a frame, pixels, as far as it changes or is explained."""
+    grade: int
+    """Index of `GRADES`."""
+    because: str
+    """Why it is not the first grade; empty where it is."""
+    plain_hz: float
+    """What a plain spectrum of the places says."""
     sd: float
-    """Standard deviation of the kernel, pixels."""
+    """Standard deviation of the kernel of spots, pixels; NaN for a region."""
+    spots: Spots | None
+    scene: Scene | None
     together: bool
     """Whether several spots have one motion in common."""
-    directions: tuple[Direction, ...]
     text: str
-    """The rig file."""
-    cut: Film
-    """The spots' windows as a film for that rig file."""
-    settings: FilmSettings
-    """The settings to import it with."""
+    """The rig file of spots; empty for a region."""
+    regions: tuple[Region, ...]
+    picture: FloatArray
+    """Mean of the frames, (rows, columns)."""
+    cut: FloatArray
+    """The pixels of the spot or region in each frame, (frames, rows, columns)."""
+    camera: bool
+    """Whether all of the picture moves alike: the camera."""
     assumed: tuple[str, ...]
     """What was assumed, and what follows where it is wrong."""
-    unknown: str
-    """Why it cannot be told what happens inside an exposure, and what would help; empty where it can."""
     doubts: tuple[str, ...]
-    """Reasons to mistrust the answer, and what would help."""
+    """What else to know."""
 
     @property
-    def caveats(self) -> tuple[str, ...]:
-        """What cannot be told, and all doubts."""
-        return ((self.unknown,) if self.unknown else ()) + self.doubts
+    def lines(self) -> tuple[Line, ...]:
+        """The vibrations, without harmonics of the first."""
+        return tuple(line for line, n in zip(self.found.lines, self.harmonics, strict=True) if n == 1)
 
     @property
-    def blurred(self) -> bool:
-        """Whether the blur shows the motion inside an exposure."""
-        return any(each.blurred for each in self.directions)
+    def harmonics(self) -> tuple[int, ...]:
+        """Of each line, which harmonic of the first one it is (or an alias of that); 1 where it is none."""
+        numbers = [1] * len(self.found.lines)
+        for k, each in enumerate(self.found.lines[1:], 1):
+            for n in range(2, _HARMONICS + 1):
+                off = abs(each.hz - n * self.found.lines[0].hz)
+                alias = [abs(s * each.hz - n * self.found.lines[0].hz) for s in (1, -1)]
+                off = min(abs(a - self.rate_hz * round(a / self.rate_hz)) for a in alias)
+                if off < _SAME * (n + 1) / self.seen.span_s:
+                    numbers[k] = n
+                    break
+        return tuple(numbers)
+
+    def path(self, times_s: FloatArray) -> FloatArray:
+        """The path by the vibrations, about its drift, x and y, pixels, at times since the film's begin, (..., 2)."""
+        middle = float(self.seen.times_s.mean())
+        t = times_s - middle
+        out = np.zeros((*times_s.shape, 2))
+        for line in self.found.lines:
+            a = line.at((t / (self.seen.span_s / 2)).ravel()).reshape(*times_s.shape, 2)
+            out += (a * np.exp(2j * np.pi * line.hz * t)[..., None]).real
+        return out
+
+    @property
+    def places(self) -> FloatArray:
+        """The mean place of the first spot or region in each exposure, x and y, pixels, (K, 2); NaN where unknown."""
+        known = np.isfinite(self.seen.mean_variance[:, 0])
+        return np.asarray(np.where(known, self.seen.mean[:, 0], np.nan) @ self.seen.axes[0])
+
+    @property
+    def rest(self) -> float:
+        """Standard deviation of what the vibrations leave of the places, in all directions, pixels."""
+        return math.sqrt(max(float((self.found.residual**2).sum(axis=2).mean()) - _noise(self.seen), 0.0))
 
     @property
     def moves(self) -> bool:
         """Whether anything moves."""
-        return any(each.moves for each in self.directions)
-
-
-Tell = Callable[[str, int, int], None]
+        return bool(self.found.lines) or self.moved > 0
 
 
 def look(
     film: Film, settings: FilmSettings, name: str, *, kernel: float | None = None, frames: int = FRAMES,
-    thorough: bool = False, before: Looked | None = None, tell: Tell = lambda what, done, of: None,
+    at: tuple[float, float] | None = None, size: int = 40, tell: Tell = lambda what, done, of: None,
 ) -> Looked:  # fmt: skip
-    """Find out what moves in a film of up to four spots, and how.
+    """Find out what moves in a film, and how.
 
     Parameters
     ----------
@@ -172,20 +153,18 @@ def look(
         Standard deviation of a resting spot, pixels, where it is known.
     frames:
         Number of frames that are looked at, from the first on.
-    thorough:
-        Whether sums of processes are tried for blurred frames as well, where ``before`` leaves something unexplained.
-    before:
-        What an earlier look at the film has found: its spots, and the motion that it explains, are taken from it.
+    at:
+        Middle (x, y) of the region to look at, instead of what moves most; ``size`` is its side, pixels.
     tell:
         Called with the present task, how much of it is done, and how much there is.
 
     Raises
     ------
     ImportingError
-        Rate or exposure time are not known, there is no spot, or there are too few frames.
+        Rate or exposure time are not known, nothing can be measured, or there are too few frames.
     """
     if film.slopes:
-        raise ImportingError(f"{film.name} has slopes and no pictures: there is no spot to look at")
+        raise ImportingError(f"{film.name} has slopes and no pictures: there is nothing to look at")
     times = film_times(film, settings)
     rate, exposure_s = times.rate_hz, settings.exposure_s or film.exposure_s
     if missing := [f"--{what}" for what, value in (("rate HZ", rate), ("exposure S", exposure_s)) if value is None]:
@@ -198,74 +177,222 @@ def look(
     assert exposure_s is not None
     if not 0 < exposure_s * rate <= 1.01:
         raise ImportingError(f"frames of {exposure_s:g} s do not fit into {1 / rate:g} s from one to the next")
-    if film.count < FEWEST:
+    count = min(frames, film.count)
+    if count < FEWEST:
         raise ImportingError(f"{film.name} has {film.count} frame(s): {FEWEST} are needed to tell what moves")
-    if before is not None:
-        spots = before.spots
-    else:
-        spots = find_spots(film, settings, frames, lambda done: tell("read", done, 2 * min(frames, film.count)))
+    starts = np.arange(count) / rate
+    if film.times_ns is not None:
+        starts = (film.times_ns[:count] - film.times_ns[0]) / 1e9
+    common = {"rate_hz": rate, "exposure_s": exposure_s, "frames": count}
+    if at is None and (spots := _spots(film, settings, count, tell)) is not None:
+        return _of_spots(film, settings, name, spots, kernel, starts + exposure_s / 2, common, tell)
+    return _of_regions(film, settings, starts + exposure_s / 2, common, at, size, tell)
+
+
+def _spots(film: Film, settings: FilmSettings, count: int, tell: Tell) -> Spots | None:
+    """The spots of a film; None where it shows something else."""
+    try:
+        spots = find_spots(film, settings, count, lambda done: tell("read", done, 2 * count))
+    except ImportingError:
+        return None
+    return spots if spots.alone else None
+
+
+def _of_spots(
+    film: Film, settings: FilmSettings, name: str, spots: Spots, kernel: float | None, times_s: FloatArray,
+    common: dict[str, float], tell: Tell,
+) -> Looked:  # fmt: skip
+    rate, exposure_s = common["rate_hz"], common["exposure_s"]
     sd = spots.sd if kernel is None else kernel
-    if not math.isfinite(sd):
-        raise ImportingError(
-            f"{film.name}: the frames are too dim to tell how wide a spot at rest is: give its standard deviation with"
-            " --kernel PIXELS, or take brighter frames"
-        )
-    scene = Scene(film, spots, times, rate, exposure_s, name)
-    everything = range(len(spots.corners))
+    scene = Scene(film, spots, film_times(film, settings), rate, exposure_s, name)
+    n = len(spots.corners)
+    seen = [[readings(*scene.along(d, k, sd)) for d in (0, 1)] for k in range(n)]
+    moments = _path_moments(seen, scene.unit, times_s, exposure_s, rate, 0.0 if kernel else sd)
+    together = n > 1 and _one_motion(list(zip(*seen, strict=True)))
+    each = moments.together() if together else moments.part([0])
+    found = find(each, tell=lambda done, of: tell("frequencies", done, of))
+    if kernel is None and found.lines and found.lines[0].ellipse[1] > _ROUND * sd:
+        # What swings across the motion was taken for the kernel.
+        sd = math.sqrt(max(sd**2 + float(found.constant[:, [0, 2]].mean()), 0.25 * sd**2))
+    moved, sure = _moved(each)
+    blurs = np.nan_to_num(np.median(each.spread[:, 0, [0, 2]], axis=0)) - found.constant[0, [0, 2]]
+    spread = math.sqrt(max(float(blurs.sum()), 0.0))
+    walks = () if found.lines else tuple(_wandering([one[d] for one in seen], scene) for d in (0, 1))
+    text = scene.text(sd, _models(found, scene, each) if found.lines else walks, together=together)
+    doubts = list(_doubts(spots))
+    if not together and n > 1:
+        doubts.append("the spots move on their own: the first, brightest one is described")
+    looked = Looked(
+        **common, seen=each, found=found, moved=moved if moved > max(LEAST_MOTION, _CERTAIN * sure) else 0.0,
+        blur=spread, grade=0, because="", plain_hz=_plain(each, found), sd=sd, spots=spots, scene=scene,
+        together=together, text=text, regions=(), picture=spots.mean, cut=spots.light[:, 0], camera=False,
+        assumed=tuple(_assumed(film, settings, common, spots, kernel, sd)), doubts=tuple(doubts),
+    )  # type: ignore[arg-type] # fmt: skip
+    return _graded(looked)
 
-    seen = [[readings(*scene.along(d, k, sd)) for k in everything] for d in (0, 1)]
-    directions = [_direction(DIRECTIONS[d], each, scene.unit, sd) for d, each in enumerate(seen)]
-    together = len(everything) > 1 and _one_motion(seen)
-    which = [0] if together else everything
-    for d, each in enumerate(directions):
-        first = None if before is None else before.directions[d]
-        if first is not None and not first.unexplained:
-            directions[d] = first  # a sum of processes would explain what is explained
-        elif each.moves:
-            names = (*_SINGLE, *_SUMS) if thorough or not each.blurred else _SINGLE  # sharp frames take no time
-            directions[d] = _identified(scene, d, each, which, sd, names, partial(_say, tell, each.name))
-    for d, each in enumerate(directions):
-        if (band := _common_band(each, directions[1 - d])) is not None:
-            directions[d] = _identified(scene, d, each, which, sd, ("resonance",), partial(_say, tell, each.name), band)
-    unknown = ""
-    if not any(each.blurred for each in directions):
-        unknown = (
-            f"cannot tell what happens inside an exposure: the blur, {max(each.blur for each in directions):.2g} pixels"
-            f" rms, is below a third of the kernel, {sd:.2g} pixels: expose longer"
-        )
-    models = [each.found.model if each.found else None for each in directions]
-    doubts = tuple(_doubts(film, spots, directions, sd, given=kernel is not None, thorough=thorough))
-    return Looked(
-        spots=spots, rate_hz=rate, exposure_s=exposure_s, sd=sd, together=together, directions=tuple(directions),
-        text=scene.text(sd, models, together=together), cut=scene.cut(sd), settings=scene.settings,
-        assumed=tuple(_assumed(film, settings, scene, kernel)), unknown=unknown, doubts=doubts,
+
+def _of_regions(
+    film: Film, settings: FilmSettings, times_s: FloatArray, common: dict[str, float],
+    at: tuple[float, float] | None, size: int, tell: Tell,
+) -> Looked:  # fmt: skip
+    """What moves in up to four regions of a picture of anything."""
+    count = int(common["frames"])
+    light = FilmLight(film, settings)
+    rows, columns = film.shape
+    least = 2 * MARGIN + 8
+    size = min(size, rows - 2 * MARGIN, columns - 2 * MARGIN)
+    if size < least:
+        raise ImportingError(f"{film.name} has {columns} x {rows} pixels: that is too small to look at a part of it")
+    if at is None:
+        regions, picture = lively(_shown(film, light, count, tell), size, _REGIONS)
+        if not regions:
+            raise ImportingError(f"{film.name} shows nothing that moves: all frames are the same picture")
+    else:
+        x, y = (round(value - size / 2) for value in at)
+        if not (MARGIN <= x <= columns - size - MARGIN and MARGIN <= y <= rows - size - MARGIN):
+            raise ImportingError(
+                f"--at {at[0]:g},{at[1]:g} with --size {size} goes over the picture's edge, which has {columns} x"
+                f" {rows} pixels: choose a place at least {size // 2 + MARGIN} pixels from it"
+            )
+        regions, picture = [Region(x, y, size, size)], np.zeros(film.shape)
+    cuts = [np.empty((count, size + 2 * MARGIN, size + 2 * MARGIN)) for _ in regions]
+    for k, shown in enumerate(_shown(film, light, count, tell, 1)):
+        for region, cut in zip(regions, cuts, strict=True):
+            cut[k] = region.cut(shown, MARGIN)
+        if at is not None:
+            picture = picture + shown / count
+    results = []
+    for number, cut in enumerate(cuts):
+        tell("regions", number, len(cuts))
+        seen, _ = moments_of(cut, times_s, common["exposure_s"], common["rate_hz"])
+        results.append((seen, find(seen, most=2)))
+    results = [(seen, found) for seen, found in results]
+    best = max(range(len(results)), key=lambda k: _strength(*results[k]))
+    seen, found = results[best]
+    camera = len(results) >= 3 and all(_alike(found, other) for _, other in results)
+    doubts = []
+    if camera:
+        doubts.append("all of the picture moves alike: it is the camera that moves")
+    elif others := sorted({f"{f.lines[0].hz:.4g}" for k, (_, f) in enumerate(results) if k != best and f.lines and not _alike(found, f)}):
+        doubts.append(f"another part of the picture vibrates at {' and at '.join(others)} Hz: choose one with --at X,Y")
+    moved, sure = _moved(seen)
+    chosen = regions[best]
+    looked = Looked(
+        **common, seen=seen, found=found, moved=moved if moved > max(LEAST_MOTION, _CERTAIN * sure) else 0.0,
+        blur=0.0, grade=0, because="", plain_hz=_plain(seen, found), sd=math.nan, spots=None, scene=None,
+        together=False, text="", regions=(chosen, *(r for r in regions if r is not chosen)), picture=picture,
+        cut=cuts[best], camera=camera, assumed=tuple(_assumed(film, settings, common, None, None, math.nan)),
+        doubts=tuple(doubts),
+    )  # type: ignore[arg-type] # fmt: skip
+    return _graded(looked)
+
+
+def _shown(film: Film, light: FilmLight, count: int, tell: Tell, turn: int = 0) -> Iterator[FloatArray]:
+    for k, frame in enumerate(islice(film.frames(), count)):
+        tell("read", turn * count + k, 2 * count)
+        yield light.of(frame)[0]
+
+
+def _strength(seen: PathMoments, found: Found) -> float:
+    """How much of a vibration a region shows, in its noise."""
+    if not found.lines:
+        return 0.0
+    noise = float(np.sqrt(np.nanmedian(np.where(np.isfinite(seen.mean_variance), seen.mean_variance, np.nan))))
+    return found.lines[0].ellipse[0] / max(noise, 1e-12)
+
+
+def _alike(one: Found, other: Found) -> bool:
+    """Whether two regions have one motion."""
+    if not (one.lines and other.lines):
+        return False
+    a, b = one.lines[0], other.lines[0]
+    near = abs(a.hz - b.hz) < 0.01 * a.hz
+    return near and float(np.abs(a.amplitude - b.amplitude).max()) < 0.3 * float(np.abs(a.amplitude).max())
+
+
+def _path_moments(
+    seen: Sequence[Sequence[Readings]], unit: float, times_s: FloatArray, exposure_s: float, rate: float, sd: float
+) -> PathMoments:
+    """Moments of the paths of spots from their readings along x and along y, pixels."""
+    K, R = len(times_s), len(seen)
+    mean, mean_variance = np.zeros((K, R, 2)), np.full((K, R, 2), np.inf)
+    spread, spread_variance = np.zeros((K, R, 3)), np.full((K, R, 3), np.inf)
+    for r, both in enumerate(seen):
+        for d, one in enumerate(both):
+            slots = np.rint((times_s - times_s[0]) * rate).astype(int)
+            slots = np.minimum(slots, one.slots - 1)
+            good = one.usable[0, slots]
+            noise = one.mean_noise[0, slots]
+            mean[:, r, d] = unit * (one.mean + one.centre)[0, slots]
+            mean_variance[good, r, d] = unit**2 * noise[good]
+            # The square about c of the mean has the noise of the mean in it.
+            spread[:, r, 2 * d] = unit**2 * (one.square[0, slots] - one.mean[0, slots] ** 2 + noise)
+            variance = one.square_noise[0, slots] + 4 * one.mean[0, slots] ** 2 * noise
+            spread_variance[good, r, 2 * d] = unit**4 * variance[good]
+    constant = np.full((R, 3), _KERNEL_KNOWN * sd**2 if sd else LEAST_MOTION)
+    return PathMoments(
+        times_s=times_s, exposure_s=exposure_s, rate_hz=rate, mean=mean, mean_variance=mean_variance, spread=spread,
+        spread_variance=spread_variance, constant_sd=constant, axes=np.tile(np.eye(2), (R, 1, 1)),
     )  # fmt: skip
 
 
-def _say(tell: Tell, direction: str, what: str, done: int, of: int) -> None:
-    tell(f"{what.split(',')[0]} along {direction}", done, of)
+def _moved(seen: PathMoments) -> tuple[float, float]:
+    """Standard deviation of the places beyond that of noise, in all directions, and that which noise alone may show."""
+    known = np.isfinite(seen.mean_variance[:, 0])
+    variance = square = 0.0
+    for d in range(2):
+        good = known[:, d]
+        if good.sum() > 2:
+            noise = seen.mean_variance[good, 0, d]
+            variance += float(seen.mean[good, 0, d].var() - noise.mean())
+            square += float(noise.mean()) * math.sqrt(2 / good.sum())
+    return math.sqrt(max(variance, 0.0)), math.sqrt(square)
 
 
-def _direction(name: str, seen: Sequence[Readings], unit: float, sd: float) -> Direction:
-    """How far the spots move from frame to frame and within one."""
-    usable = [each for each in seen if each.usable.any()]
-    if not usable:
-        return Direction(name=name, moved=0.0, blur=0.0, blurred=False, least_blur=0.0, sure=0.0)
+def _plain(seen: PathMoments, found: Found) -> float:
+    """The frequency of the largest value of a plain spectrum of the places, Hz."""
+    if not found.lines:
+        return math.nan
+    hz = found.lines[0].hz
+    return abs(hz - seen.rate_hz * round(hz / seen.rate_hz))
 
-    def mean(of: Callable[[Readings], FloatArray]) -> float:
-        return float(np.mean([of(each)[each.usable].mean() for each in usable]))
 
-    noise = mean(lambda each: each.mean_noise)
-    moved = float(np.mean([(each.mean + each.centre)[each.usable].var() for each in usable])) - noise
-    # The square about c of the mean has the noise of the mean in it.
-    blur = unit * math.sqrt(max(mean(lambda each: each.square - each.mean**2 + each.mean_noise), 0.0))
-    count = sum(int(each.usable.sum()) for each in usable)
-    within = np.concatenate([(each.square - each.mean**2 + each.mean_noise)[each.usable] for each in usable])
-    return Direction(
-        name=name, moved=unit * math.sqrt(max(moved, 0.0)), blur=blur, blurred=blur >= LEAST_BLUR * sd,
-        least_blur=unit * math.sqrt(max(float(np.quantile(within, _SHARPEST)), 0.0)),
-        sure=unit * math.sqrt(noise * math.sqrt(2 / count)),
-    )  # fmt: skip
+def _models(found: Found, scene: Scene, seen: PathMoments) -> list[ProcessSum | None]:
+    """The processes along x and y that estimate the path: a vibration that keeps its phase for a part of the film, with
+    a damping of its own, and a drift."""
+    models: list[ProcessSum | None] = []
+    rest = np.nanmedian(np.where(np.isfinite(seen.mean_variance), seen.mean_variance, np.nan))
+    left = float(found.residual.var() - rest)
+    drift = found.drift[:, 0] - found.drift[:, 0].mean(axis=0)
+    for d in range(2):
+        parts = []
+        for line in found.lines:
+            sd = abs(line.amplitude[d]) / math.sqrt(2)
+            if sd > LEAST_MOTION:
+                cycles = max(2 * math.pi * line.hz * seen.span_s / 4, 4.0)
+                parts.append(Process("resonance", (line.hz, 1 / cycles, sd / scene.unit)))
+        slow = math.sqrt(max(float(drift[:, d].var()) - rest, left, 0.0))
+        if slow > LEAST_MOTION:
+            parts.append(Process("ornstein-uhlenbeck", (seen.span_s / 10, slow / scene.unit)))
+        models.append(ProcessSum(tuple(parts)) if parts else None)
+    return models
+
+
+def _wandering(seen: Sequence[Readings], scene: Scene) -> ProcessSum | None:
+    """The walk or the wandering that explains readings along a direction best."""
+    best: tuple[float, ProcessSum | None] = (-math.inf, None)
+    moved = float(np.mean([(one.mean + one.centre)[one.usable].var() - one.mean_noise[one.usable].mean() for one in seen]))
+    if scene.unit * math.sqrt(max(moved, 0.0)) <= LEAST_MOTION:
+        return None
+    for name in _WANDERS:
+        space = space_of(kinds_of(name), seen, lowest_hz=scene.rate_hz / SLOWEST, highest_hz=None, plant=None)
+        try:
+            top = maxima(space, seen)[0]
+        except IdentificationError:
+            continue
+        value = top.log_likelihood - len(space.names) * math.log(len(seen[0].mean[0])) / 2
+        best = max(best, (value, space.model(top.x)), key=lambda each: each[0])
+    return best[1]
 
 
 def _one_motion(seen: Sequence[Sequence[Readings]]) -> bool:
@@ -273,7 +400,7 @@ def _one_motion(seen: Sequence[Sequence[Readings]]) -> bool:
     with the Bayesian information criterion."""
     gain = 0.0
     for spots in seen:
-        usable = np.all([each.usable[0] for each in spots], axis=0)
+        usable: BoolArray = np.all([each.usable[0] for each in spots], axis=0)
         shown = np.array([(each.mean + each.centre)[0, usable] for each in spots])
         n, count = shown.shape
         if count < FEWEST:
@@ -287,187 +414,63 @@ def _one_motion(seen: Sequence[Sequence[Readings]]) -> bool:
     return gain > 0
 
 
-def _identified(
-    scene: Scene, d: int, direction: Direction, which: Sequence[int], sd: float, names: Sequence[str],
-    tell: Tell, band: tuple[float, float] | None = None,
-) -> Direction:  # fmt: skip
-    """The direction with the model of its motion and the errors of its path; with a band, it is one vibration in it."""
-    films = [scene.along(d, k, sd)[1] for k in which]
-    rig, some = parse_rig(scene.line_text(sd)), films[0][:_SEARCHED]
-    wanted, seen = Wanted(lowest_hz=scene.rate_hz / _SLOWEST), [readings(rig, each[:_SEARCHED]) for each in films]
-    if not direction.blurred:
-        # Sharp frames show places, and of the width only how well the kernel is known.
-        wanted = replace(wanted, highest_hz=scene.rate_hz / 2, pixels=False)
-        seen = [replace(each, square_noise=np.full_like(each.square_noise, _NOTHING)) for each in seen]
-    if band is not None:
-        wanted = replace(wanted, lowest_hz=band[0], highest_hz=band[1])
-    name, tops = _best_model(rig, seen, names, wanted, tell)
-    found = from_readings(rig, seen, some, replace(wanted, models=(name,)), tell, tops).found[0]
-    if not direction.blurred and band is None:
-        found = _with_aliases(found, scene, LEAST_BLUR * sd)
-    rig = parse_rig(scene.line_text(sd, found.model))
-    each_film = [run(rig, each, [ESTIMATOR])[ESTIMATOR] for each in films]
-    path = np.array([[one.path[0] for one in each] for each in each_film]).swapaxes(0, 1)
-    settled = [one for each in each_film for one in each[_SETTLED:]]
-    error = float(np.mean(np.square([each.path_sd for each in settled])))
-    within = float(np.mean((path[_SETTLED:] - path[_SETTLED:].mean(axis=2, keepdims=True)) ** 2))
-    verdicts = [each[-1].verdict for each in each_film]
-    misfits = [
-        _for_films(each)
-        for each in verdicts
-        if each is not None and each.fit is Fit.DOES_NOT_FIT and each.widening > _MUCH_WIDER
-        if direction.blurred or each.kind != "pixels"  # what sharp frames tell needs no kernel
-    ]
-    return replace(
-        direction,
-        found=found,
-        known=scene.unit * math.sqrt(error),
-        held=scene.unit * math.sqrt(within + error),
-        path=scene.unit * (path + 1) - 0.5,
-        misfit=misfits[0] if misfits else "",
-        left_hz=line_left([readings(rig, each) for each in films], found.model, scene.rate_hz),
-    )
+def _graded(looked: Looked) -> Looked:
+    """What was found with its grade, and why it is no better."""
+    found, spots = looked.found, looked.spots
+    if spots is not None and spots.saturated_frames > _SATURATED:
+        return replace(looked, grade=2, because="the spot is saturated in most frames: expose less")
+    if not found.lines:
+        multiple = f"it is still, or vibrates at a multiple of {looked.rate_hz:.4g} Hz"
+        whole = 1 / looked.exposure_s
+        if abs(whole / looked.rate_hz - 1) > 0.02:
+            multiple += f" or of {whole:.4g} Hz, whole swings in an exposure"
+        wanders = f"it wanders by {looked.moved:.2g} pixels rms, and no frequency stands out of that"
+        return replace(looked, grade=2, because=wanders if looked.moved else f"all frames have one shape: {multiple}")
+    line, parts = found.lines[0], found.sets[0]
+    if len(looked.lines) == MOST_LINES and looked.lines[-1].ellipse[0] > _COMPARABLE * line.ellipse[0]:
+        return replace(looked, grade=2, because="the motion is more than three vibrations")
+    left = looked.rest
+    shown = line.ellipse[0] / math.sqrt(2) * abs(float(np.sinc(line.hz * looked.exposure_s)))
+    why = []
+    if len(parts) > 1:
+        why.append("the blur is too small to tell it from its aliases" if len(parts) > 3 else "these frames cannot tell it from its aliases")
+    if left > _UNEXPLAINED * max(shown, LEAST_MOTION) and left > LEAST_MOTION:
+        why.append(f"the places move by {left:.2g} pixels rms that no vibration explains")
+    if found.spread_misfit > _MISFIT:
+        why.append("the blur is not all explained")
+    if any(abs(each.growth) > 0.9 for each in found.lines):
+        why.append("it grows or dies within the film")
+    return replace(looked, grade=1 if why else 0, because="; ".join(why))
 
 
-def _common_band(one: Direction, other: Direction) -> tuple[float, float] | None:
-    """The band of the frequency of the vibration along the other direction, which is certain, where one of the aliases
-    along this one is in it: then a single vibration aslant explains both. None where there is no such thing."""
-    if one.found is None or other.found is None or {one.found.model.name, other.found.model.name} != {"resonance"}:
-        return None
-    (hz,), (certain,) = (
-        [each for each in found.parameters if each.name == "frequency_hz"] for found in (one.found, other.found)
-    )
-    if len(hz.pieces) < 2 or len(certain.pieces) != 1:
-        return None
-    (piece,) = certain.pieces
-    own = [each for each in hz.pieces if each.low <= piece.high and each.high >= piece.low]
-    return (min(own[0].low, piece.low), max(own[0].high, piece.high)) if own else None
+def _noise(seen: PathMoments) -> float:
+    """Mean variance of a place by the pixels' noise, in all known directions, pixels squared."""
+    variance = np.where(np.isfinite(seen.mean_variance), seen.mean_variance, 0.0)
+    return float(variance.sum(axis=2).mean())
 
 
-def _for_films(verdict: Verdict) -> str:
-    """A verdict with advice that somebody with a film can follow."""
-    return verdict.text.replace(ADVICE[verdict.kind], _ADVICE[verdict.kind])
-
-
-def heeding(looked: Looked, score: Score) -> Looked:
-    """What a film shows, with the doubts of the score of all its windows by the rig file that was written."""
-    doubts = []
-    if score.gated > _REFUSED * score.estimated:
-        doubts.append(
-            f"{score.gated} of {score.estimated} frames do not fit the rig file that is written, and its estimates are"
-            " not to be used: try --kernel, with the width of a spot at rest"
-        )
-    elif score.verdict is not None and score.verdict.fit is Fit.DOES_NOT_FIT and score.verdict.widening > _MUCH_WIDER:
-        doubts.append(f"in the recording {_for_films(score.verdict)}")
-    return replace(looked, doubts=(*looked.doubts, *doubts))
-
-
-def line_left(seen: Sequence[Readings], model: ProcessSum, rate_hz: float) -> float | None:
-    """The frequency of a line in the innovations of the places, where chance does not explain it: Fisher's test (1929)
-    of the largest value of a periodogram against their mean."""
-    left = [one for each in seen for one in Likelihood(each, 1).whitened_means(model)]
-    count = max(map(len, left))
-    power = np.mean([np.abs(np.fft.rfft(each - each.mean())) ** 2 for each in left if len(each) == count], axis=0)
-    first = max(1, -(-count // _SLOWEST))  # what is slower is a drift
-    power = power[first : (count + 1) // 2]
-    top = int(power.argmax())
-    chance = len(power) * (1 - power[top] / power.sum()) ** (len(power) - 1)
-    return (top + first) / count * rate_hz if chance < _CHANCE else None
-
-
-def _with_aliases(found: IdentifiedModel, scene: Scene, most_blur: float) -> IdentifiedModel:
-    """The model with all aliases of a frequency in its set that would blur the spot by no more than ``most_blur``,
-    pixels rms: sharp frames cannot tell them apart."""
-    rate, exposure_s, highest = scene.rate_hz, scene.exposure_s, 0.5 / scene.step_s
-    sds = {each.name: each.best * scene.unit for each in found.parameters if each.name.endswith("sd")}
-
-    def aliases(each: Identified) -> Identified:
-        if not each.name.endswith("frequency_hz"):
-            return each
-        shown = sds.get(each.name.replace("frequency_hz", "sd"), 0.0) * abs(float(np.sinc(each.best * exposure_s)))
-
-        def possible(hz: float) -> bool:
-            left = abs(float(np.sinc(hz * exposure_s)))
-            return hz < highest and shown * math.sqrt(max(1 - left**2, 0.0)) <= most_blur * left
-
-        pieces = list(each.pieces)
-        for multiple in np.arange(rate, highest + rate, rate).tolist():
-            for piece in each.pieces:
-                low, best, high = multiple - piece.high, multiple - piece.best, multiple - piece.low
-                pieces.append(Piece(low, high, best, open_low=piece.open_high, open_high=piece.open_low))
-                above = (multiple + piece.low, multiple + piece.high, multiple + piece.best)
-                pieces.append(Piece(*above, open_low=piece.open_low, open_high=piece.open_high))
-        return replace(each, pieces=tuple(one for one in pieces if one in each.pieces or possible(one.best)))
-
-    return replace(found, parameters=tuple(map(aliases, found.parameters)))
-
-
-def _best_model(
-    rig: Rig, seen: Sequence[Readings], names: Sequence[str], wanted: Wanted, tell: Tell
-) -> tuple[str, list[Maximum]]:
-    """The sum of kinds that explains readings best by the Bayesian information criterion, and its local maxima."""
-    best: tuple[float, str, list[Maximum]] = (-math.inf, "", [])
-    count = 2 * sum(int(each.usable.sum()) for each in seen)
-    for number, name in enumerate(names):
-        tell("models", number, len(names))
-        space = space_wanted(kinds_of(name), seen, wanted)
-        try:
-            found = maxima(space, seen)
-        except IdentificationError:
-            continue
-        hz = [math.exp(x) for each, x in zip(space.names, found[0].x, strict=True) if each.endswith("frequency_hz")]
-        if len(names) > 1 and hz and wanted.lowest_hz and min(hz) < 1.05 * wanted.lowest_hz:
-            continue  # a drift, which the limit keeps from being as slow as it is
-        value = found[0].log_likelihood - len(space.names) * math.log(count) / 2
-        best = max(best, (value, name, found), key=lambda each: each[0])
-    if not best[1]:
-        raise ImportingError("no model of the motion can be fitted to these frames: they show too little")
-    return best[1:]
-
-
-def _assumed(film: Film, settings: FilmSettings, scene: Scene, kernel: float | None) -> Iterator[str]:
+def _assumed(
+    film: Film, settings: FilmSettings, common: dict[str, float], spots: Spots | None, kernel: float | None, sd: float
+) -> Iterator[str]:
     """What was taken for granted, each with what follows where it is wrong."""
-    spots = scene.spots
+    rate, exposure_s = common["rate_hz"], common["exposure_s"]
     yield (
-        f"each frame is exposed for {scene.exposure_s:g} s of {1 / scene.rate_hz:.4g} s: if it is"
-        " not, frequencies that the blur tells from their aliases are wrong"
+        f"frames come at {rate:.6g} a second, each exposed for {exposure_s:.4g} s: if it was taken at another rate, say"
+        " --rate; with another exposure, aliases are told apart wrongly"
     )
     yield "all rows are exposed at the same time: with a rolling shutter the lower rows are later, and the blur is bent"
-    if kernel is None:
-        yield (
-            f"a spot at rest is round, {spots.sd:.3g} pixels wide (sd), the widest that explains the frames: if it is"
-            " wider or narrower, so is the motion that is left; --kernel gives another"
-        )
+    if spots is not None and kernel is None:
+        yield f"a spot at rest is {sd:.3g} pixels wide (standard deviation), as across its motion; --kernel gives another"
     if film.nonlinear and settings.gamma == 1.0:
-        yield f"{nonlinear_note(film)}: if it is not linear, spots look wider than they are"
-    if spots.left_out:
+        yield f"{nonlinear_note(film)}: if it is not linear, amplitudes are wrong"
+    if spots is not None and spots.left_out:
         yield f"{spots.left_out} fainter spot(s) are left out: they may move in another way"
-    if len(spots.light) < film.count:
-        yield f"the first {len(spots.light)} of {film.count} frames are looked at: later motion may be another"
+    if common["frames"] < film.count:
+        yield f"the first {common['frames']:g} of {film.count} frames are looked at: later motion may be another"
 
 
-def _doubts(
-    film: Film, spots: Spots, directions: Sequence[Direction], sd: float, *, given: bool, thorough: bool
-) -> Iterator[str]:
-    """Reasons to mistrust what was found, and what would help."""
-    if film.account:
-        yield f"{film.left_out} of {film.count + film.left_out} frames are none: {film.account}"
-    if not given and min(each.least_blur for each in directions) >= LEAST_BLUR * sd:
-        yield (
-            f"no frame shows the spot as narrow as its kernel, {sd:.2g} pixels, along x or along y: this width is known"
-            " from the steep sides of the blur alone, and holds for a Gaussian spot only; if a spot at rest is wider,"
-            " frequencies may be wrong: give its width with --kernel"
-        )
-    for each in directions:
-        if each.misfit:
-            yield f"along {each.name} {each.misfit}"
-        if each.left_hz is not None:
-            more = "without --quick sums are tried" if each.blurred and not thorough else "frequencies may be wrong"
-            yield (
-                f"along {each.name} a vibration at {each.left_hz:.3g} Hz or an alias of it is left over, which the"
-                f" model does not have: {more}"
-            )
-    if spots.saturated > 0.001:
+def _doubts(spots: Spots) -> Iterator[str]:
+    if 0.001 < spots.saturated:
         yield f"{spots.saturated:.1%} of the pixels about the spots are saturated or hot and are left out: expose less"
     if spots.at_edge:
         yield "a spot is at the edge of the picture: what it does beyond is not seen"

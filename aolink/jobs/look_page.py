@@ -1,8 +1,12 @@
-"""The page of `aolink look`: a film's spots, exposures with the path in the blur, spectra with the sets, and what it
-means in words."""
+"""What `aolink look` writes beside its rig file: the page, the path as numbers, and the motion as a tone."""
 
 from __future__ import annotations
 
+import base64
+import csv
+import io
+import math
+import wave
 from collections.abc import Sequence
 from html import escape
 from pathlib import Path
@@ -12,78 +16,105 @@ import numpy as np
 
 from aolink.errors import ExportError
 from aolink.files import writing
-from aolink.jobs.look import Direction, Looked
-from aolink.jobs.look_words import in_set, paragraph
+from aolink.identification.vibration import Vibration
+from aolink.jobs.look_texture import MARGIN
+from aolink.jobs.look import Looked
+from aolink.jobs.look_words import in_set, paragraph, size_of
 from aolink.numerics.arrays import FloatArray
-from aolink.optics.kernel import pixel_masses
 from aolink.plotting.report import facts_table, html_page, picture_in_page
 from aolink.plotting.style import new_figure, paper
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_SHOWN = (0.98, 0.5, 0.02)
-"""Exposures that are shown, by how blurred they are among all."""
-_POINTS = 2000
-"""Frequencies of a spectrum."""
-_HIGHEST = 1.6
-"""Highest frequency of a spectrum, in those of the sets."""
+STEPS = 16
+"""Instants of an exposure in the path's table, and in the film of one exposure."""
+_POINTS = 4000
+_TONE_S, _TONE_HZ, _LOUD = 2.0, 44_100, 0.7
+_AUDIBLE = (20.0, 20_000.0)
+_LARGE = 200
+"""Pixels along a side of a picture that is played."""
 
 
 def write_page(looked: Looked, path: Path, name: str, commands: Sequence[str], *, overwrite: bool = False) -> None:
     """Write the page. Raises ExportError where it exists and not ``overwrite``, or without matplotlib."""
     with paper(), writing(path, overwrite=overwrite, suffix=".html", error=ExportError) as partial:
         parts = [f"<h1>{escape(name)}</h1>", f"<p>{escape(paragraph(looked))}</p>"]
-        parts += [f'<p class="note">{escape(each)}.</p>' for each in looked.caveats]
-        figures = [picture_in_page(_whole(looked), "The mean of the frames, and the windows of the spots.")]
+        if looked.doubts:
+            parts += ["<h2>Also</h2>", *(f"<p>{escape(each)}.</p>" for each in looked.doubts)]
+        figures = [picture_in_page(_whole(looked), "The mean of the frames, and where it was looked at.")]
+        if looked.found.lines:
+            figures.append(_played(looked))
         if looked.moves:
-            caption = "Three exposures, from much to little blur, with the path of the spot in them."
-            figures.append(picture_in_page(_exposures(looked), caption))
-            caption = "The light summed along one direction: as measured, and as the kernel on that path makes it."
-            figures.append(picture_in_page(_profile(looked), caption))
-            caption = "The spectrum of the path; in grey the sets of its frequencies."
-            figures.append(picture_in_page(_spectra(looked), caption))
+            figures.append(picture_in_page(_places(looked), "The mean place in each frame, and the vibrations in it."))
+            figures.append(picture_in_page(_spectrum(looked), "Spectrum of the places, which aliases share, and what"
+                                           " the blur says of each frequency: the higher, the likelier."))  # fmt: skip
         parts += [
             "<h2>Pictures</h2>",
             f'<div class="row pairs">{"".join(f"<div>{each}</div>" for each in figures)}</div>',
         ]
         parts += ["<h2>Numbers</h2>", facts_table(_numbers(looked))]
         parts += ["<h2>What was assumed</h2>", *(f"<p>{escape(each)}.</p>" for each in looked.assumed)]
-        parts += ["<h2>To go on</h2>", f"<pre>{escape(chr(10).join(commands))}</pre>"]
+        parts += ["<h2>To go on</h2>", f"<pre>{escape(chr(10).join(commands))}</pre>"] if commands else []
         partial.write_text(html_page(name, parts), encoding="utf-8")
 
 
+def write_path(looked: Looked, path: Path, *, overwrite: bool = False) -> None:
+    """Write the path by the vibrations and the drift: time, x and y, and their standard deviation, pixels."""
+    inside = (np.arange(STEPS) + 0.5) / STEPS - 0.5
+    times = looked.seen.times_s[:, None] + inside * looked.exposure_s
+    moved = looked.path(times) + (looked.found.drift[:, :1] @ looked.seen.axes[0])
+    sd = looked.rest / math.sqrt(2)
+    with writing(path, overwrite=overwrite, suffix=".csv", error=ExportError) as partial, partial.open("w", newline="", encoding="utf-8") as file:
+        rows = csv.writer(file)
+        rows.writerow(("time_s", "x_pixels", "y_pixels", "sd_pixels"))
+        for t, (x, y) in zip(times.ravel(), moved.reshape(-1, 2), strict=True):
+            rows.writerow((f"{t:.9g}", f"{x:.6g}", f"{y:.6g}", f"{sd:.3g}"))
+
+
+def write_tone(looked: Looked, path: Path, *, overwrite: bool = False) -> bool:
+    """Write two seconds of the motion as sound; False where nothing of it can be heard."""
+    heard = [line for line in looked.found.lines if _AUDIBLE[0] <= line.hz <= _AUDIBLE[1]]
+    if not heard:
+        return False
+    t = np.arange(round(_TONE_S * _TONE_HZ)) / _TONE_HZ
+    sound = sum(line.ellipse[0] * np.sin(2 * np.pi * line.hz * t) for line in heard)
+    sound = np.asarray(sound) / max(float(np.abs(sound).max()), 1e-12) * _LOUD
+    with writing(path, overwrite=overwrite, suffix=".wav", error=ExportError) as partial, wave.open(str(partial), "wb") as file:
+        file.setnchannels(1)
+        file.setsampwidth(2)
+        file.setframerate(_TONE_HZ)
+        file.writeframes((sound * 32767).astype("<i2").tobytes())
+    return True
+
+
 def _numbers(looked: Looked) -> dict[str, str]:
-    """The table of the paragraph."""
-    rows = {
-        "frames": f"{len(looked.spots.light)}, {looked.rate_hz:.6g} a second, {looked.exposure_s:.4g} s each",
-        "spots": ", ".join(f"at {x},{y}" for x, y in looked.spots.corners + looked.spots.light.shape[-1] // 2),
-        "kernel": f"{looked.sd:.3g} pixels (standard deviation)",
-    }
-    for each in looked.directions:
-        if each.found is None:
-            rows[f"along {each.name}"] = f"nothing moves by more than {each.least:.2g} pixels rms"
-            continue
-        rows[f"along {each.name}"] = f"{each.size:.3g} pixels rms, {each.found.model.name}"
-        for one in each.found.parameters:
-            if one.name.endswith("frequency_hz"):
-                rows[f"{one.name} along {each.name}"] = in_set(one, 12)
-        rows[f"path along {each.name}"] = (
-            f"known to {each.known:.2g} pixels rms inside an exposure; by the centroid alone {each.held:.2g}"
-        )
+    rows = {"frames": f"{looked.frames}, {looked.rate_hz:.6g} a second, {looked.exposure_s:.4g} s each"}
+    if looked.spots is not None:
+        half = looked.spots.light.shape[-1] // 2
+        rows["spots"] = ", ".join(f"at {x},{y}" for x, y in looked.spots.corners + half)
+        rows["kernel"] = f"{looked.sd:.3g} pixels (standard deviation)"
+    else:
+        rows["region"] = ", ".join(f"{each.columns} x {each.rows} at {each.x},{each.y}" for each in looked.regions[:1])
+    for line, parts, n in zip(looked.found.lines, looked.found.sets, looked.harmonics, strict=True):
+        rows[f"{line.hz:.4g} Hz"] = f"{in_set(parts)}; {size_of(line, looked)}{'' if n == 1 else f'; harmonic {n}'}"
+    rows["places"] = f"move by {looked.moved:.3g} pixels rms from frame to frame; {looked.rest:.2g} are left"
     return rows
 
 
 def _whole(looked: Looked) -> Figure:
     figure = new_figure(100, 75)
     axes = figure.subplots()
-    shown = looked.spots.mean
-    axes.imshow(shown, cmap="gray", vmin=0, vmax=float(np.quantile(shown, 0.999)))
-    side = looked.spots.light.shape[-1]
-    for number, (x, y) in enumerate(looked.spots.corners, 1):
-        across, along = (np.array(corners) * side - 0.5 for corners in ((0, 1, 1, 0, 0), (0, 0, 1, 1, 0)))
-        axes.plot(x + across, y + along, color="tab:orange", linewidth=0.8)
+    shown = looked.picture
+    low, high = np.quantile(shown, [0.001, 0.999])
+    axes.imshow(shown, cmap="gray", vmin=float(low), vmax=float(max(high, low + 1e-9)))
+    boxes = [(each.x, each.y, each.columns, each.rows) for each in looked.regions[:1]]
+    if looked.spots is not None:
+        side = looked.spots.light.shape[-1]
+        boxes = [(int(x), int(y), side, side) for x, y in looked.spots.corners]
+    for number, (x, y, columns, rows) in enumerate(boxes, 1):
+        across, down = (np.array(corners) for corners in ((0, 1, 1, 0, 0), (0, 0, 1, 1, 0)))
+        axes.plot(x - 0.5 + columns * across, y - 0.5 + rows * down, color="tab:orange", linewidth=0.8)
         axes.annotate(str(number), (x, y), color="tab:orange", fontsize=7, ha="right", va="bottom")
     axes.set(
         xlabel="x, pixels", ylabel="y, pixels", xlim=(-0.5, shown.shape[1] - 0.5), ylim=(shown.shape[0] - 0.5, -0.5)
@@ -91,87 +122,90 @@ def _whole(looked: Looked) -> Figure:
     return figure
 
 
-def _chosen(looked: Looked) -> list[int]:
-    """Exposures of much, of middling and of little blur."""
-    moved = sum(each.path[:, 0].var(axis=1) for each in looked.directions if each.path is not None)
-    order = np.argsort(moved)
-    return [int(order[round(share * (len(order) - 1))]) for share in _SHOWN]
-
-
-def _path(looked: Looked, direction: int, number: int) -> FloatArray:
-    """The path of the first spot in an exposure along a direction, pixels of its window, (steps,)."""
-    path = looked.directions[direction].path
-    if path is not None:
-        return np.asarray(path[number, 0])
-    light = np.nan_to_num(looked.spots.light[:, 0].mean(axis=0)).sum(axis=direction)
-    steps = next(each.path.shape[-1] for each in looked.directions if each.path is not None)
-    return np.full(steps, float(light @ np.arange(len(light)) / light.sum()))
-
-
-def summary(looked: Looked) -> Figure:
-    """Three exposures with the path in them, and the spectrum along the direction of more motion: in a paper's size."""
-    figure = new_figure(180, 48)
-    *three, last = figure.subplots(1, len(_SHOWN) + 1, width_ratios=[1, 1, 1, 2.2])
-    _show_exposures(looked, three)
-    _spectrum(looked, looked.directions[_main(looked)], last)
-    return figure
-
-
-def _exposures(looked: Looked) -> Figure:
-    figure = new_figure(140, 55)
-    _show_exposures(looked, figure.subplots(1, len(_SHOWN)))
-    return figure
-
-
-def _show_exposures(looked: Looked, each_axes: Sequence[Axes]) -> None:
-    for axes, number in zip(each_axes, _chosen(looked), strict=True):
-        axes.imshow(looked.spots.light[number, 0], cmap="gray")
-        axes.plot(_path(looked, 0, number), _path(looked, 1, number), color="tab:orange", linewidth=1.0)
-        axes.set(title=f"exposure {number}", xticks=[], yticks=[])
-
-
-def _main(looked: Looked) -> int:
-    """The direction of more motion."""
-    return int(np.argmax([each.size for each in looked.directions]))
-
-
-def _profile(looked: Looked) -> Figure:
-    figure = new_figure(100, 60)
+def _places(looked: Looked) -> Figure:
+    """Place against time along the direction of the first vibration, or of the most motion."""
+    figure = new_figure(140, 60)
     axes = figure.subplots()
-    number, d = _chosen(looked)[0], _main(looked)
-    light = looked.spots.light[number, 0].sum(axis=d)
-    at = np.arange(len(light))
-    masses = pixel_masses(looked.sd**2, np.arange(-0.5, len(light)), _path(looked, d, number), 0)[0]
-    axes.plot(at, light, "o", markersize=3, color="black", label="measured")
-    axes.plot(at, masses.mean(axis=0), color="tab:orange", label="predicted")
-    axes.set(xlabel=f"{looked.directions[d].name}, pixels of the window", ylabel="share of the light")
+    places = np.nan_to_num(looked.places - np.nanmean(looked.places, axis=0))
+    along = np.array([1.0, 0.0])
+    if looked.found.lines:
+        angle = looked.found.lines[0].ellipse[2]
+        along = np.array([math.cos(angle), math.sin(angle)])
+    times = looked.seen.times_s
+    axes.plot(times, places @ along, ".", markersize=3, color="black", label="mean place of a frame")
+    if looked.found.lines:
+        inside = (np.arange(STEPS) + 0.5) / STEPS - 0.5
+        fine = times[:, None] + inside * looked.exposure_s
+        drift = looked.found.drift[:, 0] @ looked.seen.axes[0]
+        path = (looked.path(fine) + (drift - drift.mean(axis=0))[:, None]) @ along
+        joined = np.concatenate([path, np.full((len(path), 1), np.nan)], axis=1)
+        at = np.concatenate([fine, fine[:, -1:]], axis=1)
+        axes.plot(at.ravel(), joined.ravel(), color="tab:orange", linewidth=0.8, label="path in the exposures")
+    last = min(len(times) - 1, 40)
+    axes.set(xlabel="time, s", ylabel="place, pixels", xlim=(times[0] - looked.exposure_s, times[last]))
     axes.legend()
     return figure
 
 
-def _spectra(looked: Looked) -> Figure:
-    moving = [each for each in looked.directions if each.path is not None]
-    figure = new_figure(100, 45 * len(moving))
-    for axes, each in zip(np.atleast_1d(figure.subplots(len(moving), 1)), moving, strict=True):
-        _spectrum(looked, each, axes)
+def _spectrum(looked: Looked) -> Figure:
+    figure = new_figure(140, 70)
+    first, second = figure.subplots(2, 1)
+    places = np.nan_to_num(looked.places - np.nanmean(looked.places, axis=0))
+    hz = np.linspace(0, looked.rate_hz / 2, _POINTS // 4)
+    turned = np.exp(-2j * np.pi * hz[:, None] * looked.seen.times_s) @ places
+    first.plot(hz, 2 / len(places) * np.sqrt((np.abs(turned) ** 2).sum(axis=1)), color="black", linewidth=0.7)
+    first.set(xlabel="frequency, Hz (a plain spectrum)", ylabel="pixels", xlim=(0, looked.rate_hz / 2), ylim=(0, None))
+    of = Vibration(looked.seen)
+    means, spreads, constants, _ = of.scan(())
+    none = sum(of.chi_squares(()))
+    parts = [part for each in looked.found.sets for part in each]
+    top = max([1.2 * part.high for part in parts] + [2 * looked.rate_hz])
+    shown = of.hz < top
+    score = np.sqrt(np.maximum(none - means - spreads - constants, 0.0))
+    second.plot(of.hz[shown], score[shown], color="black", linewidth=0.5)
+    for part in parts:
+        second.axvline(part.best, color="tab:orange", linewidth=0.8, alpha=0.8)
+    for k in range(1, math.ceil(2 * top / looked.rate_hz)):
+        second.axvline(k * looked.rate_hz / 2, color="tab:gray", linewidth=0.4, linestyle=":")
+    second.set(xlabel="frequency, Hz (with the blur; dotted: multiples of half the rate)", xlim=(0, top), ylim=(0, None))
+    second.set(ylabel="evidence")
     return figure
 
 
-def _spectrum(looked: Looked, direction: Direction, axes: Axes) -> None:
-    """The amplitude of the path over frequency: exposures stand at their times, with the gaps between them."""
-    assert direction.path is not None
-    assert direction.found is not None
-    frames, _, steps = direction.path.shape
-    inside = (np.arange(steps) + 0.5) / steps * looked.exposure_s
-    times = (np.arange(frames)[:, None] / looked.rate_hz + inside).ravel()
-    path = direction.path[:, 0].ravel()
-    sets = [one for one in direction.found.parameters if one.name.endswith("frequency_hz")]
-    bands = [(piece.low, piece.high) for one in sets for piece in one.pieces]
-    top = max([_HIGHEST * one.best for one in sets] + [looked.rate_hz])
-    hz = np.linspace(top / _POINTS, top, _POINTS)
-    turned = np.exp(-2j * np.pi * hz[:, None] * times)
-    axes.plot(hz, 2 * np.abs(turned @ (path - path.mean())) / len(path), color="black", linewidth=0.7)
-    for low, high in bands:
-        if low < top:
-            axes.axvspan(low, min(high, top), color="tab:gray", alpha=0.4, linewidth=0.8)
-    axes.set(xlabel="frequency, Hz", ylabel=f"amplitude along {direction.name}, pixels", xlim=(0, top), ylim=(0, None))
+def _played(looked: Looked) -> str:
+    """One blurred frame, and it played in slow motion inside its exposure: its sharpest like along the path."""
+    from PIL import Image
+    from scipy import ndimage
+
+    inside = (np.arange(2 * STEPS) + 0.5) / (2 * STEPS) - 0.5
+    times = looked.seen.times_s[:, None] + inside * looked.exposure_s
+    path = looked.path(times)
+    blurs = path.var(axis=1).sum(axis=1)
+    number, sharp = int(blurs.argmax()), int(blurs.argmin())
+    cut = np.nan_to_num(looked.cut)
+    if not looked.regions:
+        y, x = np.indices(cut.shape[1:])
+        middle = [float((cut[sharp] * each).sum() / cut[sharp].sum()) for each in (y, x)]
+        still = np.exp(-((y - middle[0]) ** 2 + (x - middle[1]) ** 2) / (2 * looked.sd**2)) * cut.max()
+    else:
+        still = cut[sharp]
+    moves = path[number] - path[sharp].mean(axis=0)
+    frames = [ndimage.shift(still, move[::-1], order=1, mode="nearest") for move in moves]
+    edge = MARGIN if looked.regions else 0
+    shown = [each[edge : each.shape[0] - edge, edge : each.shape[1] - edge] for each in (cut[number], *frames)]
+    low, high = float(shown[0].min()), float(max(shown[0].max(), shown[1].max()))
+
+    def picture(values: FloatArray) -> Image.Image:
+        grey = np.clip((values - low) / max(high - low, 1e-12) * 255, 0, 255).astype(np.uint8)
+        factor = max(1, _LARGE // max(values.shape))
+        return Image.fromarray(np.kron(grey, np.ones((factor, factor), np.uint8)))
+
+    def embedded(file: io.BytesIO, kind: str) -> str:
+        return f'<img alt="" src="data:image/{kind};base64,{base64.b64encode(file.getvalue()).decode()}">'
+
+    blurred, film = io.BytesIO(), io.BytesIO()
+    picture(shown[0]).save(blurred, "PNG")
+    first, *rest = (picture(each) for each in shown[1:])
+    first.save(film, "GIF", save_all=True, append_images=rest, duration=80, loop=0)
+    caption = f"Frame {number} as it was taken, and played in slow motion inside its exposure, along the path that was found."
+    return f"<figure>{embedded(blurred, 'png')} {embedded(film, 'gif')}<figcaption>{caption}</figcaption></figure>"

@@ -1,10 +1,8 @@
 """Spots of a film that may be blurred by their motion: where they are, their kernel, light and noise.
 
-A blurred spot is the kernel moved along the path: the image of a density of places that is nowhere negative. So the
-kernel is found without knowing the motion. A narrower kernel than the true one still explains every frame, with other
-densities; a wider one leaves residuals, at the steep sides of the blur. The widest that explains the frames as well as
-narrow ones is the kernel. Where frames are sharp, that is the width of the spot itself; where the motion is along one
-direction, the width across it.
+The kernel is seen across the motion, where nothing blurs it: the mean of all frames, summed along the direction in which
+it is longest, is a Gaussian there. What swings across as well makes it too wide at first, and the constant that is left of
+the blur's covariances (`aolink.identification.vibration`) corrects it.
 """
 
 from __future__ import annotations
@@ -12,7 +10,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache
 from itertools import islice
 
 import numpy as np
@@ -33,6 +30,10 @@ _SMOOTH = 1.5
 """Standard deviation of the Gaussian that these frames are smoothed by, pixels."""
 _SIGNIFICANT = 8.0
 """A spot is this many standard deviations of a smoothed frame's noise above the ground, ..."""
+_STILL = 4.5
+"""Differences of two frames beyond so many medians are motion."""
+_DARK = 0.15
+"""Share of the brightest light that the picture has elsewhere where spots stand alone."""
 _FAINTEST = 0.2
 """... and has this share of the brightest one's height; it goes where it has half of the latter."""
 _SHARPEST = 0.8
@@ -42,22 +43,18 @@ _REACH = 4.0
 _LARGEST = 128
 """Most pixels along a side of a window."""
 _SMALLEST = 12
-_KERNEL_FRAMES = 100
-"""Frames that decide on the kernel."""
-_WIDTHS = 1.02 ** np.arange(-40, 92)
-"""Standard deviations of the kernels that are tried, pixels: .45 to 6."""
 _FINE = 3
 """Places in a pixel at which a density may be: with one, a sharp spot between two pixels looks wider than it is."""
-_NARROWER, _WORSE, _SHARE, _SURE = 8, 1.0, 0.1, 2.5
-"""A kernel is too wide where the squares of a profile's residuals exceed those with one so many steps narrower by so
-many squares of the noise, and by so many standard deviations of chance. The first too wide is looked for with a rise by
-such a share, since they rise a little with every width where the noise is larger than it is taken for."""
 _BRIGHT, _SHOT, _FEWEST_PIXELS = 0.3, 0.3, 100
 """Shot noise is looked for in pixels of profiles with this share of the brightest one's light; the share of the dark
 noise's variance that shows; and how many such pixels are enough."""
-_NOISIEST, _TURNS, _SETTLED = 0.05, 6, 0.1
-"""Shot noise of the brightest pixel, over its light, from which turns begin in which kernel and shot noise are found;
-how many there are at most, and the change of the latter that ends them."""
+_GAIN_FRAMES = 24
+"""Frames that tell the shot noise."""
+_NARROWER = 0.9
+"""A kernel so much narrower than the one that was found explains the frames as well: what it leaves is noise."""
+_BRIGHT_PART = 0.1
+"""Share of the brightest pixel above which light tells the direction of the motion."""
+_SUBPIXELS = 4
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -70,7 +67,7 @@ class Spots:
     corners: IntArray
     """First pixel of each window, (n, 2)."""
     sd: float
-    """Standard deviation of the kernel, pixels; infinite where every kernel explains the frames."""
+    """Standard deviation of the kernel across the motion, pixels."""
     noise: float
     """Standard deviation of a dark pixel's noise, over a spot's light."""
     electrons: float
@@ -79,6 +76,10 @@ class Spots:
     """Mean picture, (rows, columns)."""
     saturated: float
     """Share of the pixels in the windows that are saturated or hot."""
+    saturated_frames: float
+    """Share of the frames in which a pixel of the brightest spot is saturated."""
+    alone: bool
+    """Whether the picture is dark but for the spots."""
     left_out: int
     """Number of fainter spots."""
     at_edge: bool
@@ -117,15 +118,34 @@ def find_spots(
     windows /= usual[:, None, None]
     windows[:, others] = 0.0  # as dark as the ground, so that sums over the window can be used
     noise /= float(usual.mean())
+    sd = float(np.median([across(np.nanmean(windows[:, k], axis=0)) for k in range(len(corners))]))
     profiles = [np.nansum(windows, axis=axis) for axis in (2, 3)]  # along x, along y
-    sd, electrons = _kernel_and_electrons(profiles, noise * math.sqrt(side))
+    electrons = _electrons(profiles, sd, noise * math.sqrt(side))
     rows, columns = film.shape
     ends = corners + side
     return Spots(
         light=windows, corners=corners, sd=sd, noise=noise,
         electrons=electrons, mean=mean, saturated=float(bad.mean()), left_out=left_out,
+        saturated_frames=float((bad[:, 0] & ~defects[_inside(corners[0], side, film.shape)]).any(axis=(1, 2)).mean()),
+        alone=_alone(mean, corners, side),
         at_edge=bool((corners < 0).any() or (ends > (columns, rows)).any()),
     )  # fmt: skip
+
+
+def _inside(corner: IntArray, side: int, shape: tuple[int, int]) -> tuple[IntArray, IntArray]:
+    """Rows and columns of a window, as numbers for an array, those beyond the picture at its edge."""
+    y, x = (np.clip(corner[d] + np.arange(side), 0, shape[1 - d] - 1) for d in (1, 0))
+    return y[:, None], x[None]
+
+
+def _alone(mean: FloatArray, corners: IntArray, side: int) -> bool:
+    """Whether the mean picture is dark but for the windows: nothing else has a tenth of the brightest light."""
+    rest = mean.copy()
+    top = float(mean.max())
+    for x, y in corners:
+        rest[max(0, y) : y + side, max(0, x) : x + side] = np.nan
+    rest = rest[np.isfinite(rest)]
+    return rest.size == 0 or float(np.quantile(np.abs(rest - np.median(rest)), 0.99)) < _DARK * top
 
 
 def _seen(
@@ -142,7 +162,10 @@ def _seen(
             smooth = ndimage.gaussian_filter(shown, _SMOOTH)
             brightest = smooth if brightest is None else np.maximum(brightest, smooth)
         if last is not None and k % every == 1 % every:
-            differences.append(float(np.median(np.abs(shown - last))) / (0.6745 * math.sqrt(2)))
+            off = np.abs(shown - last)
+            # Whole numbers have no median of their own: the mean square of all but what moves.
+            usual = off[off <= _STILL * max(float(np.median(off)), light.step)]
+            differences.append(math.sqrt(float((usual**2).mean()) / 2))
         total = shown if total is None else total + shown
         last = shown
     if brightest is None or total is None or not differences:
@@ -252,57 +275,42 @@ def _densities(profile: FloatArray, sd: float, noise: FloatArray) -> tuple[Float
     return density.reshape(*profile.shape[:-1], -1), (flat - density @ kernel.T).reshape(profile.shape)
 
 
-def _kernel_and_electrons(profiles: list[FloatArray], dark: float) -> tuple[float, float]:
-    """The widest kernel that explains profiles along x and along y, whose noise in the dark is given, and a spot's
-    photoelectrons. Shot noise is known once the kernel is, so both are found in turns."""
-    frames, spots, _ = profiles[0].shape
-    some = np.unique(np.linspace(0, frames - 1, max(_KERNEL_FRAMES // spots, 24)).round().astype(int))
+def across(picture: FloatArray) -> float:
+    """Standard deviation of the kernel, from a window's mean (rows, columns): that of a Gaussian which fits the light
+    summed along the direction in which it is longest."""
+    rows, columns = picture.shape
+    light = np.where(np.isfinite(picture), picture, 0.0)
+    bright = np.where(light > _BRIGHT_PART * light.max(), light, 0.0)
+    y, x = np.indices(light.shape)
+    at = np.array([x.ravel(), y.ravel()], dtype=np.float64)
+    middle = (at * bright.ravel()).sum(axis=1) / bright.sum()
+    _, vectors = np.linalg.eigh(np.cov(at, aweights=bright.ravel()))
+    place = vectors[:, 0] @ (at - middle[:, None])
+    # Each pixel's light goes to the places across that it covers, as from a square turned by the direction.
+    edges = np.arange(-math.ceil(np.abs(place).max()) - 1, math.ceil(np.abs(place).max()) + 2) / 2
+    fine = (np.arange(_SUBPIXELS) + 0.5) / _SUBPIXELS - 0.5
+    offsets = (vectors[0, 0] * fine[:, None] + vectors[1, 0] * fine).ravel()
+    profile = sum(np.histogram(place + each, edges, weights=light.ravel())[0] for each in offsets) / len(offsets)
+    centres = (edges[1:] + edges[:-1]) / 2
+    reach = np.abs(centres) < max(_SMALLEST / 2, 6 * math.sqrt((profile.clip(0) * centres**2).sum() / profile.clip(0).sum()))
+    start = math.sqrt(max(np.cov(at, aweights=bright.ravel()).trace() / 4, 1.0))
+
+    def misfit(p: FloatArray) -> FloatArray:
+        return np.asarray(p[0] * np.exp(-((centres - p[1]) ** 2) / (2 * p[2] ** 2)) + p[3] - profile)[reach]
+
+    found = optimize.least_squares(misfit, [profile.max(), 0.0, start, 0.0])
+    pixel = (1 / 12) * (1 + 1 / 4)  # of a pixel's square, and of the bins
+    return math.sqrt(max(float(found.x[2]) ** 2 - pixel, 0.1))
+
+
+def _electrons(profiles: list[FloatArray], sd: float, dark: float) -> float:
+    """A spot's photoelectrons, from profiles along x and along y whose noise in the dark is given; zero where shot noise
+    does not show."""
+    some = np.unique(np.linspace(0, len(profiles[0]) - 1, _GAIN_FRAMES).round().astype(int))
     profiles = [profile[some] for profile in profiles]
-    # With too much noise the kernel is too wide at first, and what it leaves says so; with too little all that is left
-    # would be taken for a kernel that is too wide.
-    gain = _NOISIEST**2 * max(float(profile.max()) for profile in profiles)
-    for _ in range(_TURNS):
-        noises = [_noise(profile, dark, gain) for profile in profiles]
-        sd = _kernel(profiles, noises)
-        before, gain = gain, _gain(profiles, sd, noises, dark) if math.isfinite(sd) else 0.0
-        if abs(gain - before) <= _SETTLED * before:
-            break
-    return sd, 1 / gain if gain else 0.0
-
-
-def _noise(profile: FloatArray, dark: float, gain: float) -> FloatArray:
-    """Standard deviation of each pixel of profiles by read-out and by shot noise of its light."""
-    light = np.maximum(ndimage.gaussian_filter1d(profile, 1.0, axis=-1), 0.0)
-    return np.asarray(np.sqrt(dark**2 + gain * light))
-
-
-def _kernel(profiles: list[FloatArray], noises: list[FloatArray]) -> float:
-    """The widest kernel that explains the profiles along x and along y, (frames, n, pixels) each."""
-    widest = math.inf
-    for profile, noise in zip(profiles, noises, strict=True):
-
-        @cache
-        def misfit(k: int, profile: FloatArray = profile, noise: FloatArray = noise) -> FloatArray:
-            """Squares of each frame's residuals, over their noise: a density that is not zero takes one away."""
-            density, left = _densities(profile, float(_WIDTHS[k]), noise)
-            taken = np.count_nonzero(density > 0, axis=2)
-            return np.asarray((((left / noise) ** 2).sum(axis=2) + taken).mean(axis=1))
-
-        coarse = range(0, len(_WIDTHS), _NARROWER)
-
-        def too_wide(k: int, share: float = 0.0) -> float:
-            more = misfit(k) - misfit(k - _NARROWER)
-            chance = _SURE * float(more.std()) / math.sqrt(len(more))
-            return float(more.mean()) - max(_WORSE, share * float(misfit(k - _NARROWER).mean()), chance)
-
-        wrong = next((k for k in coarse[1:] if too_wide(k, _SHARE) > 0), coarse[1])
-        if wrong == coarse[1]:
-            continue
-        within = range(wrong - _NARROWER, wrong)
-        last = max((k for k in within if too_wide(k) <= 0), default=within[0])
-        part = max(0.0, too_wide(last) / (too_wide(last) - too_wide(last + 1)))
-        widest = min(widest, float(_WIDTHS[last] * (_WIDTHS[1] / _WIDTHS[0]) ** part))
-    return widest
+    noises = [np.full_like(profile, dark) for profile in profiles]
+    gain = _gain(profiles, _NARROWER * sd, noises, dark)
+    return 1 / gain if gain else 0.0
 
 
 def _gain(profiles: list[FloatArray], sd: float, noises: list[FloatArray], dark: float) -> float:

@@ -5,75 +5,61 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from aolink.identification import Identified
-from aolink.jobs.look import Direction, Looked
+from aolink.identification.vibration import Line, Part
+from aolink.jobs.look import GRADES, Looked
+
+_MOST_NAMED = 12
+"""Aliases that are named."""
 
 
 def paragraph(looked: Looked) -> str:
-    """What moves, how, and how well it is known, in a few sentences."""
-    n = len(looked.spots.corners)
-    what = f"{n} spots, each" if n > 1 else "One spot,"
-    said = [f"{what} {looked.sd:.3g} pixels wide at rest (standard deviation)."]
-    if n > 1:
-        said.append("They move together." if looked.together else "Each moves on its own, all in the same way.")
-    moving = [each for each in looked.directions if each.moves]
-    for each in looked.directions:
-        if each.found is None:
-            said.append(f"Along {each.name} nothing moves by more than {_digits(each.least)} pixels rms.")
-        else:
-            said.append(f"Along {each.name}: {described(each, looked)}.")
-    for each in moving:
-        where = f" along {each.name}" if len(moving) > 1 else ""
-        if each.blurred:
-            better = each.held / each.known
-            tells = (
-                f"the blur tells {better:.2g} times more than the centroid here"
-                if better > 1.2
-                else ("the blur tells hardly more than the centroid here")
-            )
-            said.append(
-                f"Inside an exposure the path{where} is known to {_digits(each.known)} pixels rms; the centroid alone"
-                f" leaves {_digits(each.held)}: {tells}."
-            )
+    """The grade, what moves, and how, in a few sentences."""
+    grade = GRADES[looked.grade].capitalize()
+    if looked.grade == len(GRADES) - 1:
+        said = [f"{grade}, because {looked.because}."]
+    else:
+        said = [f"{grade}{f': {looked.because}' if looked.because else ''}."]
+        said += [described(looked, k) for k, n in enumerate(looked.harmonics) if n == 1]
+        if harmonics := sorted({n for n in looked.harmonics if n > 1}):
+            said.append(f"Its harmonics {', '.join(map(str, harmonics))} show too.")
+        if looked.plain_hz and abs(looked.plain_hz - looked.found.lines[0].hz) > 0.01 * looked.plain_hz:
+            said.append(f"A plain spectrum of this film says {looked.plain_hz:.3g} Hz.")
+    if looked.spots is not None:
+        n = len(looked.spots.corners)
+        what = f"{n} spots, each" if n > 1 else "One spot,"
+        together = "" if n == 1 else " They move together." if looked.together else " Each moves on its own."
+        said.append(f"{what} {looked.sd:.3g} pixels wide at rest (standard deviation).{together}")
     return " ".join(said)
 
 
-def described(direction: Direction, looked: Looked) -> str:
-    """The motion along one direction in words, with the sets of its frequencies."""
-    assert direction.found is not None
-    parts, sets = [], {each.name: each for each in direction.found.parameters}
-    processes = direction.found.model.processes
-    for number, process in enumerate(processes):
-        if process.kind != "resonance":
-            kind = "it walks at random" if process.kind == "random-walk" else "it wanders at random and returns within"
-            parts.append(kind if process.kind == "random-walk" else f"{kind} {process['correlation_s']:.2g} s")
-            continue
-        names = [name for name in sets if name.endswith("frequency_hz")]
-        one = sets[names[sum(each.kind == "resonance" for each in processes[:number])]]
-        size = f", {_digits(direction.size)} pixels rms" if len(processes) == 1 else ""
-        parts.append(f"it vibrates at {in_set(one)}{size}")
-    alone = (
-        ""
-        if processes[0].kind == "resonance" and len(processes) == 1
-        else f", {_digits(direction.size)} pixels rms in all"
-    )
-    return " and ".join(parts) + alone
+def described(looked: Looked, number: int) -> str:
+    """One vibration with its set."""
+    line, parts = looked.found.lines[number], looked.found.sets[number]
+    verb = "It vibrates" if number == 0 else "It also vibrates"
+    return f"{verb} at {in_set(parts)}, {size_of(line, looked)}."
 
 
-def in_set(each: Identified, most: int = 4) -> str:
-    """A frequency with its set in words; of many pieces the first ones."""
-    finest = min((piece.high - piece.low for piece in each.pieces), default=0.0)
-    digits = max(0, min(3, 1 - math.floor(math.log10(max(finest, 1e-3)))))
-    if not each.pieces:
-        return f"{each.best:.{digits}f} Hz, though no frequency explains both the width and the shape of the blur"
-    own = next((piece for piece in each.pieces if piece.low <= each.best <= piece.high), each.pieces[0])
-    others = [piece for piece in each.pieces if piece is not own]
-    said = f"{each.best:.{digits}f} Hz [{own.low:.{digits}f}, {own.high:.{digits}f}]"
+def size_of(line: Line, looked: Looked) -> str:
+    """How far and in what direction a vibration goes."""
+    longer, shorter, angle = line.ellipse
+    # Rows count downwards, angles upwards.
+    degrees = round(-math.degrees(angle)) % 180
+    if shorter > max(0.1 * longer, 2 * looked.rest / math.sqrt(looked.frames)):
+        return f"in an ellipse of {_digits(longer)} by {_digits(shorter)} pixels to each side, the longer along {degrees} degrees from horizontal"
+    across = "" if len(looked.seen.axes) and looked.sees_all else " (an edge is seen across itself only)"
+    return f"{_digits(longer)} pixels to each side, along {degrees} degrees from horizontal{across}"
+
+
+def in_set(parts: tuple[Part, ...]) -> str:
+    """A frequency with its set in words."""
+    best, *others = parts
+    digits = max(0, min(4, 1 - math.floor(math.log10(max(best.high - best.low, 1e-4)))))
+    said = f"{best.best:.{digits}f} Hz [{best.low:.{digits}f}, {best.high:.{digits}f}]"
     if not others:
         return said
-    named = ", ".join(f"{piece.best:.{digits}f}" for piece in others[:most])
-    more = " and so on" if len(others) > most else ""
-    return f"{said} or an alias of it ({named} Hz{more}), which these frames cannot tell from it"
+    others.sort(key=lambda each: each.best)
+    named = ", ".join(f"{each.best:.{digits}f}" for each in others[:_MOST_NAMED])
+    return f"{said} or at {named} Hz{' and so on' if len(others) > _MOST_NAMED else ''}, which these frames cannot tell from it"
 
 
 def _digits(value: float) -> str:
@@ -82,27 +68,25 @@ def _digits(value: float) -> str:
 
 def as_json(looked: Looked) -> dict[str, Any]:
     """The numbers of `paragraph`."""
+    spots = looked.spots
     return {
-        "spots": looked.spots.corners.tolist(), "window": int(looked.spots.light.shape[-1]), "kernel_sd": looked.sd,
-        "rate_hz": looked.rate_hz, "exposure_s": looked.exposure_s, "together": looked.together,
-        "blurred": looked.blurred, "moves": looked.moves,
-        "directions": {each.name: _direction_as_json(each) for each in looked.directions},
-        "assumed": list(looked.assumed), "unknown": looked.unknown or None, "doubts": list(looked.doubts),
+        "grade": GRADES[looked.grade], "because": looked.because or None,
+        "lines": [
+            {
+                "hz": line.hz, "set": [[part.low, part.high] for part in parts], "best": [part.best for part in parts],
+                "half_axes_pixels": list(line.ellipse[:2]), "degrees": round(-math.degrees(line.ellipse[2]), 1) % 180,
+                "harmonic": n, "growth": line.growth,
+            }
+            for line, parts, n in zip(looked.found.lines, looked.found.sets, looked.harmonics, strict=True)
+        ],
+        "plain_hz": _number(looked.plain_hz), "rate_hz": looked.rate_hz, "exposure_s": looked.exposure_s,
+        "frames": looked.frames, "moved_pixels": looked.moved, "left_pixels": looked.rest,
+        "spots": None if spots is None else spots.corners.tolist(), "kernel_sd": _number(looked.sd),
+        "together": looked.together, "camera": looked.camera,
+        "regions": [[each.x, each.y, each.columns, each.rows] for each in looked.regions],
+        "assumed": list(looked.assumed), "doubts": list(looked.doubts),
     }  # fmt: skip
 
 
-def _direction_as_json(each: Direction) -> dict[str, Any]:
-    found = None if each.found is None else each.found.model.name
-    parameters = (
-        {}
-        if each.found is None
-        else {
-            one.name: {"value": one.best, "set": [[piece.low, piece.high] for piece in one.pieces]}
-            for one in each.found.parameters
-        }
-    )
-    return {
-        "moves": each.moves, "rms_pixels": each.size, "model": found, "parameters": parameters,
-        "path_sd_pixels": None if math.isnan(each.known) else each.known,
-        "centroid_sd_pixels": None if math.isnan(each.held) else each.held,
-    }  # fmt: skip
+def _number(value: float) -> float | None:
+    return value if math.isfinite(value) else None
