@@ -1,4 +1,4 @@
-"""The command look: from a film of spots to what moves in it, without a rig file."""
+"""The command look: from a film to what moves in it, without a rig file."""
 
 import json
 import math
@@ -8,11 +8,10 @@ from typing import Annotated
 
 import typer
 
-from aolink.cli.common import JsonOption, OverwriteOption, app, program, progress, stderr, stdout
+from aolink.cli.common import JsonOption, OverwriteOption, app, program, progress, stdout
 from aolink.cli.films import ExposureOption, FilmOfLook, RateOption, film_file, film_settings
 from aolink.errors import ExportError, ImportingError, RecordingError
 from aolink.files import writing
-from aolink.signals import Interrupted
 
 
 @app.command(
@@ -22,7 +21,7 @@ from aolink.signals import Interrupted
 def look(
     source: Annotated[
         Path,
-        typer.Argument(metavar="FILM", help="A film of spots, as `aolink import` takes."),
+        typer.Argument(metavar="FILM", help="A film, as `aolink import` takes."),
     ],
     rate: RateOption = None,
     exposure: ExposureOption = None,
@@ -34,23 +33,24 @@ def look(
         float | None,
         typer.Option(metavar="PIXELS", help="Standard deviation of a resting spot; without it the frames tell."),
     ] = None,
-    quick: Annotated[
-        bool, typer.Option("--quick", help="End before sums of processes are tried for blurred frames.")
-    ] = False,
+    at: Annotated[
+        str | None, typer.Option(metavar="X,Y", help="Middle of the part to look at. [what moves most]")
+    ] = None,
+    size: Annotated[int, typer.Option(min=8, metavar="PIXELS", help="Side of that part.")] = 40,
     film: FilmOfLook = None,
     overwrite: OverwriteOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Say what moves in a film of up to four spots, and how well its blur tells the path inside each exposure.
+    """Say what moves in a film, at what frequency, and whether to believe it.
 
-    Writes a rig file to go on with, a recording with estimates, and a page with pictures. The first answer comes in
-    about a minute; where it leaves something of blurred frames unexplained, sums of processes are then tried, which may
-    take minutes. Ctrl-C keeps what there is.
+    Spots on a dark ground or anything else that has edges: the blur inside the exposures tells frequencies above the
+    frame rate from their aliases. Writes a page with pictures, the path, and the motion as a tone; of spots also a rig
+    file to go on with, and a recording with estimates.
     """
     from aolink.importing.recording import import_film
-    from aolink.jobs.look import ESTIMATOR, Looked, heeding
+    from aolink.jobs.look import ESTIMATOR
     from aolink.jobs.look import look as look_at
-    from aolink.jobs.look_page import write_page
+    from aolink.jobs.look_page import write_page, write_path, write_tone
     from aolink.jobs.look_words import as_json as numbers
     from aolink.jobs.look_words import paragraph
     from aolink.recording.reader import Recording
@@ -62,61 +62,67 @@ def look(
     how = film_file(film, "look")
     settings, shown = film_settings(rate, exposure, how), how.open(source)
     folder = output or Path(f"{source.stem}-look")
-    rig_file, recording, page = folder / "rig.toml", folder / "film.mcap", folder / "page.html"
-    if not overwrite and (there := [each for each in (rig_file, recording, page) if each.exists()]):
+    names = ("page.html", "path.csv", "tone.wav", "rig.toml", "film.mcap")
+    page, path, tone, rig_file, recording = (folder / each for each in names)
+    if not overwrite and (there := [folder / each for each in names if (folder / each).exists()]):
         raise RecordingError(f"{there[0]} exists already: give another -o DIR, or --overwrite")
-    looked: Looked | None = None
-    interrupted: Interrupted | None = None
-    for thorough in (False, True)[: 1 if quick else 2]:
-        try:
-            with progress("look", None) as tell:
-                said = look_at(
-                    shown, settings, source.stem, kernel=kernel, thorough=thorough, before=looked,
-                    tell=lambda what, done, of: tell(done, f"{what}: {done} of {of}"),
-                )  # fmt: skip
-        except Interrupted as stopped:
-            if looked is None:
-                raise
-            stderr.print("stopped: the first answer is kept and written", markup=False)
-            interrupted = stopped
-            break
-        first, looked = looked, said
-        if not as_json and (first is None or paragraph(first) != paragraph(looked)):
-            stdout.print(f"{'' if first is None else 'After more models: '}{paragraph(looked)}", markup=False)
-        if not looked.moves:
-            break
-    assert looked is not None
-    folder.mkdir(parents=True, exist_ok=True)
-    rig = parse_rig(looked.text)
-    with writing(rig_file, overwrite=overwrite, sources=[source], error=ImportingError) as partial:
-        partial.write_text(looked.text, encoding="utf-8")
-    with TemporaryDirectory(dir=folder, prefix=".look-") as place:
-        imported = Path(place) / recording.name
-        import_film(looked.cut, rig, looked.settings, imported, sources=[source])
-        with progress("estimate", len(looked.spots.light)) as tell:
+    try:  # before anything is computed
+        folder.mkdir(parents=True, exist_ok=True)
+        with TemporaryDirectory(dir=folder, prefix=".look-"):
+            pass
+    except OSError as error:
+        raise ImportingError(f"{folder} cannot be written: {error.strerror}") from None
+    place = None if at is None else _place(at)
+    with progress("look", None) as tell:
+        looked = look_at(
+            shown, settings, source.stem, kernel=kernel, at=place, size=size,
+            tell=lambda what, done, of: tell(done, f"{what}: {done} of {of}"),
+        )  # fmt: skip
+    if not as_json:
+        stdout.print(paragraph(looked), markup=False)
+    commands, written = [], {"page": page, "path": None, "tone": None, "rig": None, "recording": None}
+    if looked.text:
+        rig = parse_rig(looked.text)
+        with writing(rig_file, overwrite=overwrite, sources=[source], error=ImportingError) as partial:
+            partial.write_text(looked.text, encoding="utf-8")
+        with TemporaryDirectory(dir=folder, prefix=".look-") as temporary:
+            imported = Path(temporary) / recording.name
+            assert looked.scene is not None
+            import_film(looked.scene.cut(looked.sd), rig, looked.scene.settings, imported, sources=[source])
             if looked.moves:
-                scores = write_reestimated(
-                    Recording(imported), [ESTIMATOR], recording, overwrite=overwrite, progress=tell
-                )  # fmt: skip
-                looked = heeding(looked, scores[ESTIMATOR])
+                with progress("estimate", looked.frames) as tell:
+                    write_reestimated(Recording(imported), [ESTIMATOR], recording, overwrite=overwrite, progress=tell)
             else:
                 imported.replace(recording)
-    commands = [
-        f"{program()} view {recording}",
-        f"{program()} info {recording}",
-        f"{program()} report {recording} -o {folder / 'report.html'}",
-    ]
+        written |= {"rig": rig_file, "recording": recording}
+        commands = [
+            f"{program()} view {recording}",
+            f"{program()} info {recording}",
+            f"{program()} report {recording} -o {folder / 'report.html'}",
+        ]
+    if looked.found.lines:
+        write_path(looked, path, overwrite=overwrite)
+        written["path"] = path
+        if write_tone(looked, tone, overwrite=overwrite):
+            written["tone"] = tone
     drawn = f"{page}: the pictures"
     try:
         write_page(looked, page, source.name, commands, overwrite=overwrite)
     except ExportError as error:  # the answer does not need it
-        drawn = f"no page with pictures: {error}"
+        drawn, written["page"] = f"no page with pictures: {error}", None
     if as_json:
-        files = {"rig": str(rig_file), "recording": str(recording), "page": str(page) if page.exists() else None}
+        files = {name: None if each is None else str(each) for name, each in written.items()}
         print(json.dumps({"text": paragraph(looked), **numbers(looked), **files}, allow_nan=False))
-    else:
-        lines = [*(f"{each}." for each in looked.caveats), "Assumed:", *(f"  {each}." for each in looked.assumed)]
-        lines += [f"{drawn}. To go on:", *(f"  {each}" for each in commands)]
-        stdout.print("\n".join(lines), markup=False)
-    if interrupted is not None:
-        raise interrupted
+        return
+    lines = [*(f"{each}." for each in looked.doubts), "Assumed:", *(f"  {each}." for each in looked.assumed)]
+    lines += [drawn, *(["To go on:"] if commands else []), *(f"  {each}" for each in commands)]
+    stdout.print("\n".join(lines), markup=False)
+
+
+def _place(text: str) -> tuple[float, float]:
+    """X,Y in pixels."""
+    try:
+        x, y = (float(each) for each in text.split(","))
+    except ValueError:
+        raise ImportingError(f"--at {text} is no place: give its column and row, as --at 320,120") from None
+    return x, y

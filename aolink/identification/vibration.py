@@ -5,9 +5,9 @@ A line p(t) = Re[a exp(i w t)], a complex for x and y (an ellipse with phase), g
     mean        s(f) Re[a exp(i w t)],                                              s(f) = sin(pi f T) / (pi f T)
     covariance  Re[a a*]/2 + s(2f) Re[a a' exp(2 i w t)]/2 - mean mean' + constant
 
-The constant is what is not known of the kernel, or of the reference. The means alone cannot tell f from its aliases; the
-covariance swings at 2f by s(2f)/s(f)^2 times as much, so that together they do (Mishra & Wen, Extracting Dynamics from
-Blur (2014)). An amplitude may grow or decay linearly, and a slow drift of the means is free.
+The constant is what is not known of the kernel, or of the reference. The means alone cannot tell f from its aliases;
+the covariance swings at 2f by s(2f)/s(f)^2 times as much, so that together they do (Mishra & Wen, Extracting Dynamics
+from Blur). An amplitude may grow or decay linearly, and a slow drift of the means is free.
 
 The likelihood is Gaussian. It is scanned over all frequencies, amplitudes profiled out of the means, and the best
 minima are refined in all parameters (Levenberg and Marquardt). Sets hold the frequencies that are as likely as chance
@@ -36,6 +36,8 @@ _REFINED, _REFINED_BESIDE = 24, 8
 _HOPELESS = 0.6
 """Share of the best one's gain below which a maximum of the scan is not refined."""
 _LEVEL = 0.95
+_ALTERNATIVE = 15.0
+"""Chi-square by which another frequency may be worse that is named beside the best: a model is never all right."""
 _CHANCE = 1e-3
 """Chance that noise alone has such a line."""
 _AT_ONCE = 256
@@ -213,7 +215,7 @@ class Vibration:
     def _without_drift(self, weighted: FloatArray) -> FloatArray:
         """Weighted means (..., K, R, 2) without what a drift explains."""
         inside = np.einsum("rdkc,...krd->...rdc", self._drift, weighted)
-        return weighted - np.einsum("rdkc,...rdc->...krd", self._drift, inside)
+        return np.asarray(weighted - np.einsum("rdkc,...rdc->...krd", self._drift, inside))
 
     def _s(self, hz: FloatArray) -> FloatArray:
         return np.asarray(np.sinc(hz * self.seen.exposure_s))
@@ -229,12 +231,12 @@ class Vibration:
             gram = weighted @ weighted.swapaxes(1, 2) - inside @ inside.swapaxes(1, 2)
             normal += q[:, None, None, None] * q[None, None, :, None] * gram[:, None, :, None, :]
             right += q[:, None] * (weighted @ white[:, r, d])[:, None]
-        normal, right = normal.reshape(-1, 4, 4), right.reshape(-1, 4)
-        size = np.einsum("fii->f", normal)[:, None, None] + 1e-300
-        x = np.linalg.solve(normal + 1e-9 * size * np.eye(4), right[..., None])[..., 0]
+        square, pulls = normal.reshape(-1, 4, 4), right.reshape(-1, 4)
+        size = np.einsum("fii->f", square)[:, None, None] + 1e-300
+        x = np.linalg.solve(square + 1e-9 * size * np.eye(4), pulls[..., None])[..., 0]
         parts = x.reshape(-1, 2, 2)
         a = parts[..., 0] + 1j * parts[..., 1]
-        return a @ self.seen_along.T @ self.seen_along, np.einsum("fi,fi->f", x, right)
+        return a @ self.seen_along.T @ self.seen_along, np.einsum("fi,fi->f", x, pulls)
 
     def path_mean(self, lines: Sequence[Line]) -> FloatArray:
         """The mean in each exposure, along x and y, (K, 2)."""
@@ -287,7 +289,8 @@ class Vibration:
         m = self.path_mean(before)
         white = self._without_drift(self._root * (self.y - self.in_regions(m)))
         whole = float((white**2).sum())
-        means, spreads, constants, lines = [], [], [], list[Line]()
+        means, spreads, constants = (list[FloatArray]() for _ in range(3))
+        lines = list[Line]()
         limit = 0.02
         for first in range(0, len(self.hz), _AT_ONCE):
             hz = self.hz[first : first + _AT_ONCE]
@@ -347,7 +350,8 @@ class Vibration:
 
         start = np.concatenate([self._packed(each, finest, unit) for each in lines])
         done = optimize.least_squares(misfit, start, xtol=1e-7, ftol=1e-6, x_scale="jac", max_nfev=_MOST_STEPS)
-        covariance = np.linalg.pinv(done.jac.T @ done.jac)
+        slopes = np.asarray(done.jac)
+        covariance = np.linalg.pinv(slopes.T @ slopes)
         return Refined(2 * float(done.cost), unpacked(done.x), float(covariance[-size, -size]) * finest**2)
 
     def _packed(self, line: Line, finest: float, unit: float) -> FloatArray:
@@ -367,17 +371,18 @@ class Vibration:
         return sum(each / of for each, of in zip(self.chi_squares(lines), (*scale, 1.0), strict=True))
 
     def pieces(self, refined: Sequence[Refined], scale: tuple[float, float]) -> tuple[Part, ...]:
-        """The frequencies of the last line that are as likely as the best, from refined minima, the best first."""
+        """The frequencies of the last line that explain the film nearly as well as the best, which comes first, from
+        refined minima."""
         least = min(each.value for each in refined)
         worst = max(1.0, *(a / b for a, b in zip(self.misfits(min(refined).lines), scale, strict=True)))
-        allowed = float(special.gammainccinv(0.5, 1 - _LEVEL) * 2) * worst
+        allowed = float(special.gammainccinv(0.5, 1 - _LEVEL) * 2)
         found: list[Part] = []
         for each in sorted(refined):
-            more = each.value - least
-            if more > allowed:
+            more = (each.value - least) / worst
+            if more > _ALTERNATIVE:
                 break
             hz, sd = each.lines[-1].hz, math.sqrt(max(each.hz_variance * worst, 0.0))
-            reach = sd * math.sqrt(max(allowed - more, 0.04 * allowed) / worst)
+            reach = sd * math.sqrt(max(allowed - more, 0.25 * allowed))
             if hz > 0 and not any(one.low <= hz <= one.high for one in found):
                 found.append(Part(hz - reach, hz, hz + reach))
         return tuple(found)

@@ -11,6 +11,7 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
+from typing import TypedDict
 
 import numpy as np
 
@@ -19,10 +20,10 @@ from aolink.films.film import Film
 from aolink.identification import FEWEST, Readings, kinds_of, maxima, readings, space_of
 from aolink.identification.models import Process, ProcessSum
 from aolink.identification.vibration import MOST_LINES, SLOWEST, Found, Line, PathMoments, find
-from aolink.jobs.look_spots import Spots, find_spots
 from aolink.importing.frames import FilmLight, FilmSettings, film_times, nonlinear_note
-from aolink.jobs.look_texture import MARGIN, Region, lively, moments_of
 from aolink.jobs.look_scene import LEAST_MOTION, Scene
+from aolink.jobs.look_spots import Spots, find_spots
+from aolink.jobs.look_texture import MARGIN, Region, lively, moments_of
 from aolink.numerics.arrays import BoolArray, FloatArray
 
 FRAMES = 500
@@ -42,7 +43,9 @@ _MISFIT = 4.0
 _SATURATED = 0.5
 """Share of the frames with saturated pixels in a spot from which on there is no answer."""
 _COMPARABLE = 0.2
-"""Size of the last of the most lines that are looked for, over that of the first, from which on more are to be there."""
+"""Size of the last of the most lines that are looked for, over that of the first, from which on there are more."""
+_FEW = 3
+"""Frequencies in a set, of more the blur says next to nothing."""
 _REGIONS = 3
 """Parts of a picture of anything that are looked at."""
 _HARMONICS = 6
@@ -51,6 +54,14 @@ _SAME = 2.0
 _WANDERS = ("random-walk", "ornstein-uhlenbeck")
 GRADES = ("believe it", "believe the frequency, not the path", "no answer")
 Tell = Callable[[str, int, int], None]
+
+
+class Common(TypedDict):
+    """What every answer says of its film."""
+
+    rate_hz: float
+    exposure_s: float
+    frames: int
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -134,6 +145,12 @@ class Looked:
         return math.sqrt(max(float((self.found.residual**2).sum(axis=2).mean()) - _noise(self.seen), 0.0))
 
     @property
+    def sees_all(self) -> bool:
+        """Whether the motion is seen in all directions."""
+        known = np.isfinite(self.seen.mean_variance).any(axis=0)
+        return bool((known.sum(axis=1) == known.shape[1]).any())
+
+    @property
     def moves(self) -> bool:
         """Whether anything moves."""
         return bool(self.found.lines) or self.moved > 0
@@ -183,7 +200,7 @@ def look(
     starts = np.arange(count) / rate
     if film.times_ns is not None:
         starts = (film.times_ns[:count] - film.times_ns[0]) / 1e9
-    common = {"rate_hz": rate, "exposure_s": exposure_s, "frames": count}
+    common = Common(rate_hz=rate, exposure_s=exposure_s, frames=count)
     if at is None and (spots := _spots(film, settings, count, tell)) is not None:
         return _of_spots(film, settings, name, spots, kernel, starts + exposure_s / 2, common, tell)
     return _of_regions(film, settings, starts + exposure_s / 2, common, at, size, tell)
@@ -200,7 +217,7 @@ def _spots(film: Film, settings: FilmSettings, count: int, tell: Tell) -> Spots 
 
 def _of_spots(
     film: Film, settings: FilmSettings, name: str, spots: Spots, kernel: float | None, times_s: FloatArray,
-    common: dict[str, float], tell: Tell,
+    common: Common, tell: Tell,
 ) -> Looked:  # fmt: skip
     rate, exposure_s = common["rate_hz"], common["exposure_s"]
     sd = spots.sd if kernel is None else kernel
@@ -219,7 +236,7 @@ def _of_spots(
     spread = math.sqrt(max(float(blurs.sum()), 0.0))
     walks = () if found.lines else tuple(_wandering([one[d] for one in seen], scene) for d in (0, 1))
     text = scene.text(sd, _models(found, scene, each) if found.lines else walks, together=together)
-    doubts = list(_doubts(spots))
+    doubts = [*_of_film(film), *_doubts(spots)]
     if not together and n > 1:
         doubts.append("the spots move on their own: the first, brightest one is described")
     looked = Looked(
@@ -227,16 +244,16 @@ def _of_spots(
         blur=spread, grade=0, because="", plain_hz=_plain(each, found), sd=sd, spots=spots, scene=scene,
         together=together, text=text, regions=(), picture=spots.mean, cut=spots.light[:, 0], camera=False,
         assumed=tuple(_assumed(film, settings, common, spots, kernel, sd)), doubts=tuple(doubts),
-    )  # type: ignore[arg-type] # fmt: skip
+    )  # fmt: skip
     return _graded(looked)
 
 
 def _of_regions(
-    film: Film, settings: FilmSettings, times_s: FloatArray, common: dict[str, float],
+    film: Film, settings: FilmSettings, times_s: FloatArray, common: Common,
     at: tuple[float, float] | None, size: int, tell: Tell,
 ) -> Looked:  # fmt: skip
     """What moves in up to four regions of a picture of anything."""
-    count = int(common["frames"])
+    count = common["frames"]
     light = FilmLight(film, settings)
     rows, columns = film.shape
     least = 2 * MARGIN + 8
@@ -266,15 +283,16 @@ def _of_regions(
         tell("regions", number, len(cuts))
         seen, _ = moments_of(cut, times_s, common["exposure_s"], common["rate_hz"])
         results.append((seen, find(seen, most=2)))
-    results = [(seen, found) for seen, found in results]
     best = max(range(len(results)), key=lambda k: _strength(*results[k]))
     seen, found = results[best]
     camera = len(results) >= 3 and all(_alike(found, other) for _, other in results)
-    doubts = []
+    doubts = list(_of_film(film))
     if camera:
         doubts.append("all of the picture moves alike: it is the camera that moves")
-    elif others := sorted({f"{f.lines[0].hz:.4g}" for k, (_, f) in enumerate(results) if k != best and f.lines and not _alike(found, f)}):
-        doubts.append(f"another part of the picture vibrates at {' and at '.join(others)} Hz: choose one with --at X,Y")
+    own = f"{found.lines[0].hz:.3g}" if found.lines else ""
+    others = sorted({f"{each.lines[0].hz:.3g}" for _, each in results if each.lines} - {own})
+    if others and not camera:
+        doubts.append(f"other parts of the picture vibrate at {' and '.join(others)} Hz: choose one with --at X,Y")
     moved, sure = _moved(seen)
     chosen = regions[best]
     looked = Looked(
@@ -283,7 +301,7 @@ def _of_regions(
         together=False, text="", regions=(chosen, *(r for r in regions if r is not chosen)), picture=picture,
         cut=cuts[best], camera=camera, assumed=tuple(_assumed(film, settings, common, None, None, math.nan)),
         doubts=tuple(doubts),
-    )  # type: ignore[arg-type] # fmt: skip
+    )  # fmt: skip
     return _graded(looked)
 
 
@@ -381,7 +399,8 @@ def _models(found: Found, scene: Scene, seen: PathMoments) -> list[ProcessSum | 
 def _wandering(seen: Sequence[Readings], scene: Scene) -> ProcessSum | None:
     """The walk or the wandering that explains readings along a direction best."""
     best: tuple[float, ProcessSum | None] = (-math.inf, None)
-    moved = float(np.mean([(one.mean + one.centre)[one.usable].var() - one.mean_noise[one.usable].mean() for one in seen]))
+    places = [((one.mean + one.centre)[one.usable], one.mean_noise[one.usable]) for one in seen]
+    moved = float(np.mean([place.var() - noise.mean() for place, noise in places]))
     if scene.unit * math.sqrt(max(moved, 0.0)) <= LEAST_MOTION:
         return None
     for name in _WANDERS:
@@ -433,7 +452,8 @@ def _graded(looked: Looked) -> Looked:
     shown = line.ellipse[0] / math.sqrt(2) * abs(float(np.sinc(line.hz * looked.exposure_s)))
     why = []
     if len(parts) > 1:
-        why.append("the blur is too small to tell it from its aliases" if len(parts) > 3 else "these frames cannot tell it from its aliases")
+        small = "the blur is too small" if len(parts) > _FEW else "these frames are not enough"
+        why.append(f"{small} to tell it from its aliases")
     if left > _UNEXPLAINED * max(shown, LEAST_MOTION) and left > LEAST_MOTION:
         why.append(f"the places move by {left:.2g} pixels rms that no vibration explains")
     if found.spread_misfit > _MISFIT:
@@ -450,7 +470,7 @@ def _noise(seen: PathMoments) -> float:
 
 
 def _assumed(
-    film: Film, settings: FilmSettings, common: dict[str, float], spots: Spots | None, kernel: float | None, sd: float
+    film: Film, settings: FilmSettings, common: Common, spots: Spots | None, kernel: float | None, sd: float
 ) -> Iterator[str]:
     """What was taken for granted, each with what follows where it is wrong."""
     rate, exposure_s = common["rate_hz"], common["exposure_s"]
@@ -458,9 +478,9 @@ def _assumed(
         f"frames come at {rate:.6g} a second, each exposed for {exposure_s:.4g} s: if it was taken at another rate, say"
         " --rate; with another exposure, aliases are told apart wrongly"
     )
-    yield "all rows are exposed at the same time: with a rolling shutter the lower rows are later, and the blur is bent"
+    yield "all rows are exposed at the same time: with a rolling shutter lower rows are later, and the blur is bent"
     if spots is not None and kernel is None:
-        yield f"a spot at rest is {sd:.3g} pixels wide (standard deviation), as across its motion; --kernel gives another"
+        yield f"a spot at rest is {sd:.3g} pixels wide (standard deviation), as across its motion; or give --kernel"
     if film.nonlinear and settings.gamma == 1.0:
         yield f"{nonlinear_note(film)}: if it is not linear, amplitudes are wrong"
     if spots is not None and spots.left_out:
@@ -469,8 +489,13 @@ def _assumed(
         yield f"the first {common['frames']:g} of {film.count} frames are looked at: later motion may be another"
 
 
+def _of_film(film: Film) -> Iterator[str]:
+    if film.account:
+        yield f"{film.left_out} of {film.count + film.left_out} frames are none: {film.account}"
+
+
 def _doubts(spots: Spots) -> Iterator[str]:
-    if 0.001 < spots.saturated:
+    if spots.saturated > 0.001:
         yield f"{spots.saturated:.1%} of the pixels about the spots are saturated or hot and are left out: expose less"
     if spots.at_edge:
         yield "a spot is at the edge of the picture: what it does beyond is not seen"

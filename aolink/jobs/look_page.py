@@ -17,14 +17,15 @@ import numpy as np
 from aolink.errors import ExportError
 from aolink.files import writing
 from aolink.identification.vibration import Vibration
-from aolink.jobs.look_texture import MARGIN
 from aolink.jobs.look import Looked
+from aolink.jobs.look_texture import MARGIN
 from aolink.jobs.look_words import in_set, paragraph, size_of
 from aolink.numerics.arrays import FloatArray
 from aolink.plotting.report import facts_table, html_page, picture_in_page
 from aolink.plotting.style import new_figure, paper
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 STEPS = 16
@@ -65,11 +66,13 @@ def write_path(looked: Looked, path: Path, *, overwrite: bool = False) -> None:
     times = looked.seen.times_s[:, None] + inside * looked.exposure_s
     moved = looked.path(times) + (looked.found.drift[:, :1] @ looked.seen.axes[0])
     sd = looked.rest / math.sqrt(2)
-    with writing(path, overwrite=overwrite, suffix=".csv", error=ExportError) as partial, partial.open("w", newline="", encoding="utf-8") as file:
-        rows = csv.writer(file)
-        rows.writerow(("time_s", "x_pixels", "y_pixels", "sd_pixels"))
-        for t, (x, y) in zip(times.ravel(), moved.reshape(-1, 2), strict=True):
-            rows.writerow((f"{t:.9g}", f"{x:.6g}", f"{y:.6g}", f"{sd:.3g}"))
+    text = io.StringIO()
+    rows = csv.writer(text, lineterminator="\n")
+    rows.writerow(("time_s", "x_pixels", "y_pixels", "sd_pixels"))
+    for t, (x, y) in zip(times.ravel(), moved.reshape(-1, 2), strict=True):
+        rows.writerow((f"{t:.9g}", f"{x:.6g}", f"{y:.6g}", f"{sd:.3g}"))
+    with writing(path, overwrite=overwrite, suffix=".csv", error=ExportError) as partial:
+        partial.write_text(text.getvalue(), encoding="utf-8")
 
 
 def write_tone(looked: Looked, path: Path, *, overwrite: bool = False) -> bool:
@@ -80,12 +83,25 @@ def write_tone(looked: Looked, path: Path, *, overwrite: bool = False) -> bool:
     t = np.arange(round(_TONE_S * _TONE_HZ)) / _TONE_HZ
     sound = sum(line.ellipse[0] * np.sin(2 * np.pi * line.hz * t) for line in heard)
     sound = np.asarray(sound) / max(float(np.abs(sound).max()), 1e-12) * _LOUD
-    with writing(path, overwrite=overwrite, suffix=".wav", error=ExportError) as partial, wave.open(str(partial), "wb") as file:
+    with (
+        writing(path, overwrite=overwrite, suffix=".wav", error=ExportError) as partial,
+        wave.open(str(partial), "wb") as file,
+    ):
         file.setnchannels(1)
         file.setsampwidth(2)
         file.setframerate(_TONE_HZ)
         file.writeframes((sound * 32767).astype("<i2").tobytes())
     return True
+
+
+def summary(looked: Looked) -> Figure:
+    """Where it was looked at, the places, and the spectra, in a paper's size."""
+    figure = new_figure(180, 60)
+    whole, places, spectra = figure.subplots(1, 3, width_ratios=[1, 1.3, 1.3])
+    _draw_whole(looked, whole)
+    _draw_places(looked, places)
+    _draw_evidence(looked, spectra)
+    return figure
 
 
 def _numbers(looked: Looked) -> dict[str, str]:
@@ -104,7 +120,11 @@ def _numbers(looked: Looked) -> dict[str, str]:
 
 def _whole(looked: Looked) -> Figure:
     figure = new_figure(100, 75)
-    axes = figure.subplots()
+    _draw_whole(looked, figure.subplots())
+    return figure
+
+
+def _draw_whole(looked: Looked, axes: Axes) -> None:
     shown = looked.picture
     low, high = np.quantile(shown, [0.001, 0.999])
     axes.imshow(shown, cmap="gray", vmin=float(low), vmax=float(max(high, low + 1e-9)))
@@ -119,13 +139,16 @@ def _whole(looked: Looked) -> Figure:
     axes.set(
         xlabel="x, pixels", ylabel="y, pixels", xlim=(-0.5, shown.shape[1] - 0.5), ylim=(shown.shape[0] - 0.5, -0.5)
     )
-    return figure
 
 
 def _places(looked: Looked) -> Figure:
-    """Place against time along the direction of the first vibration, or of the most motion."""
     figure = new_figure(140, 60)
-    axes = figure.subplots()
+    _draw_places(looked, figure.subplots())
+    return figure
+
+
+def _draw_places(looked: Looked, axes: Axes) -> None:
+    """Place against time along the direction of the first vibration, or along x."""
     places = np.nan_to_num(looked.places - np.nanmean(looked.places, axis=0))
     along = np.array([1.0, 0.0])
     if looked.found.lines:
@@ -144,7 +167,6 @@ def _places(looked: Looked) -> Figure:
     last = min(len(times) - 1, 40)
     axes.set(xlabel="time, s", ylabel="place, pixels", xlim=(times[0] - looked.exposure_s, times[last]))
     axes.legend()
-    return figure
 
 
 def _spectrum(looked: Looked) -> Figure:
@@ -155,6 +177,12 @@ def _spectrum(looked: Looked) -> Figure:
     turned = np.exp(-2j * np.pi * hz[:, None] * looked.seen.times_s) @ places
     first.plot(hz, 2 / len(places) * np.sqrt((np.abs(turned) ** 2).sum(axis=1)), color="black", linewidth=0.7)
     first.set(xlabel="frequency, Hz (a plain spectrum)", ylabel="pixels", xlim=(0, looked.rate_hz / 2), ylim=(0, None))
+    _draw_evidence(looked, second)
+    return figure
+
+
+def _draw_evidence(looked: Looked, axes: Axes) -> None:
+    """How much each frequency explains of the places and of the blur, in standard deviations."""
     of = Vibration(looked.seen)
     means, spreads, constants, _ = of.scan(())
     none = sum(of.chi_squares(()))
@@ -162,14 +190,12 @@ def _spectrum(looked: Looked) -> Figure:
     top = max([1.2 * part.high for part in parts] + [2 * looked.rate_hz])
     shown = of.hz < top
     score = np.sqrt(np.maximum(none - means - spreads - constants, 0.0))
-    second.plot(of.hz[shown], score[shown], color="black", linewidth=0.5)
+    axes.plot(of.hz[shown], score[shown], color="black", linewidth=0.5)
     for part in parts:
-        second.axvline(part.best, color="tab:orange", linewidth=0.8, alpha=0.8)
+        axes.axvline(part.best, color="tab:orange", linewidth=0.8, alpha=0.8)
     for k in range(1, math.ceil(2 * top / looked.rate_hz)):
-        second.axvline(k * looked.rate_hz / 2, color="tab:gray", linewidth=0.4, linestyle=":")
-    second.set(xlabel="frequency, Hz (with the blur; dotted: multiples of half the rate)", xlim=(0, top), ylim=(0, None))
-    second.set(ylabel="evidence")
-    return figure
+        axes.axvline(k * looked.rate_hz / 2, color="tab:gray", linewidth=0.4, linestyle=":")
+    axes.set(xlabel="frequency, Hz (with the blur)", xlim=(0, top), ylim=(0, None), ylabel="evidence")
 
 
 def _played(looked: Looked) -> str:
@@ -201,11 +227,14 @@ def _played(looked: Looked) -> str:
         return Image.fromarray(np.kron(grey, np.ones((factor, factor), np.uint8)))
 
     def embedded(file: io.BytesIO, kind: str) -> str:
-        return f'<img alt="" src="data:image/{kind};base64,{base64.b64encode(file.getvalue()).decode()}">'
+        data = base64.b64encode(file.getvalue()).decode()
+        return f'<img alt="" style="width: 48%" src="data:image/{kind};base64,{data}">'
 
     blurred, film = io.BytesIO(), io.BytesIO()
     picture(shown[0]).save(blurred, "PNG")
     first, *rest = (picture(each) for each in shown[1:])
     first.save(film, "GIF", save_all=True, append_images=rest, duration=80, loop=0)
-    caption = f"Frame {number} as it was taken, and played in slow motion inside its exposure, along the path that was found."
+    caption = (
+        f"Frame {number} as it was taken, and played in slow motion inside its exposure, along the path that was found."
+    )
     return f"<figure>{embedded(blurred, 'png')} {embedded(film, 'gif')}<figcaption>{caption}</figcaption></figure>"

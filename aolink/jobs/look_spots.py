@@ -1,8 +1,8 @@
 """Spots of a film that may be blurred by their motion: where they are, their kernel, light and noise.
 
-The kernel is seen across the motion, where nothing blurs it: the mean of all frames, summed along the direction in which
-it is longest, is a Gaussian there. What swings across as well makes it too wide at first, and the constant that is left of
-the blur's covariances (`aolink.identification.vibration`) corrects it.
+The kernel is seen across the motion, where nothing blurs it: the mean of all frames, summed along the direction in
+which it is longest, is a Gaussian there. What swings across as well makes it too wide at first, and the constant that
+is left of the blur's covariances (`aolink.identification.vibration`) corrects it.
 """
 
 from __future__ import annotations
@@ -278,7 +278,6 @@ def _densities(profile: FloatArray, sd: float, noise: FloatArray) -> tuple[Float
 def across(picture: FloatArray) -> float:
     """Standard deviation of the kernel, from a window's mean (rows, columns): that of a Gaussian which fits the light
     summed along the direction in which it is longest."""
-    rows, columns = picture.shape
     light = np.where(np.isfinite(picture), picture, 0.0)
     bright = np.where(light > _BRIGHT_PART * light.max(), light, 0.0)
     y, x = np.indices(light.shape)
@@ -290,22 +289,23 @@ def across(picture: FloatArray) -> float:
     edges = np.arange(-math.ceil(np.abs(place).max()) - 1, math.ceil(np.abs(place).max()) + 2) / 2
     fine = (np.arange(_SUBPIXELS) + 0.5) / _SUBPIXELS - 0.5
     offsets = (vectors[0, 0] * fine[:, None] + vectors[1, 0] * fine).ravel()
-    profile = sum(np.histogram(place + each, edges, weights=light.ravel())[0] for each in offsets) / len(offsets)
+    profile = np.mean([np.histogram(place + each, edges, weights=light.ravel())[0] for each in offsets], axis=0)
     centres = (edges[1:] + edges[:-1]) / 2
-    reach = np.abs(centres) < max(_SMALLEST / 2, 6 * math.sqrt((profile.clip(0) * centres**2).sum() / profile.clip(0).sum()))
+    shown = np.maximum(profile, 0.0)
+    reach = np.abs(centres) < max(_SMALLEST / 2, 6 * math.sqrt(float((shown * centres**2).sum() / shown.sum())))
     start = math.sqrt(max(np.cov(at, aweights=bright.ravel()).trace() / 4, 1.0))
 
     def misfit(p: FloatArray) -> FloatArray:
         return np.asarray(p[0] * np.exp(-((centres - p[1]) ** 2) / (2 * p[2] ** 2)) + p[3] - profile)[reach]
 
     found = optimize.least_squares(misfit, [profile.max(), 0.0, start, 0.0])
-    pixel = (1 / 12) * (1 + 1 / 4)  # of a pixel's square, and of the bins
+    pixel = (1 + 1 + 1 / 4) / 12  # of the light over a pixel, of spreading it there, and of the bins
     return math.sqrt(max(float(found.x[2]) ** 2 - pixel, 0.1))
 
 
 def _electrons(profiles: list[FloatArray], sd: float, dark: float) -> float:
-    """A spot's photoelectrons, from profiles along x and along y whose noise in the dark is given; zero where shot noise
-    does not show."""
+    """A spot's photoelectrons, from profiles along x and along y whose noise in the dark is given; zero where no shot
+    noise shows."""
     some = np.unique(np.linspace(0, len(profiles[0]) - 1, _GAIN_FRAMES).round().astype(int))
     profiles = [profile[some] for profile in profiles]
     noises = [np.full_like(profile, dark) for profile in profiles]

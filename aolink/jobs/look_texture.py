@@ -72,7 +72,8 @@ def moments_of(
     mean, mean_variance, spread, spread_variance = (np.array([each[k] for each in fits])[:, None] for k in range(4))
     return PathMoments(
         times_s=times_s, exposure_s=exposure_s, rate_hz=rate_hz, mean=mean, mean_variance=mean_variance,
-        spread=spread, spread_variance=spread_variance, axes=Q[None], constant_sd=_sharpness(reference, Q, smooth)[None] / 2,
+        spread=spread, spread_variance=spread_variance, axes=Q[None],
+        constant_sd=_sharpness(reference, Q, smooth)[None] / 2,
     ), reference  # fmt: skip
 
 
@@ -86,7 +87,7 @@ def principal_axes(image: FloatArray) -> tuple[FloatArray, bool]:
 
 def _sharpness(reference: FloatArray, Q: FloatArray, smooth: float) -> FloatArray:
     """The most that the mean blur of a reference can be, uu, uv and vv, (3,): the variance of its edges, which would be
-    wider otherwise. A Gaussian edge has twice its variance as the mean square of its first derivative over its second's."""
+    wider otherwise. Of a Gaussian edge that is half the mean square of its first derivative over its second's."""
     inside = (slice(MARGIN, -MARGIN),) * 2
     y, x = np.gradient(reference)
     widths = []

@@ -43,11 +43,20 @@ def size_of(line: Line, looked: Looked) -> str:
     """How far and in what direction a vibration goes."""
     longer, shorter, angle = line.ellipse
     # Rows count downwards, angles upwards.
-    degrees = round(-math.degrees(angle)) % 180
+    degrees = _degrees(angle)
     if shorter > max(0.1 * longer, 2 * looked.rest / math.sqrt(looked.frames)):
-        return f"in an ellipse of {_digits(longer)} by {_digits(shorter)} pixels to each side, the longer along {degrees} degrees from horizontal"
+        return (
+            f"in an ellipse, {_digits(longer)} by {_digits(shorter)} pixels to each side, the longer one along"
+            f" {degrees} degrees from horizontal"
+        )
     across = "" if len(looked.seen.axes) and looked.sees_all else " (an edge is seen across itself only)"
     return f"{_digits(longer)} pixels to each side, along {degrees} degrees from horizontal{across}"
+
+
+def _degrees(angle: float) -> int:
+    """From horizontal, from -89 to 90, upwards positive."""
+    degrees = round(-math.degrees(angle))
+    return degrees + 180 * (degrees <= -90)
 
 
 def in_set(parts: tuple[Part, ...]) -> str:
@@ -59,7 +68,8 @@ def in_set(parts: tuple[Part, ...]) -> str:
         return said
     others.sort(key=lambda each: each.best)
     named = ", ".join(f"{each.best:.{digits}f}" for each in others[:_MOST_NAMED])
-    return f"{said} or at {named} Hz{' and so on' if len(others) > _MOST_NAMED else ''}, which these frames cannot tell from it"
+    more = " and so on" if len(others) > _MOST_NAMED else ""
+    return f"{said} or at {named} Hz{more}, which these frames cannot tell from it"
 
 
 def _digits(value: float) -> str:
@@ -74,7 +84,7 @@ def as_json(looked: Looked) -> dict[str, Any]:
         "lines": [
             {
                 "hz": line.hz, "set": [[part.low, part.high] for part in parts], "best": [part.best for part in parts],
-                "half_axes_pixels": list(line.ellipse[:2]), "degrees": round(-math.degrees(line.ellipse[2]), 1) % 180,
+                "half_axes_pixels": list(line.ellipse[:2]), "degrees": _degrees(line.ellipse[2]),
                 "harmonic": n, "growth": line.growth,
             }
             for line, parts, n in zip(looked.found.lines, looked.found.sets, looked.harmonics, strict=True)
