@@ -53,7 +53,6 @@ SHORTER = {
     "--exposures 30": "--exposures 6",
     "--start 10 --end 20": "--start 0.5 --end 1.5",
     "[--view]": "",  # a test has no screen
-    "aolink look film.tif": "aolink look film.tif --quick",
 }
 """What is changed about a command before it is run: times, and what needs a screen."""
 EXIT_CODES = {"aolink copy broken.mcap": 1}

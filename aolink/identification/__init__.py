@@ -8,15 +8,14 @@ is `aolink/pages/identify.md`.
 
 from aolink.identification.choose import CANDIDATES, Tried, chosen, tried
 from aolink.identification.models import PARAMETERS, PLANTS, UNITS, IdentifiedPlant, Process, ProcessSum, kinds_of
-from aolink.identification.pixels import Candidate, Scan, by_pixels, candidates, refined, scanned
 from aolink.identification.readings import FEWEST, Readings, readings
 from aolink.identification.rig_text import identified_text
 from aolink.identification.search import Maximum, Space, maxima, space_of
 from aolink.identification.sets import Identified, Piece, identified
 
 __all__ = [
-    "CANDIDATES", "FEWEST", "PARAMETERS", "PLANTS", "UNITS", "Candidate", "Identified", "IdentifiedPlant", "Maximum",
-    "Piece", "Process", "ProcessSum", "Readings", "Scan", "Space", "Tried", "by_pixels", "candidates",
-    "chosen", "identified", "identified_text", "kinds_of", "maxima", "readings", "refined", "scanned",
+    "CANDIDATES", "FEWEST", "PARAMETERS", "PLANTS", "UNITS", "Identified", "IdentifiedPlant", "Maximum",
+    "Piece", "Process", "ProcessSum", "Readings", "Space", "Tried",
+    "chosen", "identified", "identified_text", "kinds_of", "maxima", "readings",
     "space_of", "tried",
 ]  # fmt: skip

@@ -66,7 +66,7 @@ class Identified:
     def contradiction(self) -> str:
         """What a set without any piece means."""
         return (
-            f"{self.name}: the pixels rule out every value that centroids and widths allow, so that no set is left: the"
+            f"{self.name}: no value explains centroids and widths, so that no set is left: the"
             " model, the kernel or the noise is another than the rig file or --model says"
         )
 
@@ -75,32 +75,6 @@ class Identified:
         return any(
             (each.low <= value or each.open_low) and (value <= each.high or each.open_high) for each in self.pieces
         )
-
-    def within(self, intervals: Sequence[tuple[float, float]]) -> Identified:
-        """The part of the set that lies in these intervals, which may overlap; no piece where none of it does."""
-        pieces = [
-            Piece(
-                low, high, min(max(each.best, low), high), each.open_low and low == each.low,
-                each.open_high and high == each.high,
-            )
-            for each in self.pieces
-            for low, high in ((max(each.low, low), min(each.high, high)) for low, high in intervals)
-            if low <= high
-        ]  # fmt: skip
-        return replace(self, pieces=_joined(pieces))
-
-    def at(self, value: float) -> Identified:
-        """The set with another best value, which the pixels prefer; its nearest piece is extended to hold it."""
-
-        def distance(each: Piece) -> float:
-            return max(each.low - value, value - each.high)
-
-        nearest = min(self.pieces, key=distance, default=None)
-        pieces = tuple(
-            replace(each, low=min(each.low, value), high=max(each.high, value), best=value) if each is nearest else each
-            for each in self.pieces
-        )
-        return replace(self, best=value, pieces=pieces)
 
 
 def identified(

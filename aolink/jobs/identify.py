@@ -3,7 +3,6 @@ frames."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -11,21 +10,17 @@ import numpy as np
 
 from aolink import identification
 from aolink.errors import IdentificationError
-from aolink.exposure import Exposure
 from aolink.identification import Maximum, ProcessSum, Readings, Space, Tried, identified, kinds_of, readings, tried
 from aolink.numerics.arrays import FloatArray
 from aolink.recording.reader import Recording
 from aolink.recording.reestimate import check_has_exposures
-from aolink.rig import Rig, parse_rig
+from aolink.rig import Rig
 from aolink.units import counted
 
 _MOST_OUTPUTS = 24
 """The most outputs that a model is fitted to; from more outputs, as many are taken at equal distances."""
 _APART = 2
 """Up to this many outputs of a copy of the plant have a model each; more outputs share one."""
-_BY_PIXELS = 4
-"""The most spots, of one output each, whose pixels distinguish aliases: `profile` takes a tenth of a second for an
-exposure of each."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,8 +33,6 @@ class Wanted:
     """Kind of the plant, where it is fitted as well."""
     lowest_hz: float | None = None
     highest_hz: float | None = None
-    pixels: bool = True
-    """Whether all pixels distinguish aliases, where they can."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,7 +79,6 @@ def identify(recordings: Sequence[Recording], rig: Rig | None, wanted: Wanted, t
     _check_plant(first, wanted)
     plant_known = wanted.plant is None
     seen: list[Readings] = []
-    longest: list[Exposure] = []
     for number, recording in enumerate(recordings):
         check_has_exposures(recording)
         own = rig or recording.rig
@@ -96,23 +88,21 @@ def identify(recordings: Sequence[Recording], rig: Rig | None, wanted: Wanted, t
             )
         exposures = list(recording.exposures())
         seen.append(readings(own, exposures, plant_known=plant_known))
-        longest = max(longest, exposures, key=len)
         if tell:
             tell("recordings", number + 1, len(recordings))
-    return from_readings(first, seen, longest, wanted, tell)
+    return from_readings(first, seen, wanted, tell)
 
 
 def from_readings(
-    rig: Rig, seen: Sequence[Readings], exposures: Sequence[Exposure], wanted: Wanted, tell: Tell | None = None,
-    maxima: Sequence[Maximum] = (),
+    rig: Rig, seen: Sequence[Readings], wanted: Wanted, tell: Tell | None = None, maxima: Sequence[Maximum] = ()
 ) -> Result:  # fmt: skip
-    """Identify models as `identify` does, from the readings of each recording, and the exposures of one.
+    """Identify models as `identify` does, from the readings of each recording.
 
     ``maxima`` are those of the one model that is wanted, of a rig with one output to a copy, where they are known
     already.
     """
     _check_plant(rig, wanted)
-    found = [_of_output(rig, label, each, exposures, wanted, tell, maxima) for label, each in _by_output(rig, seen)]
+    found = [_of_output(label, each, wanted, tell, maxima) for label, each in _by_output(rig, seen)]
     text = identification.identified_text(rig.toml, rig, [each.model for each in found], plant=found[0].plant)
     return Result(found=tuple(found), text=text)
 
@@ -153,7 +143,7 @@ def _some(seen: Readings, which: Sequence[int]) -> Readings:
 
 
 def _of_output(
-    rig: Rig, output: str, seen: Sequence[Readings], exposures: Sequence[Exposure], wanted: Wanted, tell: Tell | None,
+    output: str, seen: Sequence[Readings], wanted: Wanted, tell: Tell | None,
     known: Sequence[Maximum],
 ) -> IdentifiedModel:  # fmt: skip
     def space(kinds: Sequence[str]) -> Space:
@@ -171,36 +161,11 @@ def _of_output(
     of = space(kinds_of(name) if name else ())
     if tell:
         tell(f"fit, {output}", 0, len(of.names) + 1)
-    everything = tops = list(known) or identification.maxima(of, seen)
+    tops = list(known) or identification.maxima(of, seen)
     x = tops[0].x
-    left_hz: dict[int, list[tuple[float, float]]] = {}
-    if wanted.pixels and rig.plant.n_outputs == 1 and rig.plant.axes <= _BY_PIXELS:
-
-        def rig_of(x: FloatArray) -> Rig:
-            return _with_model(rig, of, x)
-
-        def on_pixels(done: int, of: int) -> None:
-            if tell:
-                tell(f"pixels, {output}", done, of)
-
-        scan = identification.scanned(of, tops, seen, rig_of, exposures, on_pixels)
-        left = identification.by_pixels(
-            [*identification.candidates(of, everything, seen), *scan.candidates], rig_of, exposures, on_pixels
-        )
-        for k, intervals in scan.left.items():
-            # What is left of the candidates was compared with the best frequencies of the scan itself.
-            hz, damping = np.exp([each.x[k : k + 2] for each in left]).T
-            left_hz[k] = [*zip(hz * (1 - damping), hz * (1 + damping), strict=True), *intervals]
-        tops = list(dict.fromkeys(each.maximum for each in left))
-        x = identification.refined(of, left[0].x, rig_of, exposures, on_pixels)
     sets = identified(of, tops, seen, (lambda k: tell(f"fit, {output}", k + 1, len(of.names) + 1)) if tell else None)
-    sets = tuple(
-        (each.within(left_hz[k]) if k in left_hz else each).at(value)
-        for k, (each, value) in enumerate(zip(sets, np.exp(x).tolist(), strict=True))
-    )
     plant = of.fitted_plant(x)
-    notes = _ruled_out(of, everything, tops)
-    notes += [each.contradiction for each in sets if not each.pieces]
+    notes = [each.contradiction for each in sets if not each.pieces]
     for each in sets:
         if each.name.endswith("frequency_hz") and len(each.pieces) > 1:
             rest = ", ".join(f"{piece.best:.4g}" for piece in each.pieces if not piece.low <= each.best <= piece.high)
@@ -218,21 +183,3 @@ def _without_plant(of: Space, x: FloatArray) -> ProcessSum:
     """The disturbance, without the noise of a plant that is fitted."""
     whole = of.model(x)
     return replace(whole, processes=whole.processes[1 if of.plant else 0 :])
-
-
-def _with_model(rig: Rig, of: Space, x: FloatArray) -> Rig:
-    """The rig with the model of a vector of parameters, for a plant of one output."""
-    models, plant = [_without_plant(of, x)], of.fitted_plant(x)
-    return parse_rig(identification.identified_text(rig.toml, rig, models, plant=plant))
-
-
-def _ruled_out(of: Space, found: Sequence[Maximum], left: Sequence[Maximum]) -> list[str]:
-    """A note for each frequency with maxima that the pixels rule out."""
-    notes = []
-    for k, name in enumerate(of.names):
-        if name.endswith("frequency_hz"):
-            kept = {f"{math.exp(each.x[k]):.4g}" for each in left}
-            out = dict.fromkeys(f"{math.exp(each.x[k]):.4g}" for each in found)
-            if gone := [each for each in out if each not in kept]:
-                notes.append(f"{name}: the pixels rule out {', '.join(gone)} Hz, which centroids and widths allow")
-    return notes

@@ -2,16 +2,11 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 import aolink
-from aolink.cli.tables.identification import set_text
 from aolink.errors import IdentificationError
 from aolink.identification import (
-    Identified,
     IdentifiedPlant,
-    Piece,
     chosen,
     identified,
     maxima,
@@ -105,45 +100,3 @@ def test_a_plant_is_identified_from_a_session_that_plays_a_pseudo_random_sequenc
     best = must_be(IdentifiedPlant, of.fitted_plant(maxima(of, seen)[0].x))
     assert best["gain"] == pytest.approx(0.8, rel=0.05)
     assert best["correlation_s"] == pytest.approx(-1e-3 / np.log(0.995), rel=0.05)
-
-
-@pytest.mark.parametrize(
-    ("value", "ends"), [(2.5, (2.0, 3.0)), (3.4, (2.0, 3.4)), (1.2, (0.9, 1.2))], ids=["inside", "above", "other piece"]
-)
-def test_a_set_is_extended_to_hold_the_value_that_the_pixels_prefer(value, ends):
-    low = Piece(0.9, 1.1, 1.0, open_low=False, open_high=False)
-    high = Piece(2.0, 3.0, 2.2, open_low=False, open_high=True)
-    found = Identified("frequency_hz", 2.2, (low, high), 1.0).at(value)
-    assert found.best == value
-    assert found.holds(value)
-    moved = [each for each in found.pieces if each not in (low, high)]
-    assert [(each.low, each.high, each.best) for each in moved] == [(*ends, value)]
-
-
-interval = st.tuples(st.floats(0.0, 10.0), st.floats(0.0, 10.0)).map(sorted)
-
-
-@given(
-    pieces=st.lists(interval, min_size=1, max_size=4), intervals=st.lists(interval, max_size=4), at=st.floats(0.0, 10.0)
-)
-def test_the_part_of_a_set_within_intervals_is_what_both_hold(pieces, intervals, at):
-    whole = Identified("frequency_hz", 1.0, tuple(Piece(low, high, low, False, False) for low, high in pieces), 1.0)
-    part = whole.within(intervals)
-    assert part.holds(at) == (whole.holds(at) and any(low <= at <= high for low, high in intervals))
-    assert all(piece.low <= piece.best <= piece.high for piece in part.pieces)
-
-
-def test_a_set_that_nothing_is_left_of_stays_empty():
-    """Two sets that contradict each other are not replaced by one of them."""
-    whole = Identified("frequency_hz", 5.0, (Piece(4.0, 6.0, 5.0, False, False),), 1.0)
-    nothing = whole.within([(0.0, 3.0), (7.0, 9.0)]).at(8.0)
-    assert (nothing.best, nothing.pieces) == (8.0, ())
-    assert set_text(nothing) == "none: contradiction"
-    assert nothing.contradiction.startswith("frequency_hz: the pixels rule out every value that centroids and widths")
-
-
-def test_an_end_that_was_not_an_end_of_the_set_stays_so_only_where_it_is():
-    whole = Identified("frequency_hz", 5.0, (Piece(1.0, 9.0, 5.0, True, True),), 1.0)
-    (low, high) = whole.within([(0.0, 2.0), (4.0, 9.5)]).pieces
-    assert (low.low, low.high, low.open_low, low.open_high) == (1.0, 2.0, True, False)
-    assert (high.low, high.high, high.open_low, high.open_high, high.best) == (4.0, 9.0, False, True, 5.0)
