@@ -141,6 +141,8 @@ def laboratory(tmp_path_factory: pytest.TempPathFactory) -> Path:
     rigs = load_rig("section-vi").path_of("", "")
     shutil.copytree(rigs, folder / "aolink" / "rigs")
     shutil.copy(rigs / "section-vi.toml", folder / "my.toml")  # as README begins with
+    (folder / "recordings").mkdir()
+    shutil.copy(ROOT / "recordings" / "fork.npz", folder / "recordings")
     rig = load_rig(folder / "my.toml")
     with simulated_rig(folder / "my.toml") as ports:
         record(rig, *ports, folder / "session.mcap", estimators=["moments"], exposures=12)

@@ -22,7 +22,7 @@ from aolink.jobs.look_texture import MARGIN
 from aolink.jobs.look_words import in_set, paragraph, size_of
 from aolink.numerics.arrays import FloatArray
 from aolink.plotting.report import facts_table, html_page, picture_in_page
-from aolink.plotting.style import new_figure, paper
+from aolink.plotting.style import legend_above, new_figure, paper
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -31,6 +31,8 @@ if TYPE_CHECKING:
 STEPS = 16
 """Instants of an exposure in the path's table, and in the film of one exposure."""
 _POINTS = 4000
+_SHOWN = 15
+"""Exposures whose path is drawn."""
 _TONE_S, _TONE_HZ, _LOUD = 2.0, 44_100, 0.7
 _AUDIBLE = (20.0, 20_000.0)
 _LARGE = 200
@@ -164,9 +166,9 @@ def _draw_places(looked: Looked, axes: Axes) -> None:
         joined = np.concatenate([path, np.full((len(path), 1), np.nan)], axis=1)
         at = np.concatenate([fine, fine[:, -1:]], axis=1)
         axes.plot(at.ravel(), joined.ravel(), color="tab:orange", linewidth=0.8, label="path in the exposures")
-    last = min(len(times) - 1, 40)
+    last = min(len(times) - 1, _SHOWN)
     axes.set(xlabel="time, s", ylabel="place, pixels", xlim=(times[0] - looked.exposure_s, times[last]))
-    axes.legend()
+    legend_above(axes)
 
 
 def _spectrum(looked: Looked) -> Figure:
@@ -185,17 +187,19 @@ def _draw_evidence(looked: Looked, axes: Axes) -> None:
     """How much each frequency explains of the places and of the blur, in standard deviations."""
     of = Vibration(looked.seen)
     means, spreads, constants, _ = of.scan(())
-    none = sum(of.chi_squares(()))
+    none, off, constant = of.chi_squares(())
     parts = [part for each in looked.found.sets for part in each]
     top = max([1.2 * part.high for part in parts] + [2 * looked.rate_hz])
     shown = of.hz < top
-    score = np.sqrt(np.maximum(none - means - spreads - constants, 0.0))
-    axes.plot(of.hz[shown], score[shown], color="black", linewidth=0.5)
+    places, blur = none - means, off + constant - spreads - constants
+    for name, gained, color in (("places", places, "black"), ("blur", blur, "tab:blue")):
+        axes.plot(of.hz[shown], np.sqrt(np.maximum(gained[shown], 0.0)), color=color, linewidth=0.5, label=name)
     for part in parts:
-        axes.axvline(part.best, color="tab:orange", linewidth=0.8, alpha=0.8)
+        axes.axvline(part.best, color="tab:orange", linewidth=2.5, alpha=0.35, zorder=0)
     for k in range(1, math.ceil(2 * top / looked.rate_hz)):
         axes.axvline(k * looked.rate_hz / 2, color="tab:gray", linewidth=0.4, linestyle=":")
     axes.set(xlabel="frequency, Hz (with the blur)", xlim=(0, top), ylim=(0, None), ylabel="evidence")
+    legend_above(axes)
 
 
 def _played(looked: Looked) -> str:

@@ -32,8 +32,9 @@ _SIGNIFICANT = 8.0
 """A spot is this many standard deviations of a smoothed frame's noise above the ground, ..."""
 _STILL = 4.5
 """Differences of two frames beyond so many medians are motion."""
-_DARK = 0.15
-"""Share of the brightest light that the picture has elsewhere where spots stand alone."""
+_DARK, _MOST_OF_BORDER = 0.15, 0.9
+"""Share of the brightest light that the picture has elsewhere where spots stand alone, and of a window's border that is
+so dark."""
 _FAINTEST = 0.2
 """... and has this share of the brightest one's height; it goes where it has half of the latter."""
 _SHARPEST = 0.8
@@ -127,7 +128,7 @@ def find_spots(
         light=windows, corners=corners, sd=sd, noise=noise,
         electrons=electrons, mean=mean, saturated=float(bad.mean()), left_out=left_out,
         saturated_frames=float((bad[:, 0] & ~defects[_inside(corners[0], side, film.shape)]).any(axis=(1, 2)).mean()),
-        alone=_alone(mean, corners, side),
+        alone=_alone(mean, corners, windows),
         at_edge=bool((corners < 0).any() or (ends > (columns, rows)).any()),
     )  # fmt: skip
 
@@ -138,12 +139,19 @@ def _inside(corner: IntArray, side: int, shape: tuple[int, int]) -> tuple[IntArr
     return y[:, None], x[None]
 
 
-def _alone(mean: FloatArray, corners: IntArray, side: int) -> bool:
-    """Whether the mean picture is dark but for the windows: nothing else has a tenth of the brightest light."""
-    rest = mean.copy()
-    top = float(mean.max())
-    for x, y in corners:
+def _alone(mean: FloatArray, corners: IntArray, windows: FloatArray) -> bool:
+    """Whether the picture is dark but for the spots: they have room in it, and neither at the borders of their windows
+    nor elsewhere has the mean of the frames more than a share of the brightest light."""
+    rest, top, side = mean.copy(), float(mean.max()), windows.shape[-1]
+    if side > min(mean.shape):
+        return False
+    border = np.ones((side, side), dtype=np.bool_)
+    border[1:-1, 1:-1] = False
+    for k, (x, y) in enumerate(corners):
         rest[max(0, y) : y + side, max(0, x) : x + side] = np.nan
+        seen = windows[:, k].mean(axis=0)
+        if not float(np.nanquantile(np.abs(seen[border]), _MOST_OF_BORDER)) < _DARK * float(np.nanmax(seen)):
+            return False
     rest = rest[np.isfinite(rest)]
     return rest.size == 0 or float(np.quantile(np.abs(rest - np.median(rest)), 0.99)) < _DARK * top
 

@@ -21,6 +21,7 @@ from aolink.jobs.look_words import as_json, paragraph
 from aolink.recording.reader import Recording
 from aolink.rig import load_rig, parse_rig
 from tests.jobs.test_look_spots import shaken
+from tests.needs import needed
 
 RATE, EXPOSURE = 50.0, 0.67 / 37.3
 """With .67 cycles in an exposure and .746 from frame to frame: 37.3 Hz at 50 frames a second."""
@@ -212,3 +213,19 @@ def test_without_matplotlib_there_is_an_answer_and_no_page(tmp_path: Path) -> No
     assert "No answer" in done.stdout
     assert "no page with pictures" in done.stdout
     assert sorted(each.name for each in (tmp_path / "film-look").iterdir()) == ["film.mcap", "rig.toml"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("summed", "opened"), [(40, 40), (40, 20), (30, 30), (20, 20), (25, 20)])
+def test_a_fork_of_32_hz_is_found_in_films_of_slow_cameras(summed: int, opened: int) -> None:
+    """Frames of a real film at 1000 frames/s averaged; 25 exposures a second see 32 Hz as 7."""
+    av = needed("av")
+    with av.open(str(Path(__file__).parents[1] / "data" / "fork_32_hz.mp4")) as film:
+        frames = np.stack([each.to_ndarray(format="gray")[60:140, 310:406] for each in film.decode(video=0)])
+    count = len(frames) // summed
+    slow = frames[: count * summed].reshape(count, summed, *frames.shape[1:])[:, :opened].mean(axis=1)
+    settings = FilmSettings(rate_hz=1000 / summed, exposure_s=opened / 1000)
+    looked = look(array_film(np.rint(slow).astype(np.uint8), "fork"), settings, "fork")
+    assert looked.grade < 2
+    assert looked.lines[0].hz == pytest.approx(31.97, abs=0.05)
+    assert looked.lines[0].ellipse[0] == pytest.approx(1.5, abs=0.15)
