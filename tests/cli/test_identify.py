@@ -39,7 +39,7 @@ def test_a_model_goes_into_a_rig_file(aolink, shaken, tmp_path):
     ("arguments", "says"),
     [
         (["--fit", "second-order"], "no input to identify a plant from"),
-        (["--model", "wobble"], "no kind of process"),
+        (["--model", "wobble"], "kind of process"),
         (["--model", "resonance", "--model", "random-walk"], "or one --model"),
         (["--model", "resonance", "--highest", "900"], "above half of the fast rate"),
     ],
