@@ -112,6 +112,7 @@ def test_an_edge_shows_the_motion_across_it() -> None:
     assert line.ellipse[2] == pytest.approx(angle, abs=0.01)
 
 
+@pytest.mark.slow
 def test_sets_hold_the_truth_as_often_as_they_say() -> None:
     rng = np.random.default_rng(5)
     hits = 0
