@@ -58,6 +58,7 @@ def negative(folder: Path) -> Path:
         negative,
     ],
 )  # fmt: skip
+@pytest.mark.slow
 def test_a_small_file_that_asks_for_much_is_refused_before_a_frame_is_read(write, tmp_path):
     path = write(tmp_path)
     with pytest.raises(ImportingError, match=r"limit|damaged"):
