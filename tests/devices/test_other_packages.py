@@ -243,7 +243,7 @@ def test_the_drivers_of_a_rig_file_are_checked_before_anything_is_opened(
     assert checked.returncode == 2
     errors = {each["key"]: each["message"] for each in json.loads(checked.stdout) if each["severity"] == "error"}
     assert "there is no camera driver exmaple" in errors["devices.camera"]
-    assert "cannot take these keys" in errors["devices.mirror"]
+    assert "no key unit_rd" in errors["devices.mirror"]
     good = aolink("rig", rig_file(tmp_path, mirror=""), "--check", env=installed)
     assert good.returncode == 0
     assert "the camera is recorded alone" in " ".join(good.stdout.split())
