@@ -16,6 +16,7 @@ without such locks two commands still cannot damage the target: each puts a whol
 
 from __future__ import annotations
 
+import atexit
 import errno
 import fcntl
 import os
@@ -39,6 +40,9 @@ _LONGEST_NAME = 200
 """The most bytes of the target's name in that of the unfinished file; file systems allow 255 for the whole name."""
 _UNFINISHED = re.compile(r"[0-9a-f]{16}\.partial")
 """The ending of the names of unfinished files."""
+_left: dict[Path, int] = {}
+"""Unfinished files that have not been removed, with the process that began them. An interruption may come while they
+are being removed: then it is done at the process's end."""
 _NO_LINKS = {errno.EPERM, errno.EOPNOTSUPP, errno.ENOTSUP, errno.ENOSYS, errno.EMLINK}
 """Errors of a file system that has no hard links."""
 _KINDS = {
@@ -282,6 +286,12 @@ def _remove(held: Iterable[Path]) -> None:
     for each in held:
         with suppress(OSError):
             each.unlink()
+        _left.pop(each, None)
+
+
+@atexit.register
+def _remove_left() -> None:
+    _remove([path for path, process in _left.items() if process == os.getpid()])
 
 
 def _begun(target: Path, error: type[AolinkError], held: list[Path]) -> tuple[Path, int]:
@@ -296,6 +306,7 @@ def _begun(target: Path, error: type[AolinkError], held: list[Path]) -> tuple[Pa
         if os.path.lexists(partial):
             continue
         held[:] = [partial]
+        _left[partial] = os.getpid()
         # A private file must not be open to others even for a moment.
         mode = 0o600 if os.path.lexists(target) else 0o666
         descriptor = os.open(partial, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, mode)

@@ -64,6 +64,8 @@ class StopRequest:
             if number == signal.SIGHUP:
                 _leave_lost_terminal()
         if self._at_once if first else now - self._first_s > _ECHO_S:
+            global _is_interrupted
+            _is_interrupted = True
             raise Interrupted(number)
 
     @contextmanager
@@ -84,6 +86,8 @@ class StopRequest:
             raise Interrupted(self.signal)
 
 
+_is_interrupted = False
+"""Whether an interruption has been raised: what libraries cannot close then, half done, is nothing to report."""
 _lost = 0
 """The signal whose interruption was lost, until it is raised again."""
 
@@ -100,7 +104,7 @@ def _not_lost(ignored: sys.UnraisableHookArgs, report: Callable[[sys.UnraisableH
     if isinstance(ignored.exc_value, Interrupted):
         _lost = ignored.exc_value.number
         signal.setitimer(signal.ITIMER_REAL, _AGAIN_S)
-    else:
+    elif not _is_interrupted:
         report(ignored)
 
 

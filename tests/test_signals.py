@@ -24,7 +24,9 @@ from typing import Any, Self
 import numpy as np
 import pytest
 
+from aolink import files, signals
 from aolink.cli.common import app
+from aolink.files import writing
 from aolink.recording.editing import cut
 from aolink.recording.reader import Recording
 from aolink.signals import ending_the_command
@@ -294,3 +296,39 @@ def test_a_signal_while_an_entry_of_a_zip_file_is_opened_is_one_line(
     del ended
     gc.collect()
     assert capsys.readouterr().err == "aolink: interrupted by SIGTERM\n"
+
+
+def test_a_signal_at_any_line_of_saving_arrays_leaves_nothing_half(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Also while a ZIP file is being closed, or the unfinished file is being removed."""
+    monkeypatch.setattr(sys, "unraisablehook", sys.unraisablehook)
+    monkeypatch.setattr(signals, "_is_interrupted", False)
+    at, ended = 1, False
+    while not ended:
+        passed = 0
+        (folder := tmp_path / str(at)).mkdir()  # what was interrupted may stay locked in this process
+
+        def trace(frame: Any, event: str, argument: Any, at: int = at) -> Any:
+            nonlocal passed
+            passed += event in ("line", "return")
+            if passed == at:
+                sys.settrace(None)
+                os.kill(os.getpid(), signal.SIGTERM)
+            return trace if passed < at else None
+
+        with contextlib.suppress(SystemExit), ending_the_command():
+            sys.settrace(trace)
+            try:
+                with writing(folder / "a.npz") as partial, partial.open("wb") as file:
+                    np.savez(file, a=np.arange(50.0))
+            finally:
+                sys.settrace(None)
+        files._remove_left()
+        ended = passed < at
+        assert capsys.readouterr().err == ("" if ended else "aolink: interrupted by SIGTERM\n"), at
+        assert [each.name for each in folder.iterdir()] in ([], ["a.npz"]), at
+        at += 13
+    assert at > 500
+    with np.load(folder / "a.npz") as saved:
+        assert saved["a"].shape == (50,)

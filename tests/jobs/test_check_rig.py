@@ -10,7 +10,7 @@ import pytest
 
 import aolink
 from aolink.control.loop import centroids
-from aolink.jobs.check_rig import check_rig
+from aolink.jobs.check_rig import check_devices, check_rig
 from aolink.rig import builtin_rigs, load_rig, parse_rig
 
 SECTION_VI = load_rig("section-vi").toml
@@ -126,3 +126,15 @@ def test_rows_of_one_spot_that_are_exposed_too_far_apart_are_a_warning() -> None
     assert all("up to 0.2 of" in text for skew in (0.2, -0.2) for text in said[skew])
     assert said[0.2]
     assert said[-0.2]
+
+
+@pytest.mark.parametrize(
+    ("row_time", "driver", "warned"),
+    [("", "opencv", True), ("row_time_s = 0.0", "opencv", False), ("", "folder", False)],
+)
+def test_a_camera_that_may_expose_row_by_row_needs_a_row_time(row_time: str, driver: str, warned: bool) -> None:
+    key = {"opencv": "source", "folder": "path"}[driver]
+    text = load_rig("section-vi").toml.replace('kind = "line"', f'kind = "line"\n{row_time}')
+    rig = parse_rig(f'{text}\n[devices.camera]\ndriver = "{driver}"\n{key} = "a"\n')
+    found = [(each.severity, each.key) for each in check_devices(rig)]
+    assert (("warning", "sensor.row_time_s") in found) == warned

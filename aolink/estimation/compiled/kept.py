@@ -87,7 +87,11 @@ def compile_once(groups: Sequence[str], program: Callable[[list[str]], str]) -> 
     if kept is None:
         return
     with open(kept / "compiling.lock", "w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)  # another process may be compiling
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            _say("aolink: another process is compiling the loops of the estimators: waiting until it is done\n")
+            fcntl.flock(lock, fcntl.LOCK_EX)
         if not (missing := _missing(kept, groups)):
             return
         _say(f"aolink: compiling the loops of {', '.join(missing)} (once) ")

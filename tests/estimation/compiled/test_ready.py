@@ -4,6 +4,8 @@ import ast
 import os
 import subprocess
 import sys
+import threading
+import time
 
 import pytest
 
@@ -34,6 +36,26 @@ def test_one_process_compiles_a_group_for_all_others(place, capsys):
     assert [each.partition(" (once)")[0] for each in lines] == [
         "aolink: compiling the loops of a", "aolink: compiling the loops of b, c"
     ]  # fmt: skip
+
+
+def test_who_waits_for_another_process_says_so(place, capsys):
+    """One that holds the lock until this one has said that it waits, in the lines of its standard error."""
+    holds = (
+        "import fcntl, sys; lock = open(sys.argv[1], 'w'); fcntl.flock(lock, fcntl.LOCK_EX);"
+        " print('held', flush=True); sys.stdin.read()"
+    )
+    command = [sys.executable, "-c", holds, str(kept.folder() / "compiling.lock")]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as other:
+        assert other.stdout.readline() == "held\n"
+        waiting = threading.Thread(target=kept.compile_once, args=(["a"], lambda groups: "pass"))
+        waiting.start()
+        said = ""
+        while "waiting" not in said:
+            said += capsys.readouterr().err
+            time.sleep(0.01)
+        other.stdin.close()
+        waiting.join()
+    assert "waiting" not in capsys.readouterr().err
 
 
 def test_a_compilation_that_fails_is_said_and_tried_again(place, capsys):
