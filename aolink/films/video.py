@@ -110,10 +110,10 @@ def _bits(frame: Any) -> int:
 def _pixels(frame: Any) -> NDArray[Any]:
     """A frame's numbers as a player would turn them."""
     pixels = _unturned(frame)
-    found = next((bytes(each) for each in frame.side_data if each.type.name == "DISPLAYMATRIX"), None)
+    found = frame.side_data.get("DISPLAYMATRIX")
     if found is None:
         return pixels
-    a, b, _, c, d = np.frombuffer(found, "<i4", 5).tolist()
+    a, b, _, c, d = np.frombuffer(bytes(found), "<i4", 5).tolist()
     if abs(a) < abs(b):
         pixels, a, d = pixels.swapaxes(0, 1), c, b
     return np.ascontiguousarray(pixels[:: -1 if d < 0 else 1, :: -1 if a < 0 else 1])

@@ -126,7 +126,7 @@ def test_a_films_motion_has_the_size_and_the_lines_that_it_says(motion: str) -> 
         assert math.sqrt((moved**2).sum(axis=2).mean()) == pytest.approx(drawn.size, rel=0.5)
     frames = np.stack(list(drawn.film.frames()))
     assert frames.shape == (40, 120, 160)
-    assert frames.std() > 1
+    assert float(frames.std()) > 1
 
 
 def test_a_ratio_is_over_pairs_of_scenes() -> None:
