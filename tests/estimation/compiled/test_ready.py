@@ -44,10 +44,12 @@ def test_who_waits_for_another_process_says_so(place, capsys):
         "import fcntl, sys; lock = open(sys.argv[1], 'w'); fcntl.flock(lock, fcntl.LOCK_EX);"
         " print('held', flush=True); sys.stdin.read()"
     )
-    assert (where := kept.folder())
+    where = kept.folder()
+    assert where
     command = [sys.executable, "-c", holds, str(where / "compiling.lock")]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as other:
-        assert other.stdin and other.stdout
+        assert other.stdin
+        assert other.stdout
         assert other.stdout.readline() == "held\n"
         waiting = threading.Thread(target=kept.compile_once, args=(["a"], lambda groups: "pass"))
         waiting.start()
