@@ -34,15 +34,6 @@ NIS_COVERAGE = 0.95
 """Probability that a consistent estimator's NIS lies inside the bounds drawn."""
 SLOPES, PER_SLOPE = "slope units", "1/slope unit"
 """Units of a position, and of a density over positions."""
-LATENCY = "since exposure end"
-LATENCY_STEPS = {
-    "first_byte_ns": "first byte",
-    "complete_ns": "frame complete",
-    "estimated_ns": "estimated",
-    "command_sent_ns": "command sent",
-    "command_acknowledged_ns": "acknowledged",
-}
-"""Fields of a Latency in the order in which they happen, and their names."""
 SCENES = {"came": "as it came", "restored": "restored", "true": "at rest"}
 """The pictures of a scene."""
 MAPS = {

@@ -154,9 +154,11 @@ def record(
             session.record(
                 loaded, camera, mirror, output, estimators=names, exposures=exposures or 0, note=note,
                 calibration=calibration or "", inputs=played, control=control or "", force=force,
-                watch=live.show if live else None, overwrite=overwrite,
+                sinks=[live] if live else (), overwrite=overwrite,
                 options=options, reconnect_s=reconnect, stop=stop, progress=on_progress, report=report,
             )  # fmt: skip
+        if live and live.left_out:
+            warn(f"the view was too slow for this session: {live.left_out} messages were not shown")
         _print_session(report, output, as_json)
     stop.raise_if_asked()
     if any(each.failed for each in report.estimation.values()):
@@ -246,12 +248,10 @@ def replay(
     with live_view as live, StopRequest().installed() as stop:
         total = recording.n_frames
         with progress("replay", total) as tell:
-            series = replay_recording(recording, names, rate=speed, stop=stop)
+            series = replay_recording(recording, names, rate=speed, stop=stop, sinks=[live] if live else ())
             for number, (exposure, estimates) in enumerate(series, 1):
                 for estimate in estimates:
                     scorers[estimate.estimator].add(exposure, estimate)
-                if live is not None:
-                    live.show(exposure, estimates)
                 tell(number)
         scores = {name: scorer.result() for name, scorer in scorers.items()}
         if as_json:

@@ -14,11 +14,10 @@ from aolink.errors import ExportError
 from aolink.estimation.score import Score, Scorer
 from aolink.exporting.common import Progress, check_frame, no_progress
 from aolink.exposure import Exposure
-from aolink.gathered import FRAME_INCIDENTS, LATENCY_STEPS, NO_TIME, REFUSED, Blur, extremes, hides_swings, incidents_of
+from aolink.gathered import FRAME_INCIDENTS, NO_TIME, REFUSED, Blur, extremes, hides_swings, incidents_of
 from aolink.numerics.arrays import FloatArray, IntArray
 from aolink.numerics.rms import rms
 from aolink.recording import topics
-from aolink.recording.schemas_pb2 import Estimation, Latency
 from aolink.series import NOTHING, Also, Series, Step
 
 _COLUMNS = 1500
@@ -171,15 +170,12 @@ class _Gathered:
     def _see(self, before: Callable[[Any], None] | None, recorded: Any) -> None:
         if before is not None:
             before(recorded)
-        message = recorded.message
-        if isinstance(message, Latency):
-            for key, name in LATENCY_STEPS.items():
-                if (done := getattr(message, key)) > 0:
-                    took_ms = (done - message.exposure_end_ns) / 1e6
-                    self.timings.setdefault(name, []).append((message.frame_id, took_ms))
-        elif isinstance(message, Estimation) and not message.skipped:
-            taken = self.timings.setdefault(f"{message.estimator} takes", [])
-            taken.append((message.frame_id, message.took_ns / 1e6))
+        row, message = topics.named(recorded.topic), recorded.message
+        name = recorded.topic.removeprefix(row.name)
+        for curve in row.curves:
+            if curve.is_in(message):
+                points = self.timings.setdefault(f"{name} {curve.label}".strip(), [])
+                points.append((message.frame_id, curve.value(message)))
 
     def add(self, step: Step) -> None:
         e, estimates = step.exposure, step.estimates

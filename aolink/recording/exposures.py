@@ -13,7 +13,6 @@ from aolink.assembly import Assembler
 from aolink.estimation import ExposureModel
 from aolink.exposure import Exposure, Picture, Truth
 from aolink.recording import convert, schemas_pb2, topics
-from aolink.recording.messages import RawMessage
 from aolink.rig import Rig
 from aolink.series import Step
 from aolink.wire import messages_pb2 as wire
@@ -86,14 +85,17 @@ class Walk:
         Gives the model that expands recorded coefficients into paths.
     before:
         Number of frames before the first message that it will take.
+    most:
+        How many exposures may wait for what belongs to them; None for any number.
     """
 
     def __init__(
         self, rig: Rig, names: Sequence[str], counts: Mapping[str, int], model: Callable[[], ExposureModel],
-        before: int = 0,
+        before: int = 0, most: int | None = None,
     ) -> None:  # fmt: skip
         self._assembly, self._model, self._names = ExposureAssembly(rig, before), model, names
         self._waiting: deque[Step] = deque()
+        self._most = most
         self._truths: dict[int, Truth] = {}
         self._scenes: dict[int, Picture] = {}
         beside: list[tuple[str, Collection[int]]] = [(topics.TRUTH, self._truths), (topics.SCENE, self._scenes)]
@@ -109,12 +111,12 @@ class Walk:
         self.completed: list[Exposure] = []
         """The exposures that the last message completed, without what belongs to them."""
 
-    def take(self, raw: RawMessage, message: Message | None) -> Iterator[Step]:
+    def take(self, topic: str, time_ns: int, message: Message | None) -> Iterator[Step]:
         """Take the next message, None for one that cannot be used; gives the exposures that wait for nothing more."""
-        topic, self.completed = raw.topic, []
+        self.completed = []
         if topic in ASSEMBLED:
             self.completed = self._assembly.take(topic, message)
-            self._wait(raw.log_time_ns)
+            self._wait(time_ns)
         elif topic.startswith((topics.ESTIMATE, topics.ESTIMATION)):
             self._note(topic, message)
         elif isinstance(message, wire.Truth):
@@ -152,6 +154,8 @@ class Walk:
             self._found[name][message.frame_id] = None
 
     def _is_whole(self, frame_id: int) -> bool:
+        if self._most is not None and len(self._waiting) > self._most:
+            return True
         if len(self._waiting) == 1 and not all(frame_id in found for found in self._expected):
             return False
         return all(

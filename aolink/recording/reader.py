@@ -230,7 +230,7 @@ class Recording(RecordedMessages, Series):
             message = (None if see else self.decoded_run(raw)) or self.decoded(raw)
             if see and message is not None:
                 see(RecordedMessage(raw.topic, now, raw.sequence, message))
-            yield from walk.take(raw, message)
+            yield from walk.take(raw.topic, raw.log_time_ns, message)
         yield from walk.flush(now)
 
     def _beginning(self, number: int) -> tuple[int, int]:

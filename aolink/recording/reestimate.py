@@ -22,7 +22,7 @@ from aolink.recording.exposures import Walk
 from aolink.recording.messages import END_OF_TIME, RawMessage
 from aolink.recording.reader import Recording
 from aolink.recording.side_files import check_stands_alone
-from aolink.series import Step
+from aolink.series import NOTHING, Also, Step
 
 _AT_ONCE = 512
 """The most exposures that are estimated together."""
@@ -75,10 +75,14 @@ class Skipped:
 
     def exposures(self) -> Iterator[Exposure]:
         """The recording's exposures, each after it was noted who skipped it."""
-        for step in self._recording.steps(list(self.frames)):
+        return (step.exposure for step in self.steps())
+
+    def steps(self, also: Also = NOTHING) -> Iterator[Step]:
+        """The same with what belongs to them; ``also`` as for `aolink.series.Series.steps`."""
+        for step in self._recording.steps(list(self.frames), also=also):
             for name in step.skipped:
                 self.frames[name].add(step.exposure.frame_id)
-            yield step.exposure
+            yield step
 
 
 class Reestimated(Recording):
@@ -204,7 +208,7 @@ def _with_estimates(
 
     for raw in recording.raw_messages():
         message = recording.decoded_run(raw) or recording.decoded(raw)
-        steps.extend(walk.take(raw, message))
+        steps.extend(walk.take(raw.topic, raw.log_time_ns, message))
         if raw.topic == topics.RESTORATION:  # it comes before its pictures
             restored_with = message.estimator if isinstance(message, schemas_pb2.Restoration) else ""
         if message is None and raw.schema in topics.SCHEMAS:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Literal
+from typing import Any, Literal
 
 from foxglove_schemas_protobuf.Log_pb2 import Log
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
@@ -41,6 +41,35 @@ the end of a recording have the sums over the devices, with ``connection_`` befo
 
 
 @dataclass(frozen=True)
+class Curve:
+    """A field of a topic's messages as a curve over time."""
+
+    field: str
+    label: str
+    """What the legend says of it, behind the name of the device or the estimator."""
+    view: str
+    """Title of the view that shows it, with the view's unit; curves of several topics may share one."""
+    unit: float = 1.0
+    """Length of the field's unit in that of the view."""
+    since: str = ""
+    """Field from which it is counted."""
+    shows: Literal["value", "sum", "change", "rate"] = "value"
+    """Whether the view shows the values, their sum so far, their change since the first one, or their change in a
+    second."""
+    zero: bool = True
+    """Whether zero is a value; where it is not, it says that there is nothing to show."""
+
+    def is_in(self, message: Any) -> bool:
+        """Whether a message has something to show."""
+        return self.zero or bool(getattr(message, self.field))
+
+    def value(self, message: Any) -> float:
+        """The field of a message in the unit of the view."""
+        since = getattr(message, self.since) if self.since else 0
+        return self.unit * float(getattr(message, self.field) - since)
+
+
+@dataclass(frozen=True)
 class Topic:
     """One row of the table."""
 
@@ -52,14 +81,26 @@ class Topic:
     ``first_step`` on), or only its time. `cut` selects messages by it, and `compare` finds their counterparts by it."""
     after: str = ""
     """Topic of the message that comes before a picture and names its exposure, which the picture itself does not."""
+    curves: tuple[Curve, ...] = ()
+    """What is drawn of its messages over time, by every view."""
     shown_by: str = ""
-    """The module of `aolink.viewing` and its function that shows the topic; '' for one that is not in the table.
-    Functions of `devices` get the messages themselves, other ones the exposures, estimates and pictures that the reader
-    makes of them."""
+    """The module of `aolink.viewing` and its function that shows what is more than curves. Functions of `devices` get
+    the messages themselves, other ones the exposures, estimates and pictures that are made of them."""
 
+
+_LOST, _RESIDUAL = "Lost and faulty since start (count)", "Loop: residual (slope units)"
+LATENCY_VIEW = "Latency since exposure end, or taken (ms)"
+_FAULTS = (*CONNECTION_FAULTS, "retransmits", "reports_asked")
 
 TOPICS = (
-    Topic(EXPOSURE, pb.ExposureInfo, "exposure", shown_by="devices.log_drops"),
+    Topic(
+        EXPOSURE, pb.ExposureInfo, "exposure",
+        curves=(
+            Curve("frames_lost_before", "frames lost", _LOST, shows="sum"),
+            Curve("chunks_lost", "chunks lost", _LOST, shows="sum"),
+        ),
+        shown_by="incidents.log_exposures",
+    ),
     Topic(IMAGE, RawImage, "exposure", after=EXPOSURE, shown_by="camera.log_frames"),
     Topic(COMMAND, wire.CommandBlock, "steps", shown_by="devices.log_commands"),
     Topic(APPLIED, wire.Applied, "steps", shown_by="devices.log_applied"),
@@ -68,16 +109,49 @@ TOPICS = (
     Topic(SCENE, RawImage, "exposure", after=SCENE_EXPOSURE, shown_by="scene.log_scenes"),
     Topic(TRUTH, wire.Truth, "exposure", shown_by="motion.log_truth"),
     Topic(ESTIMATE, pb.Estimate, "exposure", shown_by="motion.log_estimates"),
-    Topic(ESTIMATION, pb.Estimation, "exposure", shown_by="devices.log_estimation"),
     Topic(RESTORATION, pb.Restoration, "exposure", shown_by="scene.log_restored"),
     Topic(RESTORED_SCENE, RawImage, "exposure", after=RESTORATION, shown_by="scene.log_restored"),
     Topic(RESTORED_SPOTS, RawImage, "exposure", after=RESTORATION, shown_by="scene.log_restored"),
-    Topic(CONTROL, pb.Control, "exposure", shown_by="devices.log_control"),
-    Topic(LATENCY, pb.Latency, "exposure", shown_by="devices.log_latency"),
-    Topic(CONNECTION, pb.ConnectionStatistics, "time", shown_by="devices.log_connection"),
-    Topic(CLOCK, pb.ClockSample, "time", shown_by="devices.log_clock"),
+    Topic(
+        CONTROL, pb.Control, "exposure",
+        curves=(
+            Curve("slope_rms", "RMS of the slopes", _RESIDUAL),
+            Curve("path_rms", "RMS inside the exposure", _RESIDUAL),
+            Curve("delay_steps", "exposure's end to first input", "Loop: delay (fast steps)"),
+            Curve("clipped_steps", "steps that limits changed", "Loop: steps clipped (count)"),
+        ),
+        shown_by="devices.log_control",
+    ),
+    Topic(
+        LATENCY, pb.Latency, "exposure",
+        curves=tuple(
+            Curve(field, label, LATENCY_VIEW, 1e-6, since="exposure_end_ns", zero=False)
+            for field, label in (
+                ("first_byte_ns", "first byte"), ("complete_ns", "frame complete"), ("estimated_ns", "estimated"),
+                ("command_sent_ns", "command sent"), ("command_acknowledged_ns", "acknowledged"),
+            )
+        ),
+    ),
+    Topic(ESTIMATION, pb.Estimation, "exposure", curves=(Curve("took_ns", "takes", LATENCY_VIEW, 1e-6, zero=False),)),
+    Topic(
+        CONNECTION, pb.ConnectionStatistics, "time",
+        curves=(
+            *(Curve(field, field.replace("_", " "), _LOST, zero=False) for field in _FAULTS),
+            Curve("round_trip_s", "round trip", "Command round trip (ms)", 1e3),
+            Curve("bytes_received", "to host", "Received (kB/s)", 1e-3, shows="rate"),
+        ),
+    ),
+    Topic(
+        CLOCK, pb.ClockSample, "time",
+        curves=(
+            Curve("sigma_ns", "offset sd", "Clock offset sd (µs)", 1e-3),
+            Curve("offset_ns", "offset change", "Clock offset change (µs)", 1e-3, shows="change"),
+            Curve("frequency_ppm", "runs fast by", "Clock rate (ppm)"),
+            Curve("round_trip_ns", "round trip", "Clock round trip (µs)", 1e-3),
+        ),
+    ),
     Topic(LOG, Log, "time", shown_by="devices.log_log"),
-)
+)  # fmt: skip
 
 SCHEMAS = {row.message.DESCRIPTOR.full_name: row.message for row in TOPICS}
 """Message class by the full name of its schema."""

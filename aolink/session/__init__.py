@@ -23,8 +23,7 @@ from aolink.control import check_stable, stability
 from aolink.devices.interfaces import Camera
 from aolink.devices.opening import open_devices
 from aolink.errors import AolinkError, ControlError, DeviceError, PortError
-from aolink.estimation import Driver, Estimate
-from aolink.exposure import Exposure
+from aolink.estimation import Driver
 from aolink.optics.scene import framed
 from aolink.recording import topics
 from aolink.recording.mcap_file import WriteOptions
@@ -33,23 +32,20 @@ from aolink.rig import Drive, Rig, rig_of
 from aolink.rig.scene_table import read_scene_picture
 from aolink.session.commanding import Inputs
 from aolink.session.controlling import Controlling, facts, served
-from aolink.session.estimating import BesideTheLoop, Outcome
+from aolink.session.estimating import BesideTheLoop
 from aolink.session.excitation import Excitation
-from aolink.session.live import Show
+from aolink.session.journal import Sink
 from aolink.session.loop import ESTIMATES_S, SessionLoop
 from aolink.session.report import EstimatorReport, Report
-from aolink.session.waiting import Aside, most_waiting
+from aolink.session.waiting import Aside
 from aolink.signals import Interrupted
 
-__all__ = ["EstimatorReport", "Report", "record"]
-
-Watch = Callable[[Exposure, Sequence[Estimate]], None]
-"""Called with each exposure and the estimates that have come since the exposure before it."""
+__all__ = ["EstimatorReport", "Report", "Sink", "record"]
 
 _PROGRESS_S = 0.1
 """In real time: time between two reports of the progress, s."""
 _ASIDE_S = 2.0
-"""In real time: how long the end of a session waits for the function that watches it, s."""
+"""In real time: how long the end of a session waits for the function that is told its progress, s."""
 
 
 def controller(rig: Rig, control: str, estimators: Sequence[str], *, force: bool) -> tuple[Controlling, dict[str, str]]:
@@ -99,7 +95,7 @@ def record(
     inputs: Inputs | None = None,
     control: str = "",
     force: bool = False,
-    watch: Watch | None = None,
+    sinks: Sequence[Sink] = (),
     overwrite: bool = False,
     options: WriteOptions | None = None,
     reconnect_s: float = 0.0,
@@ -142,10 +138,9 @@ def record(
         as possible.
     force:
         Whether to close a loop even if it is unstable by the model.
-    watch:
-        Called with each exposure and its estimates. An estimate that is not there when the next exposure comes is given
-        with that one or a later one. In real time it is called on a thread of its own and may take its time:
-        exposures that come meanwhile are left out and counted, and an exception that it raises becomes a warning.
+    sinks:
+        What gets each message when it is recorded, beside the recording. In real time the loop waits for them, so they
+        must not take time. One that fails gets no more, which is a warning.
     options:
         How the recording is divided into chunks and files.
     reconnect_s:
@@ -206,14 +201,13 @@ def record(
         )  # fmt: skip
         aside.enter_context(_closed_at_last(writer, report))
         report.warnings += warnings
-        show, beside = _shown(rig, watch), None
+        beside = None
         if not clock.virtual:
             progress = aside.enter_context(_progress_aside(progress, report))
-            show = aside.enter_context(_shown_aside(show, rig, report)) if show else None
             beside = aside.enter_context(BesideTheLoop(rig, estimators, controlling.estimator if controlling else ""))
             clock.beside = beside.processes
             aside.enter_context(_spared_collections())
-        loop = SessionLoop(rig, clock, camera, mirror, writer, driver, inputs, show, beside, report, controlling)
+        loop = SessionLoop(rig, clock, camera, mirror, writer, driver, inputs, sinks, beside, report, controlling)
         try:
             loop.run(exposures, stop, progress)
         except BaseException as error:
@@ -284,26 +278,6 @@ def _spared_collections() -> Iterator[None]:
         yield
     finally:
         gc.unfreeze()
-
-
-def _shown(rig: Rig, watch: Watch | None) -> Show | None:
-    if watch is None:
-        return None
-    return lambda exposure, outcomes: watch(exposure, [each.estimate(rig) for each in outcomes])
-
-
-@contextlib.contextmanager
-def _shown_aside(show: Show, rig: Rig, report: Report) -> Iterator[Show]:
-    """A function that shows exposures on a thread of its own, which leaves out those that it has no time for."""
-    watching = Aside[tuple[Exposure, Sequence[Outcome]]](lambda item: show(*item), most_waiting(rig.timing))
-    try:
-        yield lambda exposure, outcomes: watching.give((exposure, outcomes))
-    finally:
-        if not watching.close(_ASIDE_S):
-            report.warnings.append(f"the watcher of this session is not done with an exposure after {_ASIDE_S:g} s")
-        if watching.failed is not None:
-            report.warnings.append(f"the watcher of this session failed: {watching.failed}")
-        report.unwatched = watching.skipped
 
 
 @contextlib.contextmanager

@@ -7,9 +7,10 @@ import re
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
-from typing import cast
+from typing import Protocol, cast
 
 from foxglove_schemas_protobuf.Log_pb2 import Log
+from google.protobuf.message import Message
 
 from aolink.devices.interfaces import Camera, ClockSampled, CommandAnswered, Device, Mirror, Time
 from aolink.recording import schemas_pb2 as pb
@@ -40,15 +41,38 @@ class _Said:
     """How many have come since."""
 
 
-class Journal:
-    """Writes a session's messages into its recording, and notes warnings and counts in its `Report`."""
+class Sink(Protocol):
+    """Takes a session's messages as they are recorded."""
 
-    def __init__(self, writer: RecordingWriter, report: Report, time: Time) -> None:
+    may_wait: bool
+    """Whether it may take time; set by the session, or by a replay."""
+
+    def take(self, topic: str, time_ns: int, message: Message) -> None:
+        """Take the next message, with its topic and its log time, ns."""
+
+
+class Journal:
+    """Writes a session's messages into its recording and hands them to other sinks, and notes warnings and counts in
+    its `Report`."""
+
+    def __init__(self, writer: RecordingWriter, report: Report, time: Time, sinks: Sequence[Sink] = ()) -> None:
         self.report = report
-        self.record, self._writer = writer.write, writer
+        self._writer, self._sinks = writer, list(sinks)
+        for sink in sinks:
+            sink.may_wait = time.virtual
         self._time = time
         self._said: dict[str, _Said] = {}
         """The warnings by their kind."""
+
+    def record(self, topic: str, message: Message, log_time_ns: int) -> None:
+        """Record a message, and give it to the session's sinks; one that fails gets no more."""
+        self._writer.write(topic, message, log_time_ns)
+        for sink in list(self._sinks):
+            try:
+                sink.take(topic, log_time_ns, message)
+            except Exception as error:  # a session must not end because its picture fails
+                self._sinks.remove(sink)
+                self.warn(f"a sink of this session's messages failed, and gets no more: {error}")
 
     def log(self, text: str, level: Log.Level.ValueType = Log.INFO) -> None:
         """Record a sentence about the session."""

@@ -1,27 +1,21 @@
-"""Exposures on their way through a session: to the estimators, to the controller, and with the estimates to the
-function that watches the session."""
+"""Exposures on their way through a session: to the estimators, and with the estimates to the controller."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 
 from foxglove_schemas_protobuf.Log_pb2 import Log
 
-from aolink.assembly import Frame
 from aolink.devices.interfaces import Time
 from aolink.estimation import Estimate
 from aolink.estimation.verdict import Fit
-from aolink.exposure import Exposure, Picture
+from aolink.exposure import Exposure
 from aolink.recording import convert, topics
 from aolink.recording import schemas_pb2 as pb
 from aolink.rig import Rig
 from aolink.session.estimating import Estimating, Outcome
 from aolink.session.journal import Journal
 from aolink.session.report import LatencyBook
-
-Show = Callable[[Exposure, Sequence[Outcome]], None]
-"""A function that gets each exposure, with the estimates that have come since the one before; it must not take time."""
 
 TellController = Callable[[Exposure, Estimate | None, int], None]
 """A function that gives the controller an exposure, the estimate that serves it, and the log time, ns."""
@@ -36,19 +30,15 @@ class LiveExposures:
 
     def __init__(
         self, rig: Rig, time: Time, journal: Journal, latencies: LatencyBook, estimating: Estimating,
-        show: Show | None, control: TellController | None, serves: str,
+        control: TellController | None, serves: str,
     ) -> None:  # fmt: skip
         self._rig, self._time, self._journal, self._latencies = rig, time, journal, latencies
         self._report = journal.report
-        self._estimating, self._show, self._control, self._serves = estimating, show, control, serves
+        self._estimating, self._control, self._serves = estimating, control, serves
         self.newest_frame = 0
         """The newest frame that commands can depend on."""
         self._unsettled: dict[int, list[Outcome]] = {}
         """Outcomes so far of the exposures that some estimators are still working on, by frame."""
-        self._unseen: Exposure | None = None
-        """The exposure that has not been given to the session's watcher yet."""
-        self._unseen_estimates: list[Outcome] = []
-        """The estimates that have not been given to the session's watcher yet."""
         self._hanging: set[str] = set()
         """The estimators that hang."""
 
@@ -56,8 +46,6 @@ class LiveExposures:
         """Take the next exposures."""
         for exposure in exposures:
             self._report.exposures += 1
-            self._show_unseen(ready=True)
-            self._unseen = exposure
             self._unsettled[exposure.frame_id] = []
             outcomes = self._estimating.offer(exposure)
             if self._control is not None and not self._serves:
@@ -65,13 +53,6 @@ class LiveExposures:
             if not self._estimating.names:
                 self._settle(exposure.frame_id)
             self._take_outcomes(outcomes, log_time_ns)
-
-    def take_scene(self, frame: Frame) -> None:
-        """Take a frame of the picture sensor, for the watcher."""
-        exposure = self._unseen
-        if self._show is not None and exposure is not None and frame.frame_id == exposure.frame_id:
-            self._unseen = replace(exposure, scene=Picture(pixels=frame.pixels, mask=frame.mask))
-        self._show_unseen()
 
     def take_estimates(self) -> None:
         """Take the estimates that have become known, and warn of an estimator that hangs."""
@@ -85,7 +66,6 @@ class LiveExposures:
         """Wait for the estimates under way, and record exposures without an estimate as skipped."""
         self._take_outcomes(self._estimating.finish(patience_s), self._time.now_ns())
         self._note_failures()
-        self._show_unseen(ready=True)
 
     def _take_outcomes(self, outcomes: Sequence[Outcome], log_time_ns: int) -> None:
         for outcome in outcomes:
@@ -95,8 +75,6 @@ class LiveExposures:
                 self._say_verdict(name, message)
                 if self._control is not None and name == self._serves:
                     self._control(outcome.exposure, outcome.estimate(self._rig), log_time_ns)
-                if self._show is not None:
-                    self._unseen_estimates.append(outcome)
             if name in self._report.estimation:
                 self._report.estimation[name].add(outcome)
                 self._journal.record(topics.estimation_topic(name), outcome.account(), log_time_ns)
@@ -128,23 +106,8 @@ class LiveExposures:
         outcomes = self._unsettled.pop(frame_id)
         if all(each.message is None for each in outcomes):
             self._know(frame_id, 0 if outcomes else self._time.now_ns())
-        self._show_unseen()
 
     def _know(self, frame_id: int, estimated_ns: int) -> None:
         """Note that commands from now on depend on a frame: its first estimate is there, or there will be none."""
         self.newest_frame = max(self.newest_frame, frame_id)
         self._latencies.estimated(frame_id, estimated_ns, self._time.now_ns())
-
-    def _show_unseen(self, *, ready: bool = False) -> None:
-        """Give the waiting exposure to the watcher when it is complete, or, if ``ready``, as it is.
-
-        With a picture sensor, its scene belongs to it. It does not wait for estimates that are not there when the next
-        exposure comes; they are given with that one.
-        """
-        exposure = self._unseen
-        if self._show is None or exposure is None:
-            return
-        whole = self._rig.scene is None or exposure.scene is not None
-        if ready or (whole and exposure.frame_id not in self._unsettled):
-            self._show(exposure, self._unseen_estimates)
-            self._unseen, self._unseen_estimates = None, []

@@ -24,8 +24,8 @@ from aolink.rig import Rig
 from aolink.session.commanding import Commanding, Inputs, lead_steps
 from aolink.session.controlling import Controlling
 from aolink.session.estimating import Estimating, InTheLoop
-from aolink.session.journal import Journal, command_answer
-from aolink.session.live import LiveExposures, Show
+from aolink.session.journal import Journal, Sink, command_answer
+from aolink.session.live import LiveExposures
 from aolink.session.received import ReceivedFrames
 from aolink.session.report import EstimatorReport, LatencyBook, Report
 from aolink.wire import messages_pb2 as wire
@@ -58,7 +58,7 @@ class SessionLoop:
 
     def __init__(
         self, rig: Rig, time: Time, camera: Camera, mirror: Mirror, writer: RecordingWriter, driver: Driver,
-        inputs: Inputs | None = None, show: Show | None = None, beside: Estimating | None = None,
+        inputs: Inputs | None = None, sinks: Sequence[Sink] = (), beside: Estimating | None = None,
         report: Report | None = None, controlling: Controlling | None = None,
     ) -> None:  # fmt: skip
         self.report = report or Report()
@@ -91,14 +91,14 @@ class SessionLoop:
         self._returned: list[Device] = []
         """Vanished devices that have been identified again; their clocks are being queried."""
         self._account = Account(self.report.commands)
-        self._journal = Journal(writer, self.report, time)
+        self._journal = Journal(writer, self.report, time, sinks)
         self._latencies = LatencyBook(self.report, self._journal.latency, commanded=mirror.commanded)
         self._frames = ReceivedFrames(rig, time, camera, mirror, self._journal, self._latencies)
         self._commanding = Commanding(
             rig, time, mirror, inputs, controlling, self._assembler, self._account, self._journal, self._latencies
         )
         control, serves = (None, "") if controlling is None else (self._commanding.control, controlling.estimator)
-        self._live = LiveExposures(rig, time, self._journal, self._latencies, self._estimating, show, control, serves)
+        self._live = LiveExposures(rig, time, self._journal, self._latencies, self._estimating, control, serves)
 
     def run(self, exposures: int, stop: Callable[[], bool], progress: Callable[[int], None]) -> None:
         self._estimating.get_ready(stop)
@@ -410,9 +410,7 @@ class SessionLoop:
 
     def _take_frame(self, frame: Frame, receive_ns: int) -> None:
         frame = self._frames.take(frame, receive_ns)
-        if frame.plane:
-            self._live.take_scene(frame)
-        else:
+        if not frame.plane:
             self._last_frame_ns = receive_ns
             if self._mirror.commanded and not self._time.virtual:
                 # A mirror may report nothing at all, so that no gap shows.

@@ -9,6 +9,7 @@ from itertools import chain
 from pathlib import Path
 
 import numpy as np
+from google.protobuf.message import Message
 from numpy.typing import NDArray
 
 from aolink.arguments import names as names_of
@@ -16,9 +17,11 @@ from aolink.control import Act, ControlLoop
 from aolink.errors import RecordingError
 from aolink.estimation import Driver, Estimate
 from aolink.exposure import Exposure
-from aolink.recording import topics
+from aolink.recording import convert, topics
+from aolink.recording.messages import RecordedMessage
 from aolink.recording.reader import Recording, opened
 from aolink.recording.reestimate import Skipped
+from aolink.session.journal import Sink
 from aolink.wire import messages_pb2 as wire
 
 _NAP_S = 0.1
@@ -26,7 +29,7 @@ _NAP_S = 0.1
 
 
 def replay(
-    recording: Recording | str | Path, names: str | Sequence[str], *, rate: float = 0.0,
+    recording: Recording | str | Path, names: str | Sequence[str], *, rate: float = 0.0, sinks: Sequence[Sink] = (),
     stop: Callable[[], bool] = lambda: False, now_s: Callable[[], float] = time.monotonic,
     sleep: Callable[[float], None] = time.sleep,
 ) -> Iterator[tuple[Exposure, list[Estimate]]]:  # fmt: skip
@@ -37,6 +40,8 @@ def replay(
     ----------
     rate:
         Pace relative to that of the recording; 0 for as fast as possible.
+    sinks:
+        What gets each message of the recording, with the new estimates in the place of its own.
     now_s, sleep:
         The clock for the pace, in s, and a function that waits for some seconds.
     """
@@ -46,7 +51,19 @@ def replay(
     step_s = recording.rig.timing.fast_step_s
     first_step: int | None = None
     began_s = 0.0
-    for exposure in skipped.exposures():
+
+    def give(topic: str, time_ns: int, message: Message) -> None:
+        for sink in sinks:
+            sink.take(topic, time_ns, message)
+
+    def see(recorded: RecordedMessage) -> None:
+        give(recorded.topic, recorded.log_time_ns, recorded.message)
+
+    for sink in sinks:
+        sink.may_wait = True
+    others = [each for each in recording.counts if not each.startswith(topics.ESTIMATE)] if sinks else []
+    for step in skipped.steps(dict.fromkeys(others, see)):
+        exposure = step.exposure
         if stop():
             break
         if first_step is None:
@@ -57,7 +74,10 @@ def replay(
                 sleep(min(left_s, _NAP_S))
             if stop():
                 break
-        yield exposure, driver.step(exposure)
+        made = driver.step(exposure)
+        for each in made if sinks else ():
+            give(topics.estimate_topic(each.estimator), step.time_ns, convert.estimate_message(each))
+        yield exposure, made
     if first_step is None and not stop():
         raise RecordingError(f"{recording.path} has no exposure")
 

@@ -137,8 +137,6 @@ class Report:
     """Counts of each estimator, by its name. Empty on virtual time, which waits for every estimate."""
     control: ControlReport | None = None
     """Counts of the closed loop; None where the session played its inputs."""
-    unwatched: int = 0
-    """Exposures for which the watcher had no time."""
     warnings: list[str] = field(default_factory=list)
     files: list[str] = field(default_factory=list)
     """Files that were written."""
@@ -184,7 +182,7 @@ class Report:
         for name, value in asdict(replace(self, control=None)).items():
             if name == "commands":
                 facts |= {f"steps_{end}": value[end] for end in STEPS}
-            elif name not in ("latencies", "warnings", "files", "estimation", "unwatched", "control"):
+            elif name not in ("latencies", "warnings", "files", "estimation", "control"):
                 facts[name] = value
         facts |= {f"connection_{name}": count for name, count in facts.pop("connection_faults").items()}
         for name, each in self.estimation.items():

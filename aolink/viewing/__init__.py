@@ -1,11 +1,11 @@
 """Views of a session: Rerun files, their layout, and the viewer.
 
-Each topic has a function that turns a batch of plain data into Rerun entities on a given stream; `save_rrd`
-calls them with a whole recording, `LiveView` with one exposure after the other.
+One `sender.Sender` draws exposures and messages, part by part: of a recording (`save`), and of a session while it goes
+on (`live`, in a process of its own). A quantity's curves are named in its row of `aolink.recording.topics`.
 
-To add a view: a name in `entities`, a function that sends it, its call (the topic's ``shown_by``, or `Sender.send`),
-and its place in `blueprint` with the unit in its name. What matplotlib draws too is computed in `aolink.gathered`. No
-estimator, SciPy or pandas is loaded until the first picture.
+To add another view: a name in `entities`, a function that sends it, its call (the topic's ``shown_by``, or
+`Sender.send`), and its place in `blueprint` with the unit in its name. What matplotlib draws too is computed in
+`aolink.gathered`. No estimator, SciPy or pandas is loaded until the first picture.
 """
 
 from typing import TYPE_CHECKING

@@ -6,10 +6,10 @@ from collections.abc import Sequence
 
 import rerun.blueprint as rrb
 
-from aolink.gathered import LATENCY, MAPS, NIS_COVERAGE, PER_SLOPE, SCENES, SLOPES
+from aolink.gathered import MAPS, NIS_COVERAGE, PER_SLOPE, SCENES, SLOPES
+from aolink.recording import topics
 from aolink.viewing import entities
 from aolink.viewing.camera import HISTORY, profile_bounds
-from aolink.viewing.devices import CLOCKS, CONTROLS
 from aolink.viewing.motion import MOST_STATES
 from aolink.viewing.series import Drawing
 from aolink.viewing.timebase import FAST_STEP, TIME
@@ -155,21 +155,14 @@ class _Layout:
     def devices(self) -> list[View]:
         """The devices, and the texts."""
         views = self.legended({"Mirror input (mirror's units)": [f"{entities.COMMAND}/**", f"{entities.APPLIED}/**"]})
-        controls: dict[str, list[str]] = {}
-        for name, (title, *_) in CONTROLS.items():
-            controls.setdefault(title, []).append(f"{entities.CONTROL}/{name}")
-        views += self.legended(controls)
-        views += self.legended({f"Latency {LATENCY} (ms)": [f"{entities.LATENCY}/**"]})
-        faulty = self.drawn.has(entities.FAULTS)
-        devices = [f"{entities.FAULTS}/{device}" for device in ("camera", "mirror")]
-        lost = f"Lost {'and faulty ' if faulty else ''}since start (count)"
-        views += self.legended({
-            lost: [f"{entities.LOST}/**", *(devices if faulty else [])],
-            "Connection faults by cause (count)": [f"{entities.FAULTS}/**"],
-            "Command round trip (ms)": [f"{entities.ROUND_TRIP}/**"],
-            "Received (kB/s)": [f"{entities.RECEIVED}/**"],
-        })  # fmt: skip
-        views += self.legended({title: [f"{entities.CLOCK}/{name}/**"] for name, (title, *_) in CLOCKS.items()})
+        owners: dict[str, str] = {}
+        curves: dict[str, dict[str, list[str]]] = {}
+        for row in topics.TOPICS:
+            for curve in row.curves:  # of a view's title, the first topic's tabs have it
+                tabs = curves.setdefault(owners.setdefault(curve.view, row.name), {})
+                tabs.setdefault(curve.view, []).append(f"{entities.of(row.name)}/{curve.field}/**")
+        for tabs in curves.values():
+            views += self.legended(tabs)
         views.append(rrb.StateTimelineView(origin=entities.STATUS, name="Exposures, status of estimators and mirror"))
         return [*views, self.texts()]
 

@@ -57,17 +57,17 @@ def colour_of(name: str) -> Colour:
 
 
 def log_camera(
-    drawing: Drawing, timebase: Timebase, steps: Sequence[Step], *, following: Exposure | None = None,
-    live: bool = False,
-) -> None:  # fmt: skip
-    """Send frames, pages and profiles of exposures; in a live session those of the last exposure and its page.
+    drawing: Drawing, timebase: Timebase, steps: Sequence[Step], *, following: Exposure | None = None
+) -> None:
+    """Send frames, pages and profiles of exposures.
 
-    ``following`` is the exposure after them. The first ones set the scale of the profile's plot.
+    ``following`` is the exposure after them. The first ones set the scale of the profile's plot. A page appears where
+    its exposures begin; in a live session it grows with them.
     """
-    new, sensor = steps[-1:] if live else steps, drawing.rig.sensor
-    log_frames(drawing, timebase, [each.exposure for each in new])
+    sensor = drawing.rig.sensor
+    log_frames(drawing, timebase, [each.exposure for each in steps])
     if sensor.directions == 2:
-        _log_spot_paths(drawing, sensor, timebase, new)
+        _log_spot_paths(drawing, sensor, timebase, steps)
     # The following is about one slope over time.
     blurs = [Blur.of(drawing.rig, each, drawing.outputs[0]) for each in steps]
     if drawing.top is None:
@@ -75,20 +75,18 @@ def log_camera(
         truth = ["truth"] if any(each.exposure.truth is not None for each in steps) else []
         _log_profile_axes(drawing, sensor.profile, drawing.top, [*truth, *drawing.estimators])
     pages: dict[int, list[Blur]] = {}
-    for each in blurs:
+    for each in [*drawing.page, *blurs]:
         pages.setdefault(page_of(each.exposure, timebase.frame_id), []).append(each)
-    first = max(pages) if live else min(pages)
     for number, page in pages.items():
-        if number >= first:
-            after = next((p[0].exposure for k, p in pages.items() if k > number), following)
-            _log_page(drawing, timebase, page, drawing.top, after, page[-1 if live else 0].exposure)
-    shown = blurs[-1:] if live else blurs
+        after = next((p[0].exposure for k, p in pages.items() if k > number), following)
+        _log_page(drawing, timebase, page, drawing.top, after, page[-1 if drawing.live else 0].exposure)
+    drawing.page = page if drawing.live else []
     width = sensor.profile.pixels
     corners = np.array([(0, 0), (width, 0), (width, 1), (0, 1), (0, 0)])
-    exposures = [each.exposure for each in shown]
+    exposures = [each.exposure for each in blurs]
     rows = [corners + np.array((0, (each.frame_id - timebase.frame_id) % HISTORY)) for each in exposures]
     _send_strips(drawing, ROW_NOW, timebase, exposures, [[row] for row in rows], _PALE, 1.0)
-    _log_profile(drawing, timebase, shown, drawing.top)
+    _log_profile(drawing, timebase, blurs, drawing.top)
 
 
 def log_frames(drawing: Drawing, timebase: Timebase, exposures: Sequence[Exposure]) -> None:

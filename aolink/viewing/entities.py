@@ -8,16 +8,16 @@ from __future__ import annotations
 from aolink.recording import topics
 
 
-def _of(topic: str) -> str:
+def of(topic: str) -> str:
     """The entity of a topic, without the slashes about it."""
     return topic.strip("/")
 
 
-FRAME = _of(topics.IMAGE)
-SCENE = _of(topics.SCENE)
+FRAME = of(topics.IMAGE)
+SCENE = of(topics.SCENE)
 TRUE_SCENE = "scene/true"
-RESTORED_SCENE = _of(topics.RESTORED_SCENE)
-RESTORED_SPOTS = _of(topics.RESTORED_SPOTS)
+RESTORED_SCENE = of(topics.RESTORED_SCENE)
+RESTORED_SPOTS = of(topics.RESTORED_SPOTS)
 SCENES = (SCENE, RESTORED_SCENE, TRUE_SCENE)
 """The entities of the scene, in this order."""
 PAGE = "camera/history"
@@ -32,21 +32,13 @@ PATH_ERROR = "error/path"
 RMS_ERROR = "error/path_rms"
 END_ERROR = "error/end"
 RESIDUAL = "residual"
-ESTIMATE = _of(topics.ESTIMATE)
+ESTIMATE = of(topics.ESTIMATE)
 """Columns for tables; nothing of them is drawn."""
 PUPIL = "pupil"
 
-COMMAND = _of(topics.COMMAND)
-APPLIED = _of(topics.APPLIED)
-CONTROL = _of(topics.CONTROL)
-LATENCY = _of(topics.LATENCY)
-ESTIMATION = f"{LATENCY}/{_of(topics.ESTIMATION)}"
-LOST = f"{_of(topics.CONNECTION)}/lost"
-FAULTS = f"{_of(topics.CONNECTION)}/faults"
-ROUND_TRIP = f"{_of(topics.CONNECTION)}/round_trip"
-RECEIVED = f"{_of(topics.CONNECTION)}/received"
-CLOCK = _of(topics.CLOCK)
-LOG = _of(topics.LOG)
+COMMAND = of(topics.COMMAND)
+APPLIED = of(topics.APPLIED)
+LOG = of(topics.LOG)
 STATUS = "status"
 WARNINGS = "warnings"
 SESSION = "session"

@@ -5,9 +5,8 @@ Rerun takes most of a second to load, and its viewer as long to start, so the vi
 
 from __future__ import annotations
 
-import threading
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -22,31 +21,8 @@ if TYPE_CHECKING:
 
 _FLUSH_S = 60.0
 """Longest wait at the end until the viewer has taken all data, s."""
-
-
-@contextmanager
-def fed(server: Server, recording_id: str | None = None) -> Iterator[rr.RecordingStream]:
-    """A stream into a viewer, which stays open after the block until it is closed.
-
-    Raises `ViewerError` where the viewer takes no more data.
-    """
-    import rerun as rr  # while the viewer starts
-
-    stream = rr.RecordingStream(APPLICATION, recording_id=recording_id)
-    server.listen()
-    stream.connect_grpc(server.data_address)
-    try:
-        yield stream
-        # Without a bound, a viewer that takes nothing would block this for ever, and no signal would be handled.
-        flushing = threading.Thread(target=stream.flush, daemon=True)
-        flushing.start()
-        flushing.join(_FLUSH_S)
-        if flushing.is_alive() and server.process.poll() is None:
-            server.process.kill()
-            raise ViewerError(f"the viewer has taken nothing for {_FLUSH_S:g} s, and was ended")
-        server.process.wait()
-    finally:
-        stream.disconnect()
+_SLICE_S = 0.5
+"""Longest wait at a time, in which no signal is handled, s."""
 
 
 def show(
@@ -64,7 +40,7 @@ def show(
     Raises
     ------
     ViewerError
-        There is no display, the viewer does not start, or the recording has nothing to show.
+        There is no display, the viewer does not start or takes no more data, or the recording has nothing to show.
     """
     from aolink.recording.reader import opened
 
@@ -89,9 +65,14 @@ def _feed(
     server: Server, recording: Recording, look: Look, progress: Callable[[int], None] | None,
     on_ready: Callable[[str], None] | None = None,
 ) -> None:  # fmt: skip
-    from aolink.viewing.save import sent_parts  # and Rerun with it
+    import rerun as rr  # while the viewer starts
 
-    with fed(server, identity(recording, look)) as stream:
+    from aolink.viewing.save import sent_parts
+
+    stream = rr.RecordingStream(APPLICATION, recording_id=identity(recording, look))
+    server.listen()
+    stream.connect_grpc(server.data_address)
+    try:
         if on_ready is not None:
             on_ready(server.address)
         for done in sent_parts(stream, recording, look, at_once=True):
@@ -99,3 +80,18 @@ def _feed(
                 return  # its window was closed
             if progress:
                 progress(done)
+        _flush(stream, server)
+        server.process.wait()
+    finally:
+        stream.disconnect()
+
+
+def _flush(stream: rr.RecordingStream, server: Server) -> None:
+    deadline_s = time.monotonic() + _FLUSH_S
+    while server.process.poll() is None:
+        try:
+            stream.flush(timeout_sec=_SLICE_S)
+            return
+        except RuntimeError:
+            if time.monotonic() > deadline_s:
+                raise ViewerError(f"the viewer has taken nothing for {_FLUSH_S:g} s, and was ended") from None

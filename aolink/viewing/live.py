@@ -1,70 +1,106 @@
-"""A viewer that a session feeds as it goes on, exposure by exposure."""
+"""A view of a session while it goes on: a sink of its messages, drawn by a process of its own.
+
+Drawing in the session's process would hold Python's lock, which the loop waits for. All that happens there is that
+messages become bytes, which a thread writes to the other process.
+"""
 
 from __future__ import annotations
 
+import os
+import pickle
+import subprocess
+import sys
+import tempfile
+import threading
+import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from functools import partial
+from typing import IO, TYPE_CHECKING, Any
 
-import numpy as np
-import rerun as rr
-from numpy.typing import NDArray
+from google.protobuf.message import Message
 
-from aolink.colours import by_rank
-from aolink.estimation import Estimate
-from aolink.exposure import Exposure
-from aolink.restoration import deblur
-from aolink.rig import Rig
-from aolink.series import Step
-from aolink.viewing import entities, scene
-from aolink.viewing.blueprint import blueprint
-from aolink.viewing.camera import HISTORY
-from aolink.viewing.feed import fed
+from aolink.errors import ViewerError
+from aolink.numerics.workers import THREAD_VARIABLES, end_with
+from aolink.recording.messages import RawMessage
 from aolink.viewing.process import check_display, window
-from aolink.viewing.sender import Sender
-from aolink.viewing.series import Drawing
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from aolink.rig import Rig
+
+_PERIOD_S = 0.05
+"""Time between two looks at what waits: for each message a thread would hold up the loop."""
+_MOST_BYTES = 64 << 20
+"""The most bytes that may wait for the view."""
+_MOST_BEHIND_S = 2.0
+"""In real time, how long messages may wait for the view."""
+_END_S = 60.0
+"""Longest wait at the end until the viewer has all data, s."""
+_NICENESS = 5
 
 
 class LiveView:
-    """Sends exposures with their estimates to a viewer, one after the other.
+    """A sink of a session's messages that shows them.
 
-    An estimate that took long may come with a later exposure than its own, of the same page.
+    In real time it never waits: where the view is too slow, it goes on with new messages, and those that are left out
+    are counted and named in the view. Where it ``may_wait``, as on virtual time, nothing is left out.
     """
 
-    def __init__(
-        self,
-        stream: rr.RecordingStream,
-        rig: Rig,
-        estimators: Sequence[str],
-        true_scene: NDArray[np.uint16] | None = None,
-    ) -> None:
-        self._drawing = Drawing(stream=stream, rig=rig, estimators=by_rank(list(estimators)))
-        self._sender = Sender(self._drawing)
-        self._page: list[Step] = []
-        """The last exposures, as many as a page has."""
-        self._laid_out: set[str] = set()
-        """The entities for which there is a layout."""
-        self._true_scene = true_scene
+    def __init__(self, pipe: IO[bytes]) -> None:
+        self.may_wait = False
+        self.left_out = 0
+        """Messages that were not shown."""
+        self.failed = ""
+        """Why nothing more is shown; empty while something is."""
+        self._pipe, self._waiting, self._bytes = pipe, list[RawMessage](), 0
+        self._missing = 0
+        """Messages left out that the view does not know of."""
+        self._since_s = 0.0
+        """When the oldest that waits came."""
+        self._changed, self._closed = threading.Condition(), False
+        self._thread = threading.Thread(target=self._run, name="aolink-view", daemon=True)
+        self._thread.start()
 
-    def show(self, exposure: Exposure, estimates: Sequence[Estimate]) -> None:
-        """Show the next exposure."""
-        step, drawing = Step(exposure.frame_id, exposure), self._drawing
-        self._page = [*self._page[-HISTORY + 1 :], step]
-        known, late = {each.exposure.frame_id: each for each in self._page}, []
-        for each in estimates:
-            if (its := known.get(each.frame_id)) is not None:
-                its.estimates[each.estimator] = each
-                if its is not step:
-                    late.append(Step(its.number, its.exposure, {each.estimator: each}))
-        timebase = self._sender.send([step], page=self._page, late=sorted(late, key=lambda each: each.number))
-        if exposure.scene is not None and drawing.rig.scene is not None:
-            if drawing.estimators and (focus := step.estimates.get(drawing.estimators[-1])) is not None:
-                starts = {exposure.frame_id: exposure.first_step}
-                scene.log_restored(drawing, timebase, starts, [deblur(drawing.rig, exposure, focus)])
-            if not drawing.has(entities.TRUE_SCENE):
-                scene.log_true_scene(drawing, self._true_scene)
-        if drawing.sent != self._laid_out:
-            self._laid_out = set(drawing.sent)
-            drawing.stream.send_blueprint(blueprint(drawing), make_active=True, make_default=True)
+    def take(self, topic: str, time_ns: int, message: Message) -> None:
+        """Take the next message."""
+        raw = RawMessage(topic, message.DESCRIPTOR.full_name, time_ns, 0, message.SerializeToString())
+        with self._changed:
+            while self.may_wait and self._bytes > _MOST_BYTES and not self.failed:
+                self._changed.wait(_PERIOD_S)
+            now_s = time.monotonic()
+            if not self._waiting:
+                self._since_s = now_s
+            elif not self.may_wait and (now_s - self._since_s > _MOST_BEHIND_S or self._bytes > _MOST_BYTES):
+                self.left_out, self._missing = self.left_out + len(self._waiting), self._missing + len(self._waiting)
+                self._waiting, self._bytes, self._since_s = [], 0, now_s
+            if not self.failed:
+                self._waiting.append(raw)
+                self._bytes += len(raw.data)
+
+    def close(self) -> None:
+        """Write what waits, and say that this was all."""
+        self._closed = True
+        self._thread.join(_END_S)
+
+    def _run(self) -> None:
+        try:
+            ending = False
+            while not ending:
+                time.sleep(_PERIOD_S)
+                ending = self._closed  # read first: nothing comes after it is set
+                with self._changed:
+                    batch, self._waiting, self._bytes = (self._missing, self._waiting), [], 0
+                    self._missing = 0
+                    self._changed.notify_all()
+                if batch[1]:
+                    pickle.dump(batch, self._pipe, protocol=pickle.HIGHEST_PROTOCOL)
+                    self._pipe.flush()
+            self._pipe.close()
+        except OSError as error:
+            self.failed = f"its process has ended: {error.strerror}"
 
 
 @contextmanager
@@ -79,5 +115,45 @@ def live_viewer(
         There is no display, or the viewer does not start.
     """
     check_display("there is no display for --view: record or replay without it, then `aolink view --web`")
-    with window() as server, fed(server) as stream:
-        yield LiveView(stream, rig, estimators, true_scene)
+    with window() as server:
+        server.listen()
+        with drawn(server.data_address, rig, estimators, true_scene) as live:
+            yield live
+        server.process.wait()
+
+
+@contextmanager
+def drawn(
+    address: str, rig: Rig, estimators: Sequence[str], true_scene: NDArray[np.uint16] | None = None
+) -> Iterator[LiveView]:
+    """A `LiveView` whose process sends what it draws to a viewer at an address, or into a file of that name.
+
+    Raises `ViewerError` at the end where the process has failed.
+    """
+    main = "from aolink.viewing.live_process import main; main()"
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(os.path.isabs, sys.path))}
+    environment |= dict.fromkeys(THREAD_VARIABLES, "1")
+    with (
+        tempfile.TemporaryFile() as said,
+        # In a session of its own: Ctrl-C goes to the session, which ends it.
+        subprocess.Popen(
+            [sys.executable, "-P", "-c", main], stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=said,
+            start_new_session=True, env=environment, preexec_fn=partial(end_with, os.getpid()),
+        ) as process,
+    ):  # fmt: skip
+        pipe: Any = process.stdin
+        try:
+            pickle.dump((address, rig, list(estimators), true_scene, _NICENESS), pipe)
+            live = LiveView(pipe)
+            yield live
+            live.close()
+            process.wait(_END_S)
+        except subprocess.TimeoutExpired:
+            raise ViewerError(f"the viewer has taken nothing for {_END_S:g} s, and was ended") from None
+        finally:
+            process.kill()
+            with suppress(OSError):
+                pipe.close()
+        said.seek(0)
+        if process.returncode and (lines := said.read().decode(errors="replace").strip().splitlines()):
+            raise ViewerError(f"the view of the session failed: {lines[-1]}")

@@ -128,14 +128,14 @@ def _send_path(
     steps: list[NDArray[np.int64]] = []
     lines: list[FloatArray] = []
     limits: list[FloatArray] = []
-    after = paths[0][0]
+    after = drawing.ends.get(path, paths[0][0])
     for (first, every), half in zip(paths, reach or [np.zeros((len(outputs), 1))] * len(paths), strict=True):
+        places, line, outside = (_range if swings else _line)(every, half, outputs, points or every.shape[1])
         if first > after:
             steps.append(np.array([after]))
-            for rows in (lines, limits):
-                rows.append(np.full((1, rows[-1].shape[1]), np.nan))
-        after = first + every.shape[1]
-        places, line, outside = (_range if swings else _line)(every, half, outputs, points or every.shape[1])
+            for rows, own in ((lines, line), (limits, outside)):
+                rows.append(np.full((1, own.shape[1]), np.nan))
+        after = drawing.ends[path] = first + every.shape[1]
         steps.append(first + places)
         lines.append(line)
         limits.append(outside)

@@ -2,32 +2,27 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import rerun as rr
 
-from aolink.colours import by_rank
 from aolink.errors import ViewerError
-from aolink.estimation.score import Scorer, score_table
 from aolink.exposure import Exposure
 from aolink.gathered import lacks
 from aolink.recording import topics
 from aolink.recording.reader import Restorations
 from aolink.recording.side_files import check_stands_alone
 from aolink.series import Also, Step
-from aolink.viewing import camera, devices, entities, motion, scene
-from aolink.viewing.blueprint import PATH_WINDOW, blueprint
+from aolink.viewing import camera, motion, scene
+from aolink.viewing.blueprint import PATH_WINDOW
 from aolink.viewing.look import APPLICATION, Look, identity
 from aolink.viewing.palette import series_colour
 from aolink.viewing.rrd_file import new_rrd
-from aolink.viewing.sender import Sender
+from aolink.viewing.sender import Sender, is_drawn
 from aolink.viewing.series import Drawing
-from aolink.viewing.timebase import Timebase
 
 if TYPE_CHECKING:
     from aolink.recording.messages import RecordedMessage
@@ -94,18 +89,13 @@ def sent_parts(
     """
     sender = RecordingSender(stream, recording, look)
     stream.send_recording_name(f"{recording.rig.name} · {recording.path.name}")
-
-    def lay_out() -> None:
-        layout = blueprint(sender.drawing, alone=len(sender.numbers) == 1)
-        # Active too: a viewer that gets the data over the network would otherwise keep a layout of its own.
-        stream.send_blueprint(layout, make_active=True, make_default=True)
-
+    alone = len(sender.numbers) == 1
     for done in sender.parts():
         if at_once:
-            lay_out()
+            sender.lay_out(alone=alone)
             at_once = False
         yield done
-    lay_out()
+    sender.lay_out(alone=alone)
 
 
 class RecordingSender(Sender):
@@ -114,49 +104,45 @@ class RecordingSender(Sender):
 
     def __init__(self, stream: rr.RecordingStream, recording: Recording, look: Look) -> None:
         check_stands_alone(recording)
-        names = by_rank(list(recording.estimators))
+        names = list(recording.estimators)
         super().__init__(Drawing(stream=stream, rig=recording.rig, estimators=names, spot=look.spot))
         self._recording, self._look = recording, look
         self.numbers = range(len(recording)) if look.exposures is None else look.exposures
         if len(self.numbers) <= 2 * PATH_WINDOW + 1:
             self.drawing.points = None
-        self._scorers = {name: Scorer() for name in names}
-        self._skipped: Counter[str] = Counter()
 
     def parts(self) -> Iterator[int]:
         """Send the exposures with all that belongs to them, then the devices; gives after each part how many exposures
         are sent."""
         recording, look, drawing = self._recording, self._look, self.drawing
-        messages: list[RecordedMessage] = []
         restorations, starts = Restorations(), dict[int, int]()
-        shown = [topic for topic in recording.counts if _shows(topic)]
+        shown = [topic for topic in recording.counts if is_drawn(topic)]
         also: dict[str, Callable[[RecordedMessage], None]] = dict.fromkeys(Restorations.TOPICS, restorations.see)
         if look.exposures is None:
-            also |= dict.fromkeys(shown, messages.append)
+            also |= dict.fromkeys(shown, self.see)
         else:
-            messages += self._messages(shown)
+            for each in self._messages_of_part(shown):
+                self.see(each)
         for steps, following in self._read(also):
             timebase = self.send(steps, following=following)
-            for each in steps:
-                self._skipped.update(each.skipped)
-                for name, estimate in each.estimates.items():
-                    self._scorers[name].add(each.exposure, estimate)
             if topics.RESTORATION in recording.counts:
                 starts |= {each.exposure.frame_id: each.exposure.first_step for each in steps}
                 scene.log_restored(drawing, timebase, starts, list(restorations.taken()))
-            _send_messages(drawing, timebase, messages)
             yield self.sent
         if self.timebase is None:
             raise ViewerError(
                 f"there is no exposure in {recording.path}, so nothing to view; `aolink info` says what it holds"
             )
-        _send_messages(drawing, self.timebase, messages)
+        self.send(())
         scene.log_restored(drawing, self.timebase, starts, list(restorations.taken(ended=True)))
         for k, (name, loop) in enumerate(look.loops.items()):
             part = loop[look.exposures.start : look.exposures.stop] if look.exposures is not None else loop
             motion.log_residual(drawing, self.timebase, name, part, series_colour(k))
         scene.log_true_scene(drawing, recording.true_scene)
-        drawing.log(entities.SESSION, rr.TextDocument(self._summary(self.timebase), media_type="text/markdown"))
+        part_of = ""
+        if look.exposures is not None:
+            part_of = f" ({self.numbers.start} to {self.numbers.stop - 1} of {len(recording)}, counted from 0)"
+        self.say(part_of, lacks(recording))
 
     def _read(self, also: Also) -> Iterator[tuple[list[Step], Exposure | None]]:
         """Read parts: the exposures of whole pages, and the exposure after them."""
@@ -182,7 +168,7 @@ class RecordingSender(Sender):
         if part:
             yield part, None
 
-    def _messages(self, wanted: Sequence[str]) -> Iterator[RecordedMessage]:
+    def _messages_of_part(self, wanted: Sequence[str]) -> Iterator[RecordedMessage]:
         """Messages of some topics that belong to the part of the recording."""
         recording, timing = self._recording, self.drawing.rig.timing
         if not wanted:
@@ -203,45 +189,3 @@ class RecordingSender(Sender):
                 inside = first.host_start_ns <= each.log_time_ns < ended_ns
             if inside:
                 yield each
-
-    def _summary(self, timebase: Timebase) -> str:
-        """A page of Markdown about a session, with the data that it lacks and, where the truth is known, the
-        estimators' scores."""
-        rig, recording, look = self.drawing.rig, self._recording, self._look
-        steps = rig.timing.exposure_steps
-        part = ""
-        if look.exposures is not None:
-            part = f" ({self.numbers.start} to {self.numbers.stop - 1} of {len(recording)}, counted from 0)"
-        lines = [
-            f"## {rig.name}",
-            f"{self.sent} exposure{'s' if self.sent != 1 else ''}{part} of {steps} fast steps,"
-            f" {steps * rig.timing.fast_step_s:g} s each; {self.lost} frames lost. The first began at"
-            f" {timebase.origin_ns / 1e9:.6f} s of the camera's clock.",
-            "",
-        ]
-        if self._scorers:
-            found = score_table({name: scorer.result() for name, scorer in self._scorers.items()})
-            heads = ["estimator", *found.heads]
-            table = [heads, ["---"] * len(heads), *([name, *cells] for name, cells in found.rows.items())]
-            lines += [*(f"| {' | '.join(cells)} |" for cells in table), "", *found.notes]
-        if self._skipped:
-            counts = ", ".join(f"{name} {count}" for name, count in self._skipped.items())
-            lines += ["", f"Exposures skipped for want of time: {counts}"]
-        return "\n".join([*lines, "", " ".join(lacks(recording)), "", rig.summary])
-
-
-def _shows(topic: str) -> Callable[[Drawing, Timebase, Sequence[RecordedMessage]], None] | None:
-    """The function of `devices` that a topic's messages are handed to; None for what is shown as exposures, estimates
-    or pictures, or not at all."""
-    module, _, function = topics.named(topic).shown_by.partition(".")
-    shows: Callable[[Drawing, Timebase, Sequence[RecordedMessage]], None] | None
-    shows = getattr(devices, function) if module == "devices" else None
-    return shows
-
-
-def _send_messages(drawing: Drawing, timebase: Timebase, messages: list[RecordedMessage]) -> None:
-    """Send messages and take them out of the list."""
-    for topic, records in groupby(sorted(messages, key=lambda each: each.topic), key=lambda each: each.topic):
-        if (shows := _shows(topic)) is not None:
-            shows(drawing, timebase, list(records))
-    messages.clear()

@@ -13,6 +13,7 @@ import rerun as rr
 from numpy.typing import ArrayLike, NDArray
 
 from aolink.colours import Colour
+from aolink.gathered import Blur
 from aolink.rig import Rig
 from aolink.viewing.palette import STATUS_COLOURS
 from aolink.viewing.timebase import Timebase
@@ -26,17 +27,6 @@ _SECOND = 0.55
 
 
 @dataclass(kw_only=True)
-class Device:
-    """What has been drawn of a device so far."""
-
-    number: int
-    offset_ns: float = float("nan")
-    """The first offset of its clock."""
-    received: list[tuple[int, int]] = field(default_factory=list)
-    """Host time, ns, and bytes received at its newest statistics; empty before the first."""
-
-
-@dataclass(kw_only=True)
 class Drawing:
     """A stream into a file or a viewer, the options of the drawing, and what has been drawn so far, which the layout
     depends on."""
@@ -47,6 +37,10 @@ class Drawing:
     """The estimators in rank order; the band of the last one is shown first."""
     spot: int = 0
     """Number of the spot, of many, that is drawn as lines."""
+    live: bool = False
+    """Whether it is drawn while it happens: a page of exposures then grows."""
+    page: list[Blur] = field(default_factory=list)
+    """In a live session, the exposures of the newest page."""
     points: int | None = POINTS
     """Points with which a path of one exposure is drawn; None: every fast step."""
     sent: set[str] = field(default_factory=set)
@@ -61,12 +55,14 @@ class Drawing:
     """The style of each line, and what the legend adds."""
     swinging: dict[str, bool] = field(default_factory=dict)
     """Whether a path swings more than its points show, so that its range is drawn; by its name."""
+    ends: dict[str, int] = field(default_factory=dict)
+    """The fast step after the last one of each path."""
     states: dict[str, str] = field(default_factory=dict)
     """The last state of each lane."""
-    lost: tuple[int, int] = (0, 0)
-    """Frames and chunks lost so far."""
-    devices: dict[str, Device] = field(default_factory=dict)
-    """The devices by their names, in the order in which they came."""
+    before: dict[str, tuple[int, float]] = field(default_factory=dict)
+    """Host time, ns, and value of what a curve goes on from."""
+    names: dict[str, int] = field(default_factory=dict)
+    """Numbers of the devices and estimators that curves are of, in the order in which they came."""
 
     @cached_property
     def outputs(self) -> list[int]:
@@ -83,10 +79,6 @@ class Drawing:
     def labels(self) -> tuple[str, ...]:
         """The text that the legend adds for each output."""
         return (" x", " y") if len(self.outputs) == 2 else ("",)
-
-    def device(self, name: str) -> Device:
-        """What has been drawn of a device so far."""
-        return self.devices.setdefault(name, Device(number=len(self.devices)))
 
     def log(self, path: str, what: Any) -> None:
         """Log data that is valid for the whole session."""

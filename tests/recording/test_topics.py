@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import re
 
 from aolink.recording import topics
 from aolink.recording.topics import TOPICS
@@ -17,10 +18,19 @@ def test_a_message_has_the_fields_by_which_it_belongs() -> None:
             assert fields >= ({"frame_id"} if row.belongs_to == "exposure" else {"first_step", "n_steps"})
 
 
-def test_every_topic_is_shown_by_a_function_of_the_viewer() -> None:
+def test_every_topic_is_drawn_by_its_curves_or_by_a_function_of_the_viewer() -> None:
     for row in TOPICS:
-        module, function = row.shown_by.split(".")
-        assert callable(getattr(importlib.import_module(f"aolink.viewing.{module}"), function))
+        assert row.curves or row.shown_by
+        if row.shown_by:
+            module, function = row.shown_by.split(".")
+            assert callable(getattr(importlib.import_module(f"aolink.viewing.{module}"), function))
+
+
+def test_a_curve_is_of_fields_that_its_message_has_and_says_its_unit() -> None:
+    for row in TOPICS:
+        for curve in row.curves:
+            assert {curve.field, curve.since or curve.field} <= set(row.message.DESCRIPTOR.fields_by_name)
+            assert re.fullmatch(r".+ \([^()]+\)", curve.view)
 
 
 def test_nothing_shows_a_topic_that_is_not_in_the_table() -> None:

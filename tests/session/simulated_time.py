@@ -32,7 +32,7 @@ from aolink.recording.writer import RecordingWriter
 from aolink.rig import Rig
 from aolink.session.commanding import Inputs
 from aolink.session.controlling import Controlling
-from aolink.session.estimating import BesideTheLoop
+from aolink.session.estimating import BesideTheLoop, Outcome
 from aolink.session.loop import SessionLoop
 from aolink.session.report import Report
 from aolink.signals import Interrupted
@@ -285,10 +285,16 @@ def run_session(
         link.reset_counts()
     with RecordingWriter(path, rig, {}, hub.now_ns(), deterministic=True) as writer:
         loop = SessionLoop(
-            rig, hub, camera, no_mirror if alone else mirror, writer, Driver(rig, estimators), inputs,
-            lambda exposure, _: live.append(exposure), beside,
+            rig, hub, camera, no_mirror if alone else mirror, writer, Driver(rig, estimators), inputs, beside=beside,
             controlling=Controlling(rig, controller, estimators) if controller else None,
         )  # fmt: skip
+        offer = loop._estimating.offer
+
+        def offered(exposure: Exposure) -> list[Outcome]:
+            live.append(exposure)
+            return offer(exposure)
+
+        loop._estimating.offer = offered  # type: ignore[method-assign]
         run, hub.loop, hub.beside = Run(hub, loop, mirror, path, live), loop, beside.processes if beside else ()
         try:
             loop.run(exposures, stop, progress)

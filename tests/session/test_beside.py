@@ -13,16 +13,17 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from google.protobuf.message import Message
 
 from aolink.errors import EstimatorError
-from aolink.estimation import Driver, Estimate, make_estimator
+from aolink.estimation import Driver, make_estimator
 from aolink.estimation.driver import SkippedInputs
 from aolink.exposure import Exposure
 from aolink.recording import schemas_pb2 as pb
@@ -348,58 +349,56 @@ def test_a_terminal_that_takes_nothing_holds_up_no_session(rig_file: Path, tmp_p
 
 
 @pytest.mark.slow
-def test_who_watches_or_is_told_and_never_comes_back_holds_up_no_session(rig_file: Path, tmp_path: Path) -> None:
+def test_who_is_told_and_never_comes_back_holds_up_no_session(rig_file: Path, tmp_path: Path) -> None:
     go_on = threading.Event()
-    watched: list[int] = []
-
-    def watch(exposure: Exposure, estimates: object) -> None:
-        watched.append(exposure.frame_id)
-        go_on.wait(60)
 
     def never_back(exposures: int) -> None:
         go_on.wait(60)
 
     with simulated_rig(rig_file, "--real-time") as ports:
         report = record(
-            parse_rig(FAST), *ports, tmp_path / "a.mcap", estimators=["o3"], exposures=EXPOSURES, watch=watch,
-            progress=never_back,
-        )  # fmt: skip
+            parse_rig(FAST), *ports, tmp_path / "a.mcap", estimators=["o3"], exposures=EXPOSURES, progress=never_back
+        )
     go_on.set()
     assert (report.ended, report.frames_received, report.frames_lost) == ("complete", EXPOSURES, 0)
-    assert watched == [1]
-    assert report.unwatched >= EXPOSURES - 1 - most_waiting(parse_rig(FAST).timing)
-    assert any("is not done with an exposure" in each for each in report.warnings)
 
 
-@pytest.mark.slow
-def test_who_watches_gets_each_exposure_once_and_each_estimate_once(rig_file: Path, tmp_path: Path) -> None:
-    seen: list[int] = []
-    estimates: list[tuple[str, int]] = []
+class Seen:
+    """A sink that keeps what it gets, or fails with the first message of a topic."""
 
-    def watch(exposure: Exposure, some: Sequence[Estimate]) -> None:
-        seen.append(exposure.frame_id)
-        estimates.extend((each.estimator, each.frame_id) for each in some)
+    may_wait = True
 
-    report = Report()
+    def __init__(self, fails_at: str = "") -> None:
+        self.messages: list[tuple[str, int, bytes]] = []
+        self.fails_at = fails_at
+
+    def take(self, topic: str, time_ns: int, message: Message) -> None:
+        if topic == self.fails_at:
+            raise ValueError("no more paper")
+        self.messages.append((topic, time_ns, message.SerializeToString()))
+
+
+def test_a_sink_gets_what_is_recorded(rig_file: Path, tmp_path: Path) -> None:
+    seen, report = Seen(), Report()
     with simulated_rig(rig_file, "--real-time") as ports:
         given = record(
-            parse_rig(FAST), *ports, tmp_path / "a.mcap", estimators=["o3"], exposures=20, watch=watch, report=report
+            parse_rig(FAST), *ports, tmp_path / "a.mcap", estimators=["o3"], exposures=20, sinks=[seen], report=report
         )
     assert given is report
-    assert seen == sorted(set(seen))
-    assert len(seen) + report.unwatched == 20
-    assert len(set(estimates)) == len(estimates) <= report.estimation["o3"].estimated
-    assert report.unwatched or len(estimates) == report.estimation["o3"].estimated
+    assert not seen.may_wait
+    raw = Recording(tmp_path / "a.mcap").raw_messages()
+    assert seen.messages == [(each.topic, each.log_time_ns, each.data) for each in raw]
 
 
-def test_a_watcher_that_fails_is_a_warning(rig_file: Path, tmp_path: Path) -> None:
-    def watch(exposure: Exposure, estimates: object) -> None:
-        raise ValueError("no more paper")
-
+def test_a_sink_that_fails_is_a_warning(rig_file: Path, tmp_path: Path) -> None:
     with simulated_rig(rig_file, "--real-time") as ports:
-        report = record(parse_rig(FAST), *ports, tmp_path / "a.mcap", exposures=3, watch=watch)
-    assert (report.ended, report.unwatched) == ("complete", 2)
-    assert report.warnings == ["the watcher of this session failed: no more paper"]
+        report = record(
+            parse_rig(FAST), *ports, tmp_path / "a.mcap", exposures=3, sinks=[Seen(topics.EXPOSURE), other := Seen()]
+        )
+    assert (report.ended, report.frames_received) == ("complete", 3)
+    (warning,) = report.warnings
+    assert "no more paper" in warning
+    assert [each[0] for each in other.messages].count(topics.IMAGE) == 3
 
 
 def test_what_exists_before_a_session_is_not_garbage_collected_during_it(rig_file: Path, tmp_path: Path) -> None:
@@ -408,11 +407,13 @@ def test_what_exists_before_a_session_is_not_garbage_collected_during_it(rig_fil
     def collects_old() -> bool:
         return any(each is old for each in gc.get_objects())
 
-    def watch(exposure: Exposure, estimates: object) -> None:
-        collected.append(collects_old())
+    class Looks(Seen):
+        def take(self, topic: str, time_ns: int, message: Message) -> None:
+            if topic == topics.EXPOSURE:
+                collected.append(collects_old())
 
     with simulated_rig(rig_file, "--real-time") as ports:
-        record(parse_rig(FAST), *ports, tmp_path / "a.mcap", exposures=3, watch=watch)
+        record(parse_rig(FAST), *ports, tmp_path / "a.mcap", exposures=3, sinks=[Looks()])
     assert collected
     assert not any(collected)
     assert collects_old()

@@ -37,7 +37,8 @@ from aolink.restoration.deblur import blurred_psnr, estimated_psfs, psnr
 from aolink.rig import load_rig
 from aolink.rig.scene_table import read_scene_picture
 from aolink.session import Report, record
-from aolink.viewing import LiveView, save_rrd
+from aolink.viewing import save_rrd
+from aolink.viewing.live import drawn
 from tests.commands import simulated_rig
 from tests.kinds import must_be, truth_of
 from tests.recording.small import copied
@@ -95,16 +96,6 @@ def test_the_scene_delays_no_spot(session: Path) -> None:
     """The estimate of an exposure is made before its scene has come."""
     order = [each.topic for each in Recording(session).messages("/estimate/o1", topics.SCENE, topics.IMAGE)]
     assert order == [topics.IMAGE, "/estimate/o1", topics.SCENE] * EXPOSURES
-
-
-def test_who_watches_gets_each_exposure_with_its_scene(tmp_path: Path) -> None:
-    seen: list[Exposure] = []
-    take(tmp_path / "a.mcap", exposures=3, watch=lambda exposure, estimates: seen.append(exposure))
-    recorded = list(Recording(tmp_path / "a.mcap").exposures())
-    assert [e.frame_id for e in seen] == [e.frame_id for e in recorded] == [1, 2, 3]
-    for mine, other in zip(seen, recorded, strict=True):
-        picture = must_be(Picture, mine.scene)
-        np.testing.assert_array_equal(picture.pixels, must_be(Picture, other.scene).pixels)
 
 
 @pytest.mark.slow
@@ -455,17 +446,12 @@ def test_rerun_shows_blurred_restored_and_true(sharp: Path, tmp_path: Path) -> N
 
 @pytest.mark.slow
 def test_a_live_view_shows_the_same(sharp: Path, tmp_path: Path) -> None:
-    import rerun as rr
-
     from aolink.session.replay import replay
 
     recording = Recording(sharp)
-    stream = rr.RecordingStream("test")
-    stream.save(tmp_path / "live.rrd")
-    live = LiveView(stream, recording.rig, ["o1", "moments"], recording.true_scene)
-    for exposure, estimates in replay(recording, ["o1", "moments"]):
-        live.show(exposure, estimates)
-    stream.disconnect()
+    with drawn(str(tmp_path / "live.rrd"), recording.rig, ["o1", "moments"], recording.true_scene) as live:
+        for _ in replay(recording, ["o1", "moments"], sinks=[live]):
+            pass
     ours, theirs = read_rrd(tmp_path / "live.rrd"), read_rrd(save_rrd(recording, tmp_path / "file.rrd"))
     for entity in ("/scene/image", "/restored/image", "/restored/spot", "/scene/true"):
         shown = [[buffer for buffer in each[entity]["Image:buffer"] if buffer] for each in (ours, theirs)]

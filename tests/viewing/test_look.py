@@ -81,6 +81,6 @@ def test_a_closed_loop_is_shown(tmp_path: Path) -> None:
     entities = read_rrd(save_rrd(Recording(tmp_path / "loop.mcap"), tmp_path / "loop.rrd"))
     left = scalars(entities["/control/slope_rms"])
     assert np.isfinite(left).any()
-    assert (scalars(entities["/control/delay"]) > 0).all()
+    assert (scalars(entities["/control/delay_steps"]) > 0).all()
     assert next(state for (state,) in entities["/status/loop"]["StateChange:state"]).startswith("CLOSED")
     assert "Loop: residual (slope units)" in str(read_blueprint(tmp_path / "loop.rrd"))

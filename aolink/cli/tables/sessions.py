@@ -90,8 +90,6 @@ def session(report: Report) -> Table:
         table.add_row("estimates", f"{name}: {_estimation(each)}")
     if report.control is not None:
         table.add_row("control", _control(report.control))
-    if report.unwatched:
-        table.add_row("view", f"{report.unwatched} exposures not shown, for want of time")
     for name, since, until in () if report.virtual_time else _LATENCY_STEPS:
         table.add_row("latency", f"{name}: {_percentiles(report.latencies, since, until)}")
     return table
