@@ -38,7 +38,7 @@ _HOPELESS = 0.6
 _LEVEL = 0.95
 _ALTERNATIVE = 15.0
 """Chi-square by which another frequency may be worse that is named beside the best: a model is never all right."""
-_CHANCE = 1e-3
+CHANCE = 1e-3
 """Chance that noise alone has such a line."""
 _AT_ONCE = 256
 _PAIRS = ((0, 0), (0, 1), (1, 1))
@@ -470,7 +470,7 @@ def find(seen: PathMoments, most: int = MOST_LINES, tell: Callable[[int, int], N
     """The lines of a film, at most so many, the strongest first; none where chance explains what is seen."""
     of = Vibration(seen)
     trials = MOST_ALIASES * 2 * len(seen.times_s)
-    threshold = 2 * float(special.gammainccinv(6 / 2, _CHANCE / trials))
+    threshold = 2 * float(special.gammainccinv(6 / 2, CHANCE / trials))
     lines: tuple[Line, ...] = ()
     sets: list[tuple[Part, ...]] = []
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import io
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -214,3 +215,85 @@ def _jpeg(values: Any, quality: int) -> Any:
     file = io.BytesIO()
     Image.fromarray(values).save(file, "JPEG", quality=quality)
     return np.asarray(Image.open(file))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class RowFilm:
+    """A line or an edge, seen in all rows of a camera that exposes them one after the other."""
+
+    kind: str
+    """A line of light, or an edge."""
+    hz: tuple[float, ...]
+    amplitudes: tuple[complex, ...]
+    """Of each tone, pixels across the rows: its real part is the place at the film's begin."""
+    row_time_s: float
+    exposure_s: float
+    rest: FloatArray
+    """Place at rest of each row, pixels, (rows,)."""
+    sd: float
+    """Of the Gaussian that the line is, or that the edge is blurred by, pixels."""
+    noise: float
+    """Of a pixel, over the line's peak or the edge's step."""
+    columns: int
+    frames: int
+    rate_hz: float = 30.0
+    light: FloatArray = field(default_factory=lambda: np.ones(1))
+    """Of each row, (rows,) or (1,)."""
+
+    def clean(self, amplitudes: Sequence[complex] | None = None, rest: FloatArray | None = None) -> FloatArray:
+        """The frames without noise, (frames, rows, columns); also with other amplitudes or places at rest."""
+        amplitudes, rest = amplitudes or self.amplitudes, self.rest if rest is None else rest
+        fine = 8 + 8 * math.ceil(max(self.hz) * self.exposure_s)
+        inside = (np.arange(fine) + 0.5) / fine * self.exposure_s
+        first = np.floor(rest).astype(int) - _NEAR_LINE
+        edges = np.arange(2 * _NEAR_LINE + 2) - 0.5 - (rest - first)[:, None]
+        out = np.zeros((self.frames, len(rest), self.columns))
+        y = np.arange(len(rest))[:, None]
+        if self.kind == "edge":
+            out += np.arange(self.columns) > rest[:, None]
+        for k, picture in enumerate(out):
+            t = k / self.rate_hz + (self.row_time_s * np.arange(len(rest)))[:, None] + inside
+            p = sum((a * np.exp(2j * np.pi * f * t)).real for a, f in zip(amplitudes, self.hz, strict=True))
+            u = (edges[..., None] - np.asarray(p)[:, None]) / self.sd
+            whole = special.ndtr(u) if self.kind == "line" else u * special.ndtr(u) + np.exp(-(u**2) / 2) / _ROOT
+            seen = np.diff(whole.mean(axis=2), axis=1) * self.sd * (_ROOT if self.kind == "line" else 1.0)
+            picture[y, first[:, None] + np.arange(seen.shape[1])] = seen
+        return out * np.broadcast_to(self.light, len(rest))[:, None]
+
+    def film(self, rng: np.random.Generator) -> Film:
+        """With noise, in 8 bits."""
+        clean = self.clean()
+        values = 30 + 170 * (clean + self.noise * rng.normal(size=clean.shape))
+        return array_film(np.clip(np.rint(values), 0, 255).astype(np.uint8), self.kind)
+
+    @property
+    def settings(self) -> FilmSettings:
+        """What a stranger says of it."""
+        return FilmSettings(rate_hz=self.rate_hz, exposure_s=self.exposure_s, row_time_s=self.row_time_s)
+
+
+_NEAR_LINE, _ROOT = 20, math.sqrt(2 * math.pi)
+"""Pixels to either side of a target that its motion may light."""
+
+
+def draw_rows(
+    seed: int, *, hz: Sequence[float] = (), seen: float | None = None, rows: int = 480, frames: int = 90
+) -> RowFilm:
+    """The film of a seed: 30 frames/s, readout of 8 to 30 ms, exposures of .5 to 10 ms, a tone of 200 to 1100 Hz of
+    which the exposure leaves .1 to 1 pixel, ``seen``, of at most 4; the peak is 20 times the pixels' noise."""
+    rng = np.random.default_rng([71, seed])
+    readout, kind = float(rng.uniform(8e-3, 30e-3)), str(rng.choice(["line", "edge"]))
+    while True:
+        exposure = float(np.exp(rng.uniform(math.log(0.5e-3), math.log(10e-3))))
+        tones = tuple(hz) or (float(rng.uniform(200, 1100)),)
+        sizes = [(seen or float(np.exp(rng.uniform(math.log(0.1), 0)))) for _ in tones]
+        sizes = [size / max(abs(float(np.sinc(f * exposure))), 1e-9) for size, f in zip(sizes, tones, strict=True)]
+        if max(sizes) <= 4:
+            break
+    along = np.linspace(-1, 1, rows)
+    rest = 40 + rng.uniform(-8, 8) * along + rng.uniform(-2, 2) * along**2
+    return RowFilm(
+        kind=kind, hz=tones, amplitudes=tuple(s * np.exp(1j * rng.uniform(0, 7)) for s in sizes),
+        row_time_s=readout / rows, exposure_s=exposure, rest=rest, sd=float(rng.uniform(1.0, 2.5)), noise=0.05,
+        columns=80, frames=frames, light=1 + rng.uniform(-0.2, 0.2) * along,
+    )  # fmt: skip

@@ -1,0 +1,367 @@
+"""Vibrations of a line or an edge that a camera exposes row by row: each band of rows is a sample of its own.
+
+A band of rows, exposed for T about t, shows the profile S of the target where it was meanwhile. In the Fourier domain,
+with the band's place at rest x and the path p(t) = sum_j Re[a_j exp(i w_j t)] across the rows, that is
+
+    S(q) exp(-i q x) (1/T) int exp(-i q p) dt,
+    (1/T) int exp(-i q A cos(w t + phi)) dt = sum_n (-i)^n J_n(q A) sinc(n f T) exp(i n (w t + phi))   (Jacobi, Anger)
+
+so the exposure's low-pass, its zeros (whole swings in an exposure) and its blur are in the model, however far the path
+goes. All bands share S; their places at rest are a parabola along the rows with a slow drift in time. Readings of what
+a model leaves are scanned up to half the rate of the bands, and lines are refined with S, rest and drift in the pixels
+(Gauss and Newton, damped), which is as exact as these say.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy import ndimage, special, stats
+
+from aolink.identification.vibration import CHANCE, MOST_LINES, SLOWEST, Part
+from aolink.numerics.arrays import ComplexArray, FloatArray
+
+Tones = tuple[tuple[complex, float], ...]
+"""Amplitude at the film's middle, pixels, and frequency, Hz, of each line."""
+_OVERSAMPLED = 5
+"""Frequencies of the scan in the inverse of the film's length."""
+_AT_ONCE = 4096
+_BEYOND = 6.0
+"""Pixels beyond a window to either side until the profile repeats itself."""
+_LEAST_TERM = 1e-5
+"""Terms of the series that are left out are smaller."""
+_STEPS = 25
+_ENOUGH = 1e-7
+"""Relative gain of a step below which it was the last."""
+_RIDGE = 1e-9
+_ALTERNATIVE = 15.0
+"""Chi-square by which another frequency may be worse that is named beside the best."""
+_APART = 1.5
+"""Frequencies are another peak of the scan beyond so many inverses of the film's length."""
+_MOST_ALTERNATIVES = 8
+_DARKEST = 0.1
+"""Contrast of a band, over the usual one's, from which on it is used."""
+_FRAMES_AT_ONCE = 64
+_BACKGROUND_HZ = 60.0
+"""Width of the band of frequencies that tells the noise about one."""
+
+
+@dataclass(frozen=True, eq=False)
+class Bands:
+    """What K frames show of a target in B bands of n rows and W columns each."""
+
+    images: FloatArray
+    """Mean light of a band's rows, (K, B, W)."""
+    rest: FloatArray
+    """First guess of the target's place in each row, from the band's first column, pixels, (B, n)."""
+    times_s: FloatArray
+    """Middle of the exposure of the film's first row in each frame, (K,)."""
+    delays_s: FloatArray
+    """How much later each row is, (B, n)."""
+    exposure_s: float
+    rate_hz: float
+
+    @property
+    def highest_hz(self) -> float:
+        """Half the rate of the bands."""
+        centres = self.delays_s.mean(axis=1)
+        return float(0.5 / np.abs(np.diff(centres)).mean())
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """Lines, places at rest and profile."""
+
+    tones: Tones
+    rest: FloatArray
+    """Coefficients of slope and bend along the rows, and of the drift's cosines."""
+    profile: FloatArray
+    """A constant, a slope, and cosines and sines of the profile."""
+
+
+@dataclass(frozen=True, eq=False)
+class BandsFound:
+    """The lines of a target, the strongest first."""
+
+    tones: Tones
+    sets: tuple[tuple[Part, ...], ...]
+    places: FloatArray
+    """Of each band in each frame about its place at rest, pixels, (K, B), as the model without its noise has it."""
+    left: FloatArray
+    """What the model leaves of the places, (K, B)."""
+    variance: FloatArray
+    """Of that, by the pixels' noise, (K, B); infinite where a band shows nothing."""
+    drift: FloatArray
+    """(K,)"""
+    rest: FloatArray
+    """Place at rest of each band, from its first column, (B,)."""
+    misfit: float
+    """What is left of the places over their noise, mean square."""
+
+
+class BandFit:
+    """The likelihood of lines in bands."""
+
+    def __init__(self, bands: Bands) -> None:
+        self.of = bands
+        K, B, W = bands.images.shape
+        self.delays = bands.delays_s - bands.delays_s.mean()
+        times = bands.times_s + float(bands.delays_s.mean())
+        self.middle_s = float(times.mean())
+        self.t = times - self.middle_s
+        self.span_s = float(np.ptp(self.t)) + 1 / bands.rate_hz
+        length = W + 2 * _BEYOND
+        self.q = 2 * np.pi * np.arange(1, int(length / 2) + 1) / length
+        self.x = np.arange(W) - (W - 1) / 2
+        self.wave = np.exp(1j * self.q[:, None] * self.x)  # (M, W)
+        along = self.delays / max(float(np.abs(self.delays).max()), 1e-300)
+        self.bend = np.stack([along, along**2])  # (2, B, n)
+        count = 1 + 2 * K // SLOWEST
+        self.slow = np.cos(np.pi * np.arange(1, count + 1)[:, None] * (self.t / (2 * self.t.max()) + 0.5))
+        self.images = bands.images.copy()
+        self.weight = np.full(B, float(bands.rest.shape[1]))
+        self.hz = np.arange(bands.rate_hz / SLOWEST, bands.highest_hz, 1 / (_OVERSAMPLED * self.span_s))
+        self.start = self._level()
+
+    def _level(self) -> State:
+        """The state without lines; light of each band in units of the profile, its ground taken off."""
+        state = State((), np.zeros(2 + len(self.slow)), np.zeros(2 + 2 * len(self.q)))
+        for turn in range(3):
+            state = self.profiled(state)
+            if turn == 2:
+                break
+            shown, slope = (each.mean(axis=0) for each in self.shown(state))  # (B, W)
+            mean = self.images.mean(axis=0)
+            for b in range(len(mean)):
+                A = np.stack([shown[b], np.ones_like(self.x), slope[b]], axis=1)
+                gain, ground, _ = np.linalg.lstsq(A, mean[b], rcond=None)[0]
+                good = gain > _DARKEST
+                self.images[:, b] = (self.images[:, b] - ground) / gain if good else 0.0
+                self.weight[b] *= gain**2 if good else 0.0
+        return state
+
+    def places(self, state: State) -> tuple[FloatArray, FloatArray]:
+        """At rest, of each row (B, n), and the drift of each frame (K,)."""
+        rest = self.of.rest - (len(self.x) - 1) / 2 + np.tensordot(state.rest[:2], self.bend, axes=1)
+        return rest, state.rest[2:] @ self.slow
+
+    def moved(self, tones: Tones) -> FloatArray:
+        """Mean place of each band in each exposure by lines, (K, B)."""
+        out = np.zeros((len(self.t), len(self.delays)))
+        for a, hz in tones:
+            turn = np.exp(2j * np.pi * hz * self.delays).mean(axis=1)
+            out += (a * np.sinc(hz * self.of.exposure_s) * np.exp(2j * np.pi * hz * self.t)[:, None] * turn).real
+        return out
+
+    def transfer(self, state: State) -> ComplexArray:
+        """What becomes of each wave of the profile in each band, (K, B, M)."""
+        rest, drift = self.places(state)
+        orders = [range(-top, top + 1) for top in (math.ceil(self.q[-1] * abs(a)) + 6 for a, _ in state.tones)]
+        terms, hz = [], []
+        series = [
+            {n: (-1j) ** n * special.jv(n, self.q * abs(a)) * np.exp(1j * n * np.angle(a)) for n in each}
+            for (a, _), each in zip(state.tones, orders, strict=True)
+        ]
+        for numbers in itertools.product(*orders):
+            total = sum(n * f for n, (_, f) in zip(numbers, state.tones, strict=True))
+            term = np.full(len(self.q), np.sinc(total * self.of.exposure_s), dtype=np.complex128)
+            if abs(term[0]) < _LEAST_TERM:
+                continue
+            for n, each in zip(numbers, series, strict=True):
+                term = term * each[n]
+            if np.abs(term).max() > _LEAST_TERM:
+                terms.append(term)
+                hz.append(float(total))
+        C, F = np.array(terms), np.array(hz)
+        turned = np.exp(2j * np.pi * F[:, None] * self.delays[:, None])  # (B, L, n)
+        H = turned @ np.exp(-1j * rest[..., None] * self.q) / rest.shape[1] * C  # (B, L, M)
+        E = np.exp(2j * np.pi * self.t[:, None] * F)  # (K, L)
+        G = np.tensordot(E, H, axes=(1, 1))
+        return np.asarray(G * np.exp(-1j * drift[:, None, None] * self.q))
+
+    def shown(self, state: State, G: ComplexArray | None = None) -> tuple[FloatArray, FloatArray]:
+        """The bands' images by a state, and their derivatives along x, (K, B, W) each."""
+        G = self.transfer(state) if G is None else G
+        rest, drift = self.places(state)
+        at = rest.mean(axis=1) + drift[:, None] + self.moved(state.tones)
+        M = len(self.q)
+        S = G * (state.profile[2 : 2 + M] - 1j * state.profile[2 + M :])
+        ramp = state.profile[1] * (self.x - at[..., None])
+        return state.profile[0] + ramp + (S @ self.wave).real, state.profile[1] + ((1j * self.q * S) @ self.wave).real
+
+    def normal(self, state: State) -> tuple[FloatArray, FloatArray, float]:
+        """Normal matrix and right side of Gauss and Newton's step, and the weighted sum of squares of what is left."""
+        G = self.transfer(state)
+        I, D = self.shown(state, G)
+        steps = []
+        for k, (a, hz) in enumerate(state.tones):
+            for da, df in ((1e-4, 0.0), (1e-4j, 0.0), (0.0, 1e-4 / self.span_s)):
+                tones = (*state.tones[:k], (a + da, hz + df), *state.tones[k + 1 :])
+                steps.append((self.shown(replace(state, tones=tones))[0] - I) / (abs(da) or df))
+        rest, drift = self.places(state)
+        at = rest.mean(axis=1) + drift[:, None] + self.moved(state.tones)
+        bend = self.bend.mean(axis=2)
+        size = len(steps) + len(state.rest) + len(state.profile)
+        N, y, total = np.zeros((size, size)), np.zeros(size), 0.0
+        root = np.sqrt(self.weight)[None, :, None]
+        for first in range(0, len(I), _FRAMES_AT_ONCE):
+            k = slice(first, first + _FRAMES_AT_ONCE)
+            waves = G[k, :, :, None] * self.wave
+            columns = [each[k] for each in steps]
+            columns += [-D[k] * each[:, None] for each in bend]
+            columns += [-D[k] * each[k, None, None] for each in self.slow]
+            columns += [np.ones_like(D[k]), self.x - at[k, :, None]]
+            J = np.concatenate([np.stack(columns, axis=2), waves.real, waves.imag], axis=2)  # (k, B, P, W)
+            flat = (J * root[..., None]).swapaxes(1, 2).swapaxes(0, 1).reshape(size, -1)
+            left = (root * (self.images[k] - I[k])).ravel()
+            N += flat @ flat.T
+            y += flat @ left
+            total += float(left @ left)
+        return N, y, total
+
+    def profiled(self, state: State) -> State:
+        """With the likeliest profile, all else as it is."""
+        N, y, _ = self.normal(replace(state, profile=np.zeros_like(state.profile)))
+        P = len(state.profile)
+        return replace(state, profile=_solved(N[-P:, -P:], y[-P:], _RIDGE))
+
+    def misfit(self, state: State) -> float:
+        """Weighted sum of squares of what a state leaves."""
+        return float((self.weight[:, None] * (self.images - self.shown(state)[0]) ** 2).sum())
+
+    def refined(self, state: State) -> tuple[State, float, FloatArray]:
+        """The nearest minimum in all unknowns, its sum of squares, and the covariance of the lines' parameters (real
+        and imaginary part, frequency) over the pixels' variance."""
+        damping, T = 1e-3, 3 * len(state.tones)
+        N, y, value = self.normal(state)
+        for _ in range(_STEPS):
+            step = _solved(N, y, damping)
+            new = self._moved(state, step)
+            after = self.misfit(new)
+            if not after < value:
+                if damping > 1e3:
+                    break
+                damping *= 10
+                continue
+            gained = value - after
+            state, damping = new, max(damping / 10, _RIDGE)
+            N, y, value = self.normal(state)
+            if gained < _ENOUGH * value:
+                break
+        scale = 1 / np.sqrt(np.diag(N) + 1e-300)
+        C = np.linalg.inv(N * scale[:, None] * scale + _RIDGE * np.eye(len(N))) * scale[:, None] * scale
+        return state, value, C[:T, :T]
+
+    def _moved(self, state: State, step: FloatArray) -> State:
+        T = 3 * len(state.tones)
+        parts = step[:T].reshape(-1, 3)
+        tones = tuple(
+            (a + complex(re, im), hz + float(df)) for (a, hz), (re, im, df) in zip(state.tones, parts, strict=True)
+        )
+        split = T + len(state.rest)
+        return State(tones, state.rest + step[T:split], state.profile + step[split:])
+
+    def readings(self, state: State) -> tuple[FloatArray, FloatArray, float]:
+        """Place of each band beyond the model's, (K, B), its information for pixels of variance one, and the pixels'
+        variance."""
+        I, D = self.shown(state)
+        left = self.images - I
+        info = (D**2).sum(axis=2) * self.weight
+        place = -(D * left).sum(axis=2) / np.maximum((D**2).sum(axis=2), 1e-300)
+        free = left.size * float((self.weight > 0).mean()) - len(state.profile) - len(state.rest)
+        sigma2 = float((self.weight[:, None] * left**2).sum()) / max(free, 1.0)
+        return place, info, sigma2
+
+    def scan(self, place: FloatArray, info: FloatArray) -> tuple[FloatArray, ComplexArray]:
+        """Sum of squares that a line of each frequency takes away, places at rest and drift free, and its amplitude
+        times the exposure's low-pass, (F,) each."""
+        w = info.mean(axis=0)  # of each band: times and bands stay apart
+        y = place * w
+        centre = self.delays.mean(axis=1)
+        v = np.concatenate([np.ones((1, len(w))), self.bend.mean(axis=2), np.ones((len(self.slow), len(w)))])
+        u = np.concatenate([np.ones((3, len(self.t))), self.slow])  # columns u_k v_b
+        N = (u @ u.T) * ((v * w) @ v.T)
+        inverse = np.linalg.pinv(N)
+        right = np.einsum("ck,kb,cb->c", u, y, v)
+        gains, amplitudes = [], []
+        for first in range(0, len(self.hz), _AT_ONCE):
+            hz = self.hz[first : first + _AT_ONCE]
+            e, d = np.exp(2j * np.pi * hz[:, None] * self.t), np.exp(2j * np.pi * hz[:, None] * centre)
+            shown = ((e @ y) * d).sum(axis=1)
+            cross = (e @ u.T) * (d @ (w * v).T)  # (F, C)
+            twice = (e**2).sum(axis=1) * ((d**2) @ w)
+            one = len(self.t) * w.sum()
+            # Columns cos and -sin of the line: real and imaginary part of its amplitude.
+            A = np.empty((len(hz), 2, 2))
+            A[:, 0, 0], A[:, 1, 1] = (one + twice.real) / 2, (one - twice.real) / 2
+            A[:, 0, 1] = A[:, 1, 0] = -twice.imag / 2
+            c = np.stack([cross.real, -cross.imag], axis=1)
+            A -= c @ inverse @ c.swapaxes(1, 2)
+            b = np.stack([shown.real, -shown.imag], axis=1) - c @ (inverse @ right)
+            x = np.linalg.solve(A + 1e-6 * one * np.eye(2), b[..., None])[..., 0]
+            gains.append((x * b).sum(axis=1))
+            amplitudes.append(x[:, 0] + 1j * x[:, 1])
+        return np.concatenate(gains), np.concatenate(amplitudes)
+
+    def background(self, gain: FloatArray) -> FloatArray:
+        """The usual gain about each frequency over that of noise of variance one, (F,)."""
+        width = max(3, round(_BACKGROUND_HZ / (self.hz[1] - self.hz[0])))
+        return np.asarray(ndimage.percentile_filter(gain, 50, width, mode="nearest") / stats.chi2.median(2))
+
+    def parts(
+        self, state: State, number: int, hz_variance: float, seen: tuple[FloatArray, FloatArray], usual: FloatArray
+    ) -> tuple[Part, ...]:
+        """The frequencies of a line that explain the readings nearly as well as its own, which comes first; the
+        variance of that is for pixels of variance one, ``usual`` is the noise about each frequency."""
+        tone = state.tones[number]
+        gain, _ = self.scan(seen[0] + self.moved((tone,)), seen[1])
+        noise = float(np.interp(tone[1], self.hz, usual))
+        near = np.abs(self.hz - tone[1]) < _APART / self.span_s
+        best = float(gain[near].max()) if near.any() else float(gain.max())
+        peaks = np.flatnonzero((gain >= np.roll(gain, 1)) & (gain >= np.roll(gain, -1)) & ~near)
+        peaks = peaks[gain[peaks] > best - _ALTERNATIVE * noise]
+        peaks = peaks[np.argsort(-gain[peaks])][:_MOST_ALTERNATIVES]
+        reach = stats.norm.ppf(0.975) * math.sqrt(hz_variance * noise)
+        return tuple(Part(hz - reach, hz, hz + reach) for hz in (tone[1], *(float(self.hz[k]) for k in peaks)))
+
+
+def _solved(N: FloatArray, y: FloatArray, damping: float) -> FloatArray:
+    scale = 1 / np.sqrt(np.diag(N) + 1e-300)
+    return np.asarray(np.linalg.solve(N * scale[:, None] * scale + damping * np.eye(len(N)), y * scale) * scale)
+
+
+def find(bands: Bands, most: int = MOST_LINES, tell: Callable[[int, int], None] = lambda done, of: None) -> BandsFound:
+    """The lines of a target, at most so many, the strongest first; none where chance explains what is seen."""
+    fit = BandFit(bands)
+    state, covariance = fit.start, np.zeros((0, 0))
+    threshold = 2 * math.log(len(fit.hz) / _OVERSAMPLED / CHANCE)
+    place, info, sigma2 = fit.readings(state)
+    for number in range(most):
+        tell(number, most)
+        gain, amplitudes = fit.scan(place, info)
+        score = gain / np.maximum(fit.background(gain), sigma2)
+        for _, hz in state.tones:  # what the model of a line leaves of it
+            score[np.abs(fit.hz - hz) < 1 / fit.span_s] = 0.0
+        top = int(score.argmax())
+        if score[top] < threshold:
+            break
+        low_pass = float(np.sinc(fit.hz[top] * bands.exposure_s))
+        a = amplitudes[top] / (math.copysign(max(abs(low_pass), 0.02), low_pass))
+        state, value, covariance = fit.refined(replace(state, tones=(*state.tones, (complex(a), float(fit.hz[top])))))
+        place, info, sigma2 = fit.readings(state)
+    order = sorted(range(len(state.tones)), key=lambda k: -abs(state.tones[k][0]))
+    gain, _ = fit.scan(place, info)
+    usual = np.maximum(fit.background(gain), sigma2)
+    sets = [fit.parts(state, k, float(covariance[3 * k + 2, 3 * k + 2]), (place, info), usual) for k in order]
+    rest, drift = fit.places(state)
+    known = info > 0
+    variance = np.where(known, sigma2 / np.maximum(info, 1e-300), np.inf)
+    return BandsFound(
+        tones=tuple(state.tones[k] for k in order), sets=tuple(sets), places=fit.moved(state.tones), left=place,
+        variance=variance, drift=drift, rest=rest.mean(axis=1) + (bands.images.shape[2] - 1) / 2,
+        misfit=float((place**2 / variance)[known].mean()),
+    )  # fmt: skip
