@@ -35,6 +35,7 @@ _FILM = {
     "topic=NAME": ("topic", "channel of an MCAP file or a bag, wavefront sensor of AO telemetry"),
     "pixels=signed": ("pixels", "or unsigned, swapped: how whole numbers were meant"),
     "colour=red": ("colour", "or green, blue, all, which is the mean of a mosaic's colours"),
+    "row_time=S": ("row_time_s", "from the start of a row's exposure to the next row's, 0 for all at once"),
     "sum=8": ("frames_per_exposure", "make one exposure of this many frames, the mean of their light"),
     "background": ("subtract_median", "subtract each frame's median"),
     "scale=COUNTS": (
@@ -42,10 +43,9 @@ _FILM = {
         " full range of the camera and 16 bits are counts",
     ),
     "start=DATE": ("start_ns", "when the film begins, such as 2026-11-22T09:30, in UTC"),
-    "row_time=S": ("row_time_s", "from the start of a row's exposure to the next row's, 0 for all at once"),
 }  # fmt: skip
 """The options of --film: the field of `FilmSettings` or `FilmFile` where each goes, and its help."""
-_TAKEN = {"look": 5, "import": len(_FILM)}
+_TAKEN = {"look": 6, "import": len(_FILM)}
 """How many of them, from the first on, a command takes."""
 _COLOURS = ("red", "green", "blue", "all")
 

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -35,7 +35,7 @@ _BEYOND = 6.0
 _LEAST_TERM = 1e-5
 """Terms of the series that are left out are smaller."""
 _STEPS = 25
-_ENOUGH = 1e-7
+_ENOUGH = 3e-7
 """Relative gain of a step below which it was the last."""
 _RIDGE = 1e-9
 _ALTERNATIVE = 15.0
@@ -43,6 +43,8 @@ _ALTERNATIVE = 15.0
 _APART = 1.5
 """Frequencies are another peak of the scan beyond so many inverses of the film's length."""
 _MOST_ALTERNATIVES = 8
+_BLIND = 0.02
+"""Least low-pass of the exposure by which amplitudes of the scan are divided."""
 _DARKEST = 0.1
 """Contrast of a band, over the usual one's, from which on it is used."""
 _FRAMES_AT_ONCE = 64
@@ -95,10 +97,17 @@ class BandsFound:
     """What the model leaves of the places, (K, B)."""
     variance: FloatArray
     """Of that, by the pixels' noise, (K, B); infinite where a band shows nothing."""
+    times_s: FloatArray
+    """Middle of each band's exposures, (K, B)."""
     drift: FloatArray
     """(K,)"""
     rest: FloatArray
     """Place at rest of each band, from its first column, (B,)."""
+    bent: bool
+    """Whether it is bent at rest, so that a line at a multiple of the frame rate cannot be seen."""
+    hz: FloatArray
+    gain: FloatArray
+    """Chi-square that a line of each of these frequencies takes away, (F,) each."""
     misfit: float
     """What is left of the places over their noise, mean square."""
 
@@ -125,6 +134,10 @@ class BandFit:
         self.images = bands.images.copy()
         self.weight = np.full(B, float(bands.rest.shape[1]))
         self.hz = np.arange(bands.rate_hz / SLOWEST, bands.highest_hz, 1 / (_OVERSAMPLED * self.span_s))
+        self.offset = np.zeros(B)
+        """Of each band from the parabola, where the target is bent at rest, pixels."""
+        self.free = False
+        """Whether it is."""
         self.start = self._level()
 
     def _level(self) -> State:
@@ -147,7 +160,7 @@ class BandFit:
     def places(self, state: State) -> tuple[FloatArray, FloatArray]:
         """At rest, of each row (B, n), and the drift of each frame (K,)."""
         rest = self.of.rest - (len(self.x) - 1) / 2 + np.tensordot(state.rest[:2], self.bend, axes=1)
-        return rest, state.rest[2:] @ self.slow
+        return rest + self.offset[:, None], state.rest[2:] @ self.slow
 
     def moved(self, tones: Tones) -> FloatArray:
         """Mean place of each band in each exposure by lines, (K, B)."""
@@ -196,19 +209,19 @@ class BandFit:
     def normal(self, state: State) -> tuple[FloatArray, FloatArray, float]:
         """Normal matrix and right side of Gauss and Newton's step, and the weighted sum of squares of what is left."""
         G = self.transfer(state)
-        I, D = self.shown(state, G)
+        image, D = self.shown(state, G)
         steps = []
         for k, (a, hz) in enumerate(state.tones):
             for da, df in ((1e-4, 0.0), (1e-4j, 0.0), (0.0, 1e-4 / self.span_s)):
                 tones = (*state.tones[:k], (a + da, hz + df), *state.tones[k + 1 :])
-                steps.append((self.shown(replace(state, tones=tones))[0] - I) / (abs(da) or df))
+                steps.append((self.shown(replace(state, tones=tones))[0] - image) / (abs(da) or df))
         rest, drift = self.places(state)
         at = rest.mean(axis=1) + drift[:, None] + self.moved(state.tones)
         bend = self.bend.mean(axis=2)
         size = len(steps) + len(state.rest) + len(state.profile)
         N, y, total = np.zeros((size, size)), np.zeros(size), 0.0
         root = np.sqrt(self.weight)[None, :, None]
-        for first in range(0, len(I), _FRAMES_AT_ONCE):
+        for first in range(0, len(image), _FRAMES_AT_ONCE):
             k = slice(first, first + _FRAMES_AT_ONCE)
             waves = G[k, :, :, None] * self.wave
             columns = [each[k] for each in steps]
@@ -217,7 +230,7 @@ class BandFit:
             columns += [np.ones_like(D[k]), self.x - at[k, :, None]]
             J = np.concatenate([np.stack(columns, axis=2), waves.real, waves.imag], axis=2)  # (k, B, P, W)
             flat = (J * root[..., None]).swapaxes(1, 2).swapaxes(0, 1).reshape(size, -1)
-            left = (root * (self.images[k] - I[k])).ravel()
+            left = (root * (self.images[k] - image[k])).ravel()
             N += flat @ flat.T
             y += flat @ left
             total += float(left @ left)
@@ -233,8 +246,8 @@ class BandFit:
         """Weighted sum of squares of what a state leaves."""
         return float((self.weight[:, None] * (self.images - self.shown(state)[0]) ** 2).sum())
 
-    def refined(self, state: State) -> tuple[State, float, FloatArray]:
-        """The nearest minimum in all unknowns, its sum of squares, and the covariance of the lines' parameters (real
+    def refined(self, state: State) -> tuple[State, FloatArray]:
+        """The nearest minimum in all unknowns, and the covariance of the lines' parameters (real
         and imaginary part, frequency) over the pixels' variance."""
         damping, T = 1e-3, 3 * len(state.tones)
         N, y, value = self.normal(state)
@@ -254,7 +267,7 @@ class BandFit:
                 break
         scale = 1 / np.sqrt(np.diag(N) + 1e-300)
         C = np.linalg.inv(N * scale[:, None] * scale + _RIDGE * np.eye(len(N))) * scale[:, None] * scale
-        return state, value, C[:T, :T]
+        return state, C[:T, :T]
 
     def _moved(self, state: State, step: FloatArray) -> State:
         T = 3 * len(state.tones)
@@ -268,8 +281,8 @@ class BandFit:
     def readings(self, state: State) -> tuple[FloatArray, FloatArray, float]:
         """Place of each band beyond the model's, (K, B), its information for pixels of variance one, and the pixels'
         variance."""
-        I, D = self.shown(state)
-        left = self.images - I
+        image, D = self.shown(state)
+        left = self.images - image
         info = (D**2).sum(axis=2) * self.weight
         place = -(D * left).sum(axis=2) / np.maximum((D**2).sum(axis=2), 1e-300)
         free = left.size * float((self.weight > 0).mean()) - len(state.profile) - len(state.rest)
@@ -284,6 +297,8 @@ class BandFit:
         centre = self.delays.mean(axis=1)
         v = np.concatenate([np.ones((1, len(w))), self.bend.mean(axis=2), np.ones((len(self.slow), len(w)))])
         u = np.concatenate([np.ones((3, len(self.t))), self.slow])  # columns u_k v_b
+        if self.free:
+            v, u = np.concatenate([v, np.eye(len(w))]), np.concatenate([u, np.ones((len(w), len(self.t)))])
         N = (u @ u.T) * ((v * w) @ v.T)
         inverse = np.linalg.pinv(N)
         right = np.einsum("ck,kb,cb->c", u, y, v)
@@ -312,6 +327,27 @@ class BandFit:
         width = max(3, round(_BACKGROUND_HZ / (self.hz[1] - self.hz[0])))
         return np.asarray(ndimage.percentile_filter(gain, 50, width, mode="nearest") / stats.chi2.median(2))
 
+    def alias(self, hz: FloatArray) -> FloatArray:
+        """Distance from the nearest multiple of the frame rate."""
+        return np.asarray(hz - self.of.rate_hz * np.round(hz / self.of.rate_hz))
+
+    def is_bent(self, state: State, place: FloatArray) -> bool:
+        """Whether a straight line or a parabola at rest, and one line at a multiple of the frame rate, leave a pattern
+        that all frames share."""
+        hz = np.array([each for _, each in state.tones])
+        if (np.abs(self.alias(hz)) < 1 / self.span_s).sum() > 1:
+            return True
+        good = self.weight > 0
+        shared, noise = place.mean(axis=0)[good], place.var(axis=0)[good] / len(place)
+        return float((shared**2 / noise).sum()) > float(stats.chi2.ppf(1 - CHANCE, int(good.sum())))
+
+    def let_bend(self) -> None:
+        """Take each band to be at rest where it is in the mean of the frames."""
+        for _ in range(2):
+            self.offset += self.readings(self.start)[0].mean(axis=0)
+            self.start = self.profiled(self.start)
+        self.free = True
+
     def parts(
         self, state: State, number: int, hz_variance: float, seen: tuple[FloatArray, FloatArray], usual: FloatArray
     ) -> tuple[Part, ...]:
@@ -335,8 +371,38 @@ def _solved(N: FloatArray, y: FloatArray, damping: float) -> FloatArray:
 
 
 def find(bands: Bands, most: int = MOST_LINES, tell: Callable[[int, int], None] = lambda done, of: None) -> BandsFound:
-    """The lines of a target, at most so many, the strongest first; none where chance explains what is seen."""
+    """The lines of a target, at most so many, the strongest first; none where chance explains what is seen.
+
+    Where more than one line at multiples of the frame rate would be needed, or they leave a pattern that all frames
+    share, the target is bent at rest: then each band's place is free, and no such line can be seen.
+    """
     fit = BandFit(bands)
+    found = _lines(fit, most, tell)
+    if fit.is_bent(*found[:2]):
+        fit.let_bend()
+        found = _lines(fit, most, tell)
+    state, place, info, sigma2, covariance = found
+    order = sorted(range(len(state.tones)), key=lambda k: -abs(state.tones[k][0]))
+    gain, _ = fit.scan(place, info)
+    usual = np.maximum(fit.background(gain), sigma2)
+    sets = [fit.parts(state, k, float(covariance[3 * k + 2, 3 * k + 2]), (place, info), usual) for k in order]
+    all_lines, _ = fit.scan(place + fit.moved(state.tones), info)
+    rest, drift = fit.places(state)
+    known = info > 0
+    variance = np.where(known, sigma2 / np.maximum(info, 1e-300), np.inf)
+    return BandsFound(
+        tones=tuple(state.tones[k] for k in order), sets=tuple(sets), places=fit.moved(state.tones), left=place,
+        variance=variance, drift=drift, rest=rest.mean(axis=1) + (bands.images.shape[2] - 1) / 2, bent=fit.free,
+        times_s=fit.t[:, None] + fit.middle_s + fit.delays.mean(axis=1), hz=fit.hz, gain=all_lines / usual,
+        misfit=float((place**2 / variance)[known].mean()),
+    )  # fmt: skip
+
+
+def _lines(
+    fit: BandFit, most: int, tell: Callable[[int, int], None]
+) -> tuple[State, FloatArray, FloatArray, float, FloatArray]:
+    """A state with its lines, readings of what it leaves with their information and the pixels' variance, and the
+    covariance of the lines' parameters over that."""
     state, covariance = fit.start, np.zeros((0, 0))
     threshold = 2 * math.log(len(fit.hz) / _OVERSAMPLED / CHANCE)
     place, info, sigma2 = fit.readings(state)
@@ -346,22 +412,14 @@ def find(bands: Bands, most: int = MOST_LINES, tell: Callable[[int, int], None] 
         score = gain / np.maximum(fit.background(gain), sigma2)
         for _, hz in state.tones:  # what the model of a line leaves of it
             score[np.abs(fit.hz - hz) < 1 / fit.span_s] = 0.0
+        if fit.free:
+            score[np.abs(fit.alias(fit.hz)) < 1 / fit.span_s] = 0.0
         top = int(score.argmax())
         if score[top] < threshold:
             break
-        low_pass = float(np.sinc(fit.hz[top] * bands.exposure_s))
-        a = amplitudes[top] / (math.copysign(max(abs(low_pass), 0.02), low_pass))
-        state, value, covariance = fit.refined(replace(state, tones=(*state.tones, (complex(a), float(fit.hz[top])))))
+        hz = float(fit.hz[top])
+        low_pass = float(np.sinc(hz * fit.of.exposure_s))
+        a = complex(amplitudes[top]) / math.copysign(max(abs(low_pass), _BLIND), low_pass)
+        state, covariance = fit.refined(replace(state, tones=(*state.tones, (a, hz))))
         place, info, sigma2 = fit.readings(state)
-    order = sorted(range(len(state.tones)), key=lambda k: -abs(state.tones[k][0]))
-    gain, _ = fit.scan(place, info)
-    usual = np.maximum(fit.background(gain), sigma2)
-    sets = [fit.parts(state, k, float(covariance[3 * k + 2, 3 * k + 2]), (place, info), usual) for k in order]
-    rest, drift = fit.places(state)
-    known = info > 0
-    variance = np.where(known, sigma2 / np.maximum(info, 1e-300), np.inf)
-    return BandsFound(
-        tones=tuple(state.tones[k] for k in order), sets=tuple(sets), places=fit.moved(state.tones), left=place,
-        variance=variance, drift=drift, rest=rest.mean(axis=1) + (bands.images.shape[2] - 1) / 2,
-        misfit=float((place**2 / variance)[known].mean()),
-    )  # fmt: skip
+    return state, place, info, sigma2, covariance

@@ -17,10 +17,12 @@ import numpy as np
 
 from aolink.errors import IdentificationError, ImportingError
 from aolink.films.film import Film
-from aolink.identification import FEWEST, Readings, kinds_of, maxima, readings, space_of
+from aolink.identification import FEWEST, Readings, bands, kinds_of, maxima, readings, space_of
+from aolink.identification.bands import BandsFound
 from aolink.identification.models import Process, ProcessSum
 from aolink.identification.vibration import MOST_LINES, SLOWEST, Found, Line, PathMoments, find
 from aolink.importing.frames import FilmLight, FilmSettings, film_times, nonlinear_note
+from aolink.jobs.look_rows import as_moments, assumed, bands_of, find_target, grade_of
 from aolink.jobs.look_scene import LEAST_MOTION, Scene
 from aolink.jobs.look_spots import Spots, find_spots
 from aolink.jobs.look_texture import MARGIN, Region, lively, moments_of
@@ -103,6 +105,8 @@ class Looked:
     """What was assumed, and what follows where it is wrong."""
     doubts: tuple[str, ...]
     """What else to know."""
+    rows: BandsFound | None = None
+    """Of a target in a film that was exposed row by row."""
 
     @property
     def lines(self) -> tuple[Line, ...]:
@@ -117,7 +121,8 @@ class Looked:
             for n in range(2, _HARMONICS + 1):
                 off = abs(each.hz - n * self.found.lines[0].hz)
                 alias = [abs(s * each.hz - n * self.found.lines[0].hz) for s in (1, -1)]
-                off = min(abs(a - self.rate_hz * round(a / self.rate_hz)) for a in alias)
+                if self.rows is None:  # rows tell aliases apart
+                    off = min(abs(a - self.rate_hz * round(a / self.rate_hz)) for a in alias)
                 if off < _SAME * (n + 1) / self.seen.span_s:
                     numbers[k] = n
                     break
@@ -201,6 +206,10 @@ def look(
     if film.times_ns is not None:
         starts = (film.times_ns[:count] - film.times_ns[0]) / 1e9
     common = Common(rate_hz=rate, exposure_s=exposure_s, frames=count)
+    if settings.row_time_s:
+        by_rows = _of_rows(film, settings, starts + exposure_s / 2, common, at, size, tell)
+        if by_rows is not None:
+            return by_rows
     if at is None and (spots := _spots(film, settings, count, tell)) is not None:
         return _of_spots(film, settings, name, spots, kernel, starts + exposure_s / 2, common, tell)
     return _of_regions(film, settings, starts + exposure_s / 2, common, at, size, tell)
@@ -303,6 +312,34 @@ def _of_regions(
         doubts=tuple(doubts),
     )  # fmt: skip
     return _graded(looked)
+
+
+def _of_rows(
+    film: Film, settings: FilmSettings, times_s: FloatArray, common: Common, at: tuple[float, float] | None, size: int,
+    tell: Tell,
+) -> Looked | None:  # fmt: skip
+    """What moves a line or an edge that goes through many rows, each of which is exposed at its own time; None where
+    there is none."""
+    assert settings.row_time_s is not None
+    count, light = common["frames"], FilmLight(film, settings)
+    target = find_target(_shown(film, light, count, tell), at, size)
+    if target is None:
+        return None
+    rate, exposure_s = common["rate_hz"], common["exposure_s"]
+    cut, region = bands_of(_shown(film, light, count, tell, 1), target, times_s, settings.row_time_s, exposure_s, rate)
+    rows = bands.find(cut, tell=lambda done, of: tell("frequencies", done, of))
+    seen, found = as_moments(rows, exposure_s, rate)
+    moved, sure = _moved(seen)
+    blurs = [abs(a) ** 2 / 2 * (1 - float(np.sinc(hz * exposure_s)) ** 2) for a, hz in rows.tones]
+    grade, because = grade_of(rows, exposure_s, rate)
+    of_film, *others = _assumed(film, settings, common, None, None, math.nan)
+    return Looked(
+        **common, seen=seen, found=found, moved=moved if moved > max(LEAST_MOTION, _CERTAIN * sure) else 0.0,
+        blur=math.sqrt(sum(blurs)), grade=grade, because=because, plain_hz=_plain(seen, found), sd=math.nan, spots=None,
+        scene=None, together=False, text="", regions=(region,), picture=target.mean, cut=cut.images, camera=False,
+        assumed=(of_film, *assumed(rows, settings.row_time_s, exposure_s), *others[1:]), doubts=tuple(_of_film(film)),
+        rows=rows,
+    )  # fmt: skip
 
 
 def _shown(film: Film, light: FilmLight, count: int, tell: Tell, turn: int = 0) -> Iterator[FloatArray]:

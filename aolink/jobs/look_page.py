@@ -18,6 +18,7 @@ from aolink.errors import ExportError
 from aolink.files import writing
 from aolink.identification.vibration import Vibration
 from aolink.jobs.look import Looked
+from aolink.jobs.look_rows_page import draw_bands, draw_scan, rows_figures
 from aolink.jobs.look_texture import MARGIN
 from aolink.jobs.look_words import in_set, paragraph, size_of
 from aolink.numerics.arrays import FloatArray
@@ -46,9 +47,11 @@ def write_page(looked: Looked, path: Path, name: str, commands: Sequence[str], *
         if looked.doubts:
             parts += ["<h2>Also</h2>", *(f"<p>{escape(each)}.</p>" for each in looked.doubts)]
         figures = [picture_in_page(_whole(looked), "The mean of the frames, and where it was looked at.")]
-        if looked.found.lines:
+        if looked.rows is not None:
+            figures += [picture_in_page(figure, caption) for figure, caption in rows_figures(looked, looked.rows)]
+        elif looked.found.lines:
             figures.append(_played(looked))
-        if looked.moves:
+        if looked.moves and looked.rows is None:
             figures.append(picture_in_page(_places(looked), "The mean place in each frame, and the vibrations in it."))
             figures.append(picture_in_page(_spectrum(looked), "Spectrum of the places, which aliases share, and what"
                                            " the blur says of each frequency: the higher, the likelier."))  # fmt: skip
@@ -64,7 +67,8 @@ def write_page(looked: Looked, path: Path, name: str, commands: Sequence[str], *
 
 def write_path(looked: Looked, path: Path, *, overwrite: bool = False) -> None:
     """Write the path by the vibrations and the drift: time, x and y, and their standard deviation, pixels."""
-    inside = (np.arange(STEPS) + 0.5) / STEPS - 0.5
+    steps = STEPS if looked.rows is None else 1  # bands of rows are as near to each other
+    inside = (np.arange(steps) + 0.5) / steps - 0.5
     times = looked.seen.times_s[:, None] + inside * looked.exposure_s
     moved = looked.path(times) + (looked.found.drift[:, :1] @ looked.seen.axes[0])
     sd = looked.rest / math.sqrt(2)
@@ -101,8 +105,12 @@ def summary(looked: Looked) -> Figure:
     figure = new_figure(180, 60)
     whole, places, spectra = figure.subplots(1, 3, width_ratios=[1, 1.3, 1.3])
     _draw_whole(looked, whole)
-    _draw_places(looked, places)
-    _draw_evidence(looked, spectra)
+    if looked.rows is None:
+        _draw_places(looked, places)
+        _draw_evidence(looked, spectra)
+    else:
+        draw_bands(looked, looked.rows, places)
+        draw_scan(looked, looked.rows, spectra)
     return figure
 
 

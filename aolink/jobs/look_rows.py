@@ -6,28 +6,36 @@ A target that goes through many rows, as a bolt's edge, tape, or a line of light
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 from scipy import ndimage
 
-from aolink.identification.bands import Bands
-from aolink.numerics.arrays import FloatArray, IntArray
+from aolink.identification.bands import Bands, BandsFound
+from aolink.identification.vibration import Found, Line, PathMoments
+from aolink.jobs.look_texture import Region
+from aolink.numerics.arrays import BoolArray, FloatArray
 
 BAND_S = 0.2e-3
 """Longest time from the first row of a band to that of the next."""
 _BIN = 8
 """Rows that are summed to find a target."""
 _SMOOTH = 1.5
+_FLANKS = 5.0
+"""Standard deviation of the Gaussian that makes one place of both sides of a line, pixels."""
 _WINDOW = 32
 """Columns about a target that are looked at."""
 _LEAST_ROWS = 128
 """Rows that a target must go through: spots are smaller."""
-_NEAR = 3.0
+_NEAR = 4.0
 """Pixels from a parabola within which a place belongs to it."""
 _INLIERS = 0.7
 _TRIES = 300
+_LEAST_GAIN = 35.0
+"""Chi-square of a vibration that is seen."""
+_MISFIT = 2.0
+"""Mean square of what is left of the places, over their noise, from which on the path is not believed."""
 _STEEP = 1.0
 """Columns that a target may go aside within a band."""
 
@@ -62,9 +70,9 @@ def find_target(frames: Iterator[FloatArray], at: tuple[float, float] | None, si
     variance = squares / count - mean**2
     slope = np.gradient(mean, axis=1) ** 2
     usual = float(np.median(variance))
-    moving = ndimage.uniform_filter1d(np.maximum(variance - 2 * usual, 0.0) * slope, 5, axis=1)
-    for score in (moving, ndimage.uniform_filter1d(slope, 5, axis=1)):
-        shown = score.copy()
+    moving = np.maximum(variance - 2 * usual, 0.0) * slope
+    for score in (moving, slope):
+        shown = ndimage.gaussian_filter1d(score, _FLANKS, axis=1)
         shown[:, : _WINDOW // 4], shown[:, -(_WINDOW // 4) :] = 0, 0
         if at is not None:
             columns = np.arange(shown.shape[1])
@@ -79,9 +87,7 @@ def find_target(frames: Iterator[FloatArray], at: tuple[float, float] | None, si
     return None
 
 
-def _parabola(
-    best: FloatArray, good: np.ndarray, at: tuple[float, float] | None
-) -> tuple[int, int, FloatArray] | None:
+def _parabola(best: FloatArray, good: BoolArray, at: tuple[float, float] | None) -> tuple[int, int, FloatArray] | None:
     """First and last bin of a parabola through most of the places, and its coefficients."""
     rows = np.flatnonzero(good)
     if len(rows) * _BIN < _LEAST_ROWS:
@@ -105,8 +111,8 @@ def _parabola(
 def bands_of(
     frames: Iterator[FloatArray], target: Target, times_s: FloatArray, row_time_s: float, exposure_s: float,
     rate_hz: float,
-) -> tuple[Bands, IntArray]:  # fmt: skip
-    """The bands of a target, and the first row and column of each (B, 2); ``times_s`` are the middles of the exposures
+) -> tuple[Bands, Region]:  # fmt: skip
+    """The bands of a target, and the part of the picture that they are in; ``times_s`` are the middles of the exposures
     of each frame's first row."""
     slope = float(np.abs(np.diff(target.places)).max())
     n = max(1, min(int(BAND_S / abs(row_time_s)), int(_STEEP / max(slope, 1e-9)), len(target.places) // 8))
@@ -121,4 +127,74 @@ def bands_of(
         images=images, rest=places - first[:, None], times_s=times_s, delays_s=rows * row_time_s,
         exposure_s=exposure_s, rate_hz=rate_hz,
     )  # fmt: skip
-    return bands, np.stack([rows[:, 0], first], axis=1)
+    left, right = int(first.min()), int(first.max()) + _WINDOW
+    return bands, Region(left, target.first, right - left, count * n)
+
+
+def as_moments(found: BandsFound, exposure_s: float, rate_hz: float) -> tuple[PathMoments, Found]:
+    """What was found in bands as that of one region, whose exposures are those of all bands, in order of time."""
+    order = np.argsort(found.times_s.ravel())
+    n = len(order)
+
+    def along_x(values: FloatArray, other: float = 0.0) -> FloatArray:
+        out = np.full((n, 1, 2), other)
+        out[:, 0, 0] = values.ravel()[order]
+        return out
+
+    drift = np.repeat(found.drift[:, None], found.times_s.shape[1], axis=1)
+    seen = PathMoments(
+        times_s=found.times_s.ravel()[order], exposure_s=exposure_s, rate_hz=rate_hz,
+        mean=along_x(found.places + drift + found.left), mean_variance=along_x(found.variance, np.inf),
+        spread=np.zeros((n, 1, 3)), spread_variance=np.full((n, 1, 3), np.inf), constant_sd=np.zeros((1, 3)),
+        axes=np.eye(2)[None],
+    )  # fmt: skip
+    lines = tuple(Line(hz, np.array([a, 0j])) for a, hz in found.tones)
+    return seen, Found(
+        lines=lines, sets=found.sets, mean_misfit=found.misfit, spread_misfit=1.0, constant=np.zeros((1, 3)),
+        residual=along_x(np.where(np.isfinite(found.variance), found.left, 0.0)), drift=along_x(drift),
+    )  # fmt: skip
+
+
+def is_shared(hz: float, found: BandsFound, rate_hz: float) -> bool:
+    """Whether a vibration at a frequency shows the same in all frames: a multiple of the frame rate."""
+    return abs(hz - rate_hz * round(hz / rate_hz)) < 1 / float(np.ptp(found.times_s))
+
+
+def grade_of(found: BandsFound, exposure_s: float, rate_hz: float) -> tuple[int, str]:
+    """Index of the grade of the strongest line, and why it is no better."""
+    if not found.tones:
+        unseen = f"of {1 / exposure_s:.4g} Hz, whole swings in an exposure"
+        unseen += f", or of {rate_hz:.4g} Hz, as it is bent at rest" * found.bent
+        known = found.variance[np.isfinite(found.variance)]
+        least = math.sqrt(2 * _LEAST_GAIN / float((1 / known).sum())) if len(known) else math.inf
+        return 2, (
+            f"no vibration up to {found.hz[-1]:.4g} Hz moves it by {least:.1g} pixels or more: it is still, or vibrates"
+            f" at a multiple {unseen}"
+        )
+    why = []
+    if len(found.sets[0]) > 1:
+        why.append("these frames are not enough to tell it from its aliases")
+    if is_shared(found.tones[0][1], found, rate_hz):
+        why.append(
+            f"it is a multiple of {rate_hz:.4g} Hz, and a target that at rest is bent so, and not straight or a"
+            " parabola, looks the same"
+        )
+    if found.misfit > _MISFIT:
+        why.append("the places move in another way too")
+    return int(bool(why)), "; ".join(why)
+
+
+def assumed(found: BandsFound, row_time_s: float, exposure_s: float) -> Iterator[str]:
+    """What was taken for granted."""
+    yield (
+        f"each row begins {row_time_s:.4g} s after the one above: with another row time the frequency is another, by a"
+        " part of the frame rate or more"
+    )
+    yield (
+        f"whole swings in an exposure are unseen: vibrations at {1 / exposure_s:.4g} Hz and its multiples; also those"
+        f" beyond {found.hz[-1]:.4g} Hz"
+    )
+    if found.bent:
+        yield "the target is not straight at rest: vibrations at multiples of the frame rate are unseen"
+    else:
+        yield "the target is straight or a parabola at rest"

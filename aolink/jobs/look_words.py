@@ -23,7 +23,8 @@ def paragraph(looked: Looked) -> str:
         if harmonics := sorted({n for n in looked.harmonics if n > 1}):
             said.append(f"Its harmonics {', '.join(map(str, harmonics))} show too.")
         if looked.plain_hz and abs(looked.plain_hz - looked.found.lines[0].hz) > 0.01 * looked.plain_hz:
-            said.append(f"A plain spectrum of this film says {looked.plain_hz:.3g} Hz.")
+            what = "A plain spectrum of this film says" if looked.rows is None else "Your frame rate alone would say"
+            said.append(f"{what} {looked.plain_hz:.3g} Hz.")
     if looked.spots is not None:
         n = len(looked.spots.corners)
         what = f"{n} spots, each" if n > 1 else "One spot,"
@@ -92,6 +93,7 @@ def as_json(looked: Looked) -> dict[str, Any]:
         "plain_hz": _number(looked.plain_hz), "rate_hz": looked.rate_hz, "exposure_s": looked.exposure_s,
         "frames": looked.frames, "moved_pixels": looked.moved, "left_pixels": looked.rest,
         "spots": None if spots is None else spots.corners.tolist(), "kernel_sd": _number(looked.sd),
+        "rows": None if looked.rows is None else [looked.regions[0].y, looked.regions[0].y + looked.regions[0].rows],
         "together": looked.together, "camera": looked.camera,
         "regions": [[each.x, each.y, each.columns, each.rows] for each in looked.regions],
         "assumed": list(looked.assumed), "doubts": list(looked.doubts),
