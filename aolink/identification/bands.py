@@ -43,6 +43,8 @@ _ALTERNATIVE = 15.0
 _APART = 1.5
 """Frequencies are another peak of the scan beyond so many inverses of the film's length."""
 _MOST_ALTERNATIVES = 8
+_LIKELY = 0.8
+"""Aliases with this share of the best one's gain are refined too: readings of large motion are not exact."""
 _BLIND = 0.02
 """Least low-pass of the exposure by which amplitudes of the scan are divided."""
 _DARKEST = 0.1
@@ -138,24 +140,22 @@ class BandFit:
         """Of each band from the parabola, where the target is bent at rest, pixels."""
         self.free = False
         """Whether it is."""
-        self.start = self._level()
+        self.start = State((), np.zeros(2 + len(self.slow)), np.zeros(2 + 2 * len(self.q)))
+        for _ in range(2):
+            self.start = self.profiled(self.start)
+            self.level(self.start)
+        self.start = self.profiled(self.start)
 
-    def _level(self) -> State:
-        """The state without lines; light of each band in units of the profile, its ground taken off."""
-        state = State((), np.zeros(2 + len(self.slow)), np.zeros(2 + 2 * len(self.q)))
-        for turn in range(3):
-            state = self.profiled(state)
-            if turn == 2:
-                break
-            shown, slope = (each.mean(axis=0) for each in self.shown(state))  # (B, W)
-            mean = self.images.mean(axis=0)
-            for b in range(len(mean)):
-                A = np.stack([shown[b], np.ones_like(self.x), slope[b]], axis=1)
-                gain, ground, _ = np.linalg.lstsq(A, mean[b], rcond=None)[0]
-                good = gain > _DARKEST
-                self.images[:, b] = (self.images[:, b] - ground) / gain if good else 0.0
-                self.weight[b] *= gain**2 if good else 0.0
-        return state
+    def level(self, state: State) -> None:
+        """Take the light of each band in units of a state's profile, its ground off; both are the same in all
+        frames."""
+        shown, slope = (each.mean(axis=0) for each in self.shown(state))  # (B, W)
+        for b, mean in enumerate(self.images.mean(axis=0)):
+            A = np.stack([shown[b], np.ones_like(self.x), slope[b]], axis=1)
+            gain, ground, _ = np.linalg.lstsq(A, mean, rcond=None)[0]
+            good = gain > _DARKEST
+            self.images[:, b] = (self.images[:, b] - ground) / gain if good else 0.0
+            self.weight[b] *= gain**2 if good else 0.0
 
     def places(self, state: State) -> tuple[FloatArray, FloatArray]:
         """At rest, of each row (B, n), and the drift of each frame (K,)."""
@@ -222,15 +222,15 @@ class BandFit:
         N, y, total = np.zeros((size, size)), np.zeros(size), 0.0
         root = np.sqrt(self.weight)[None, :, None]
         for first in range(0, len(image), _FRAMES_AT_ONCE):
-            k = slice(first, first + _FRAMES_AT_ONCE)
-            waves = G[k, :, :, None] * self.wave
-            columns = [each[k] for each in steps]
-            columns += [-D[k] * each[:, None] for each in bend]
-            columns += [-D[k] * each[k, None, None] for each in self.slow]
-            columns += [np.ones_like(D[k]), self.x - at[k, :, None]]
+            part = slice(first, first + _FRAMES_AT_ONCE)
+            waves = G[part, :, :, None] * self.wave
+            columns = [each[part] for each in steps]
+            columns += [-D[part] * each[:, None] for each in bend]
+            columns += [-D[part] * each[part, None, None] for each in self.slow]
+            columns += [np.ones_like(D[part]), self.x - at[part, :, None]]
             J = np.concatenate([np.stack(columns, axis=2), waves.real, waves.imag], axis=2)  # (k, B, P, W)
             flat = (J * root[..., None]).swapaxes(1, 2).swapaxes(0, 1).reshape(size, -1)
-            left = (root * (self.images[k] - image[k])).ravel()
+            left = (root * (self.images[part] - image[part])).ravel()
             N += flat @ flat.T
             y += flat @ left
             total += float(left @ left)
@@ -417,9 +417,22 @@ def _lines(
         top = int(score.argmax())
         if score[top] < threshold:
             break
-        hz = float(fit.hz[top])
-        low_pass = float(np.sinc(hz * fit.of.exposure_s))
-        a = complex(amplitudes[top]) / math.copysign(max(abs(low_pass), _BLIND), low_pass)
-        state, covariance = fit.refined(replace(state, tones=(*state.tones, (a, hz))))
+        # A strong line raises what is taken for noise about it, so that its aliases are told apart without that.
+        family = np.flatnonzero((np.abs(fit.alias(fit.hz - fit.hz[top])) < 1 / fit.span_s) & (score > threshold))
+        family = family[np.argsort(-gain[family])]
+        tried = list[tuple[float, State, FloatArray]]()
+        chosen = list[float]()
+        for k in family[gain[family] > _LIKELY * gain[family[0]]]:
+            hz = float(fit.hz[k])
+            if any(abs(hz - other) < _APART / fit.span_s for other in chosen):
+                continue
+            chosen.append(hz)
+            low_pass = float(np.sinc(hz * fit.of.exposure_s))
+            a = complex(amplitudes[k]) / math.copysign(max(abs(low_pass), _BLIND), low_pass)
+            new, covariance = fit.refined(replace(state, tones=(*state.tones, (a, hz))))
+            tried.append((fit.misfit(new), new, covariance))
+        _, state, covariance = min(tried, key=lambda each: each[0])
+        fit.level(state)  # lines that beat slowly blur each band in its own way
+        state, covariance = fit.refined(state)
         place, info, sigma2 = fit.readings(state)
     return state, place, info, sigma2, covariance

@@ -55,17 +55,15 @@ class Target:
 def find_target(frames: Iterator[FloatArray], at: tuple[float, float] | None, size: int) -> Target | None:
     """The line or edge that moves most, or is strongest where none does; about the place ``at`` (x, y) where one is
     given, as wide as ``size``. None where nothing goes through many rows."""
-    count, total, squares, whole = 0, None, None, None
+    count, total, squares, whole = 0, *(np.zeros(()) for _ in range(3))
     for frame in frames:
-        rows = len(frame) // _BIN * _BIN
-        if rows < _LEAST_ROWS or frame.shape[1] < _WINDOW + 2:
+        height = len(frame) // _BIN * _BIN
+        if height < _LEAST_ROWS or frame.shape[1] < _WINDOW + 2:
             return None
-        binned = ndimage.gaussian_filter1d(frame[:rows].reshape(-1, _BIN, frame.shape[1]).mean(axis=1), _SMOOTH, axis=1)
-        if total is None:
-            total, squares, whole = np.zeros_like(binned), np.zeros_like(binned), np.zeros_like(frame)
+        binned = ndimage.gaussian_filter1d(
+            frame[:height].reshape(-1, _BIN, frame.shape[1]).mean(axis=1), _SMOOTH, axis=1
+        )
         total, squares, whole, count = total + binned, squares + binned**2, whole + frame, count + 1
-    if total is None or squares is None or whole is None:
-        return None
     mean = total / count
     variance = squares / count - mean**2
     slope = np.gradient(mean, axis=1) ** 2
@@ -83,7 +81,9 @@ def find_target(frames: Iterator[FloatArray], at: tuple[float, float] | None, si
         if found is not None:
             first, last, curve = found
             rows = np.arange(first * _BIN, (last + 1) * _BIN)
-            return Target(first * _BIN, np.polyval(curve, (rows - (_BIN - 1) / 2) / _BIN), whole / count)
+            return Target(
+                first * _BIN, np.asarray(np.polyval(curve, (rows - (_BIN - 1) / 2) / _BIN), np.float64), whole / count
+            )
     return None
 
 
@@ -124,7 +124,7 @@ def bands_of(
     y, x = rows[:, :, None], (first[:, None] + np.arange(_WINDOW))[:, None]
     images = np.array([frame[y, x].mean(axis=1) for frame in frames])
     bands = Bands(
-        images=images, rest=places - first[:, None], times_s=times_s, delays_s=rows * row_time_s,
+        images=images, rest=places - first[:, None], times_s=times_s, delays_s=np.asarray(rows * row_time_s, np.float64),
         exposure_s=exposure_s, rate_hz=rate_hz,
     )  # fmt: skip
     left, right = int(first.min()), int(first.max()) + _WINDOW

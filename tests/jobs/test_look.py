@@ -229,3 +229,52 @@ def test_a_fork_of_32_hz_is_found_in_films_of_slow_cameras(summed: int, opened: 
     assert looked.grade < 2
     assert looked.lines[0].hz == pytest.approx(31.97, abs=0.05)
     assert looked.lines[0].ellipse[0] == pytest.approx(1.5, abs=0.15)
+
+
+def line_film(hz: float = 437.0, amplitude: float = 0.6) -> Any:
+    """Frames of a line of light, and the time from row to row: 192 rows read in 19.2 ms, 30 frames/s of 1 ms."""
+    rng, rows, row_time = np.random.default_rng(2), np.arange(192)[:, None], 1e-4
+    inside = (np.arange(20) + 0.5) / 20 * 1e-3
+    frames = np.empty((48, 192, 64))
+    for k, frame in enumerate(frames):
+        t = k / 30 + rows * row_time + inside
+        place = 30 + 0.02 * rows + amplitude * np.sin(2 * np.pi * hz * t)
+        shown = np.exp(-((np.arange(64) - place[..., None]) ** 2) / (2 * 1.5**2)).mean(axis=1)
+        frame[:] = 20 + 160 * (shown + 0.05 * rng.normal(size=shown.shape))
+    return np.clip(np.rint(frames), 0, 255).astype(np.uint8)
+
+
+@pytest.mark.slow
+def test_rows_that_are_exposed_one_after_the_other_are_a_clock(aolink: Run, tmp_path: Path) -> None:
+    """437 Hz is an alias of 13 Hz for the frames alone."""
+    np.save(tmp_path / "line.npy", line_film())
+    done = aolink("look", "line.npy", "--rate", "30", "--exposure", "1ms", "--film", "row_time=100us", "--json")
+    assert done.returncode == 0, done.stderr
+    said = json.loads(done.stdout)
+    assert said["grade"] == "believe it"
+    (line,) = said["lines"]
+    assert line["hz"] == pytest.approx(437.0, rel=1e-4)
+    ((low, high),) = line["set"]
+    assert low < 437 < high
+    assert line["half_axes_pixels"][0] == pytest.approx(0.6, rel=0.02)
+    assert said["plain_hz"] == pytest.approx(13.0, abs=0.1)
+    assert "frame rate alone" in said["text"]
+    assert said["rows"] == [0, 192]
+    folder = tmp_path / "line-look"
+    assert {each.name for each in folder.iterdir()} == {"page.html", "path.csv", "tone.wav"}
+    assert (folder / "page.html").read_text().count("<figure>") == 4
+    path = np.loadtxt(folder / "path.csv", delimiter=",", skiprows=1)
+    true = 0.6 * np.sin(2 * np.pi * 437 * path[:, 0])
+    assert np.abs(path[:, 1] - path[:, 1].mean() - true).max() < 0.05
+
+
+@pytest.mark.slow
+def test_a_tone_at_a_multiple_of_the_frame_rate_is_told_from_no_bent_line() -> None:
+    settings = FilmSettings(rate_hz=30.0, exposure_s=1e-3, row_time_s=1e-4)
+    looked = look(array_film(line_film(600.0), "line"), settings, "line")
+    assert looked.lines[0].hz == pytest.approx(600.0, rel=1e-4)
+    assert GRADES[looked.grade] == "believe the frequency, not the path"
+    assert "bent" in looked.because
+    still = look(array_film(line_film(600.0, 0.0), "line"), settings, "line")
+    assert GRADES[still.grade] == "no answer"
+    assert "1000 Hz" in still.because

@@ -240,11 +240,11 @@ class RowFilm:
     light: FloatArray = field(default_factory=lambda: np.ones(1))
     """Of each row, (rows,) or (1,)."""
 
-    def clean(self, amplitudes: Sequence[complex] | None = None, rest: FloatArray | None = None) -> FloatArray:
-        """The frames without noise, (frames, rows, columns); also with other amplitudes or places at rest."""
-        amplitudes, rest = amplitudes or self.amplitudes, self.rest if rest is None else rest
-        fine = 8 + 8 * math.ceil(max(self.hz) * self.exposure_s)
-        inside = (np.arange(fine) + 0.5) / fine * self.exposure_s
+    def clean(self) -> FloatArray:
+        """The frames without noise, (frames, rows, columns)."""
+        rest = self.rest
+        nodes, weights = np.polynomial.legendre.leggauss(10 + 6 * math.ceil(max(self.hz) * self.exposure_s))
+        inside = (nodes + 1) / 2 * self.exposure_s
         first = np.floor(rest).astype(int) - _NEAR_LINE
         edges = np.arange(2 * _NEAR_LINE + 2) - 0.5 - (rest - first)[:, None]
         out = np.zeros((self.frames, len(rest), self.columns))
@@ -253,10 +253,10 @@ class RowFilm:
             out += np.arange(self.columns) > rest[:, None]
         for k, picture in enumerate(out):
             t = k / self.rate_hz + (self.row_time_s * np.arange(len(rest)))[:, None] + inside
-            p = sum((a * np.exp(2j * np.pi * f * t)).real for a, f in zip(amplitudes, self.hz, strict=True))
+            p = sum((a * np.exp(2j * np.pi * f * t)).real for a, f in zip(self.amplitudes, self.hz, strict=True))
             u = (edges[..., None] - np.asarray(p)[:, None]) / self.sd
             whole = special.ndtr(u) if self.kind == "line" else u * special.ndtr(u) + np.exp(-(u**2) / 2) / _ROOT
-            seen = np.diff(whole.mean(axis=2), axis=1) * self.sd * (_ROOT if self.kind == "line" else 1.0)
+            seen = np.diff(whole @ weights / 2, axis=1) * self.sd * (_ROOT if self.kind == "line" else 1.0)
             picture[y, first[:, None] + np.arange(seen.shape[1])] = seen
         return out * np.broadcast_to(self.light, len(rest))[:, None]
 
