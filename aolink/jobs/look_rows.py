@@ -123,8 +123,9 @@ def bands_of(
     first = np.clip(np.rint(places.mean(axis=1) - (_WINDOW - 1) / 2).astype(int), 0, columns - _WINDOW)
     y, x = rows[:, :, None], (first[:, None] + np.arange(_WINDOW))[:, None]
     images = np.array([frame[y, x].mean(axis=1) for frame in frames])
+    delays_s = np.asarray(rows * row_time_s, np.float64)
     bands = Bands(
-        images=images, rest=places - first[:, None], times_s=times_s, delays_s=np.asarray(rows * row_time_s, np.float64),
+        images=images, rest=places - first[:, None], times_s=times_s, delays_s=delays_s,
         exposure_s=exposure_s, rate_hz=rate_hz,
     )  # fmt: skip
     left, right = int(first.min()), int(first.max()) + _WINDOW
