@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import Any, Protocol
 
 import numpy as np
@@ -59,7 +60,7 @@ def log_curves(drawing: Drawing, timebase: Timebase, row: Topic, records: Sequen
                 )
                 values = _since(drawing, path, curve, shown)
                 if np.isfinite(values).any():
-                    send_line(drawing, path, _times(timebase, row, shown), values, style)
+                    send_line(drawing, path, _times(timebase, row, shown[-len(values) :]), values, style)
 
 
 def _times(timebase: Timebase, row: Topic, records: Sequence[Timed]) -> list[rr.TimeColumn]:
@@ -74,7 +75,8 @@ def _times(timebase: Timebase, row: Topic, records: Sequence[Timed]) -> list[rr.
 
 
 def _since(drawing: Drawing, path: str, curve: Curve, records: Sequence[Timed]) -> FloatArray:
-    """What a view shows of a curve's values: these, or what they come to with those drawn before."""
+    """What a view shows of a curve's values, which a sum, a change or a rate goes on from; a rate has none with the
+    first message."""
     values = np.array([curve.value(each.message) for each in records])
     if curve.shows == "sum":
         values = drawing.before.get(path, (0, 0.0))[1] + np.cumsum(values)
@@ -82,10 +84,10 @@ def _since(drawing: Drawing, path: str, curve: Curve, records: Sequence[Timed]) 
     elif curve.shows == "change" and np.isfinite(values).any():
         values -= drawing.before.setdefault(path, (0, float(values[np.isfinite(values)][0])))[1]
     elif curve.shows == "rate":
-        host_ns = np.array([each.log_time_ns for each in records], dtype=np.int64)
-        at, last = drawing.before.get(path, (int(host_ns[0]), np.nan))
-        drawing.before[path] = (int(host_ns[-1]), float(values[-1]))
-        values = np.diff(values, prepend=last) / (np.maximum(np.diff(host_ns, prepend=at), 1) / 1e9)
+        points = [(each.log_time_ns, float(value)) for each, value in zip(records, values, strict=True)]
+        points = [drawing.before[path], *points] if path in drawing.before else points
+        drawing.before[path] = points[-1]
+        values = np.array([(now - last) / max(at - then, 1) * 1e9 for (then, last), (at, now) in pairwise(points)])
     return np.asarray(values)
 
 

@@ -137,13 +137,16 @@ def drawn(
         tempfile.TemporaryFile() as said,
         # In a session of its own: Ctrl-C goes to the session, which ends it.
         subprocess.Popen(
-            [sys.executable, "-P", "-c", main], stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=said,
+            [sys.executable, "-P", "-c", main], stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=said,
             start_new_session=True, env=environment, preexec_fn=partial(end_with, os.getpid()),
         ) as process,
     ):  # fmt: skip
         pipe: Any = process.stdin
+        answers: Any = process.stdout
         try:
             pickle.dump((address, rig, list(estimators), true_scene, _NICENESS), pipe)
+            pipe.flush()
+            answers.readline()  # it is ready, or has ended
             live = LiveView(pipe)
             yield live
             live.close()

@@ -116,6 +116,8 @@ def main() -> None:
         stream.save(address)
     stream.send_recording_name(f"{rig.name} · live")
     sender = LiveSender(stream, rig, estimators, true_scene)
+    sender.lay_out()  # Rerun would make one of its own, of all entities
+    print("ready", flush=True)
     with suppress(EOFError):
         while True:
             missing, batch = pickle.load(coming)
