@@ -180,13 +180,13 @@ class Refined:
 class Vibration:
     """The likelihood of lines in a film."""
 
-    def __init__(self, seen: PathMoments) -> None:
-        self.seen = seen
+    def __init__(self, seen: PathMoments, slowest: int = SLOWEST) -> None:
+        self.seen, self.slowest_hz = seen, seen.rate_hz / slowest
         K = len(seen.times_s)
         self.middle_s, self.half_s = float(seen.times_s.mean()), seen.span_s / 2
         self.t = seen.times_s - self.middle_s
         self.tau = self.t / self.half_s
-        count = 2 + 2 * K // SLOWEST
+        count = 2 + 2 * K // slowest
         # Cosines slower than any vibration: a drift.
         self.slow = np.cos(np.pi * np.arange(count) * ((self.tau + 1) / 2)[:, None])
         self.w_mean = np.where(np.isfinite(seen.mean_variance), 1 / seen.mean_variance, 0.0)
@@ -210,7 +210,7 @@ class Vibration:
         known = np.concatenate([seen.axes[r, self._root[:, r].any(axis=0)] for r in range(R)])
         _, sizes, rows = np.linalg.svd(known, full_matrices=False)
         self.seen_along = rows[sizes > 1e-6 * sizes.max()]
-        self.hz = np.arange(seen.rate_hz / SLOWEST, MOST_ALIASES * seen.rate_hz, 1 / (_OVERSAMPLED * seen.span_s))
+        self.hz = np.arange(self.slowest_hz, MOST_ALIASES * seen.rate_hz, 1 / (_OVERSAMPLED * seen.span_s))
 
     def _without_drift(self, weighted: FloatArray) -> FloatArray:
         """Weighted means (..., K, R, 2) without what a drift explains."""
@@ -442,7 +442,7 @@ class Vibration:
         score = (none - means) / noise + (off - spreads) / other + constant - constants
         # The means show no line that is as slow as a drift, and of one at half the rate one phase only.
         blind = self._alias(self.hz)
-        score[(blind < rate / SLOWEST) | (blind > rate / 2 - 1 / self.seen.span_s)] = -np.inf
+        score[(blind < self.slowest_hz) | (blind > rate / 2 - 1 / self.seen.span_s)] = -np.inf
         for line in before:  # what the model of a line leaves of it, and the aliases of that
             alias = np.minimum(self._alias(self.hz - line.hz), self._alias(self.hz + line.hz))
             score[alias < 2 / self.seen.span_s] = -np.inf
@@ -466,9 +466,15 @@ class Vibration:
         return left * inverse, (off - left) * inverse
 
 
-def find(seen: PathMoments, most: int = MOST_LINES, tell: Callable[[int, int], None] = lambda done, of: None) -> Found:
-    """The lines of a film, at most so many, the strongest first; none where chance explains what is seen."""
-    of = Vibration(seen)
+def find(
+    seen: PathMoments, most: int = MOST_LINES, tell: Callable[[int, int], None] = lambda done, of: None,
+    slowest: int = SLOWEST,
+) -> Found:  # fmt: skip
+    """The lines of a film, at most so many, the strongest first; none where chance explains what is seen.
+
+    What is slower than ``slowest`` frames a cycle is a drift.
+    """
+    of = Vibration(seen, slowest)
     trials = MOST_ALIASES * 2 * len(seen.times_s)
     threshold = 2 * float(special.gammainccinv(6 / 2, CHANCE / trials))
     lines: tuple[Line, ...] = ()

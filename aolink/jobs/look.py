@@ -14,6 +14,7 @@ from itertools import islice
 from typing import TypedDict
 
 import numpy as np
+from scipy import signal
 
 from aolink.errors import IdentificationError, ImportingError
 from aolink.films.film import Film
@@ -22,10 +23,11 @@ from aolink.identification.bands import BandsFound
 from aolink.identification.models import Process, ProcessSum
 from aolink.identification.vibration import MOST_LINES, SLOWEST, Found, Line, PathMoments, find
 from aolink.importing.frames import FilmLight, FilmSettings, film_times, nonlinear_note
+from aolink.jobs.look_follow import REACH, travels
 from aolink.jobs.look_rows import as_moments, assumed, bands_of, find_target, grade_of
 from aolink.jobs.look_scene import LEAST_MOTION, Scene
 from aolink.jobs.look_spots import Spots, find_spots
-from aolink.jobs.look_texture import MARGIN, Region, lively, moments_of
+from aolink.jobs.look_texture import MARGIN, Followed, Region, beside, lively, measured
 from aolink.numerics.arrays import BoolArray, FloatArray
 
 FRAMES = 500
@@ -48,6 +50,18 @@ _COMPARABLE = 0.2
 """Size of the last of the most lines that are looked for, over that of the first, from which on there are more."""
 _FEW = 3
 """Frequencies in a set, of more the blur says next to nothing."""
+_WIDEST = 8.0
+"""Standard deviation of a spot, pixels, from which on what it shows is measured by its texture."""
+_SLOW = 4
+"""A vibration up to so many times slower than the slowest one is a part of a wandering where much else is left."""
+_LEAST_WANDERING = 0.05
+"""Smallest wandering that may be taken for a vibration, pixels rms."""
+_SLOWEST_OF_WANDERING = 12
+"""Frames in a cycle of the slowest vibration beside a wandering."""
+_FLICKER = 0.01
+"""Change of the light from frame to frame that is spoken of."""
+_APART = 0.2
+"""Share of a motion by which two parts that move alike may move apart."""
 _REGIONS = 3
 """Parts of a picture of anything that are looked at."""
 _HARMONICS = 6
@@ -147,7 +161,7 @@ class Looked:
     @property
     def rest(self) -> float:
         """Standard deviation of what the vibrations leave of the places, in all directions, pixels."""
-        return math.sqrt(max(float((self.found.residual**2).sum(axis=2).mean()) - _noise(self.seen), 0.0))
+        return _left(self.seen, self.found)
 
     @property
     def sees_all(self) -> bool:
@@ -221,7 +235,7 @@ def _spots(film: Film, settings: FilmSettings, count: int, tell: Tell) -> Spots 
         spots = find_spots(film, settings, count, lambda done: tell("read", done, 2 * count))
     except ImportingError:
         return None
-    return spots if spots.alone else None
+    return spots if spots.alone and spots.sd < _WIDEST else None
 
 
 def _of_spots(
@@ -236,7 +250,7 @@ def _of_spots(
     moments = _path_moments(seen, scene.unit, times_s, exposure_s, rate, 0.0 if kernel else sd)
     together = n > 1 and _one_motion(list(zip(*seen, strict=True)))
     each = moments.together() if together else moments.part([0])
-    found = find(each, tell=lambda done, of: tell("frequencies", done, of))
+    found = _found(each, MOST_LINES, lambda done, of: tell("frequencies", done, of))
     if kernel is None and found.lines and found.lines[0].ellipse[1] > _ROUND * sd:
         # What swings across the motion was taken for the kernel.
         sd = math.sqrt(max(sd**2 + float(found.constant[:, [0, 2]].mean()), 0.25 * sd**2))
@@ -269,8 +283,9 @@ def _of_regions(
     size = min(size, rows - 2 * MARGIN, columns - 2 * MARGIN)
     if size < least:
         raise ImportingError(f"{film.name} has {columns} x {rows} pixels: that is too small to look at a part of it")
+    gone = travels(_shown(film, light, count, tell))
     if at is None:
-        regions, picture = lively(_shown(film, light, count, tell), size, _REGIONS)
+        regions, still, picture = lively(_shown(film, light, count, tell, 1), size, _REGIONS, gone)
         if not regions:
             raise ImportingError(f"{film.name} shows nothing that moves: all frames are the same picture")
     else:
@@ -280,36 +295,61 @@ def _of_regions(
                 f"--at {at[0]:g},{at[1]:g} with --size {size} goes over the picture's edge, which has {columns} x"
                 f" {rows} pixels: choose a place at least {size // 2 + MARGIN} pixels from it"
             )
-        regions, picture = [Region(x, y, size, size)], np.zeros(film.shape)
-    cuts = [np.empty((count, size + 2 * MARGIN, size + 2 * MARGIN)) for _ in regions]
-    for k, shown in enumerate(_shown(film, light, count, tell, 1)):
-        for region, cut in zip(regions, cuts, strict=True):
-            cut[k] = region.cut(shown, MARGIN)
-        if at is not None:
-            picture = picture + shown / count
-    results = []
-    for number, cut in enumerate(cuts):
+        regions = [Region(x, y, size, size)]
+        _, still, picture = lively(_shown(film, light, count, tell, 1), size, 1, gone)
+    whole = np.rint(gone).astype(np.int64)
+    all_regions, around = [*regions, *([still] if still else [])], MARGIN + REACH
+    cuts = np.empty((len(all_regions), count, size + 2 * around, size + 2 * around))
+    for k, shown in enumerate(_shown(film, light, count, tell, 2)):
+        for number, region in enumerate(all_regions):
+            cuts[number, k] = region.cut(shown, around, whole[k])
+    every: list[Followed] = []
+    for number, (region, cut) in enumerate(zip(all_regions, cuts, strict=True)):
         tell("regions", number, len(cuts))
-        seen, _ = moments_of(cut, times_s, common["exposure_s"], common["rate_hz"])
-        results.append((seen, find(seen, most=2)))
-    best = max(range(len(results)), key=lambda k: _strength(*results[k]))
-    seen, found = results[best]
-    camera = len(results) >= 3 and all(_alike(found, other) for _, other in results)
+        one = measured(region, cut, whole, times_s, common["exposure_s"], common["rate_hz"])
+        every += [one] if one else []
+    if not every or (at is not None and every[0].region is not regions[0]):
+        raise ImportingError(f"{film.name}: what is there does not stay in view: choose a place with --at X,Y")
+    rest = every[-1] if every[-1].region is still and len(every) > 1 else None
+    travelling = bool(gone.any()) and len(every) > 1
+    if travelling:  # what moves as another region does is the rest of the picture, wherever the search has put that
+        rest = min(every[at is not None :], key=lambda one: _apart(one, every) * (0.5 if one.region is still else 1.0))
+    results = [(each, each.moments, _found(each.moments, 2)) for each in every if each is not rest]
     doubts = list(_of_film(film))
+    if travelling and rest:
+        beside_rest = [(each, beside(each.moments, rest.moments)) for each, _, _ in results]
+        relative = [(each, seen, _found(seen, 2)) for each, seen in beside_rest if seen is not None]
+        # What is left of a travel by interpolation is no motion.
+        lines = [line for _, _, found in relative for line in found.lines[:1]]
+        if travelling := any(_shown_by(line, common["exposure_s"]) > LEAST_MOTION for line in lines):
+            results = relative
+            doubts.append("what travels with the whole picture, as by a camera in the hand, is taken out")
+    best, seen, found = max(results, key=lambda one: _strength(*one[1:]))
+    if found.lines and (quarter := best.livelier_quarter(found.lines[0].hz)):
+        doubts.append("parts of this region move in different ways: the quarter that moves most is described")
+        best, seen = quarter, quarter.moments
+        if travelling and rest:
+            seen = beside(seen, rest.moments) or seen
+        found = _found(seen, 2)
+    camera = rest is not None and _moves_alike(seen, rest.moments)
     if camera:
         doubts.append("all of the picture moves alike: it is the camera that moves")
-    own = f"{found.lines[0].hz:.3g}" if found.lines else ""
-    others = sorted({f"{each.lines[0].hz:.3g}" for _, each in results if each.lines} - {own})
+    elif rest is None:
+        doubts.append("nothing else in the picture has edges: whether the camera moves is not seen")
+    light = signal.detrend(best.windows.mean(axis=(1, 2))).std() / abs(best.windows.mean())
+    if light > _FLICKER:
+        doubts.append(f"the light flickers by {light:.1%} rms, as lamps on mains do: that is taken out")
+    hz = f"{found.lines[0].hz:.3g}" if found.lines else ""
+    others = sorted({f"{each.lines[0].hz:.3g}" for _, _, each in results if each.lines} - {hz})
     if others and not camera:
         doubts.append(f"other parts of the picture vibrate at {' and '.join(others)} Hz: choose one with --at X,Y")
     moved, sure = _moved(seen)
-    chosen = regions[best]
     looked = Looked(
         **common, seen=seen, found=found, moved=moved if moved > max(LEAST_MOTION, _CERTAIN * sure) else 0.0,
         blur=0.0, grade=0, because="", plain_hz=_plain(seen, found), sd=math.nan, spots=None, scene=None,
-        together=False, text="", regions=(chosen, *(r for r in regions if r is not chosen)), picture=picture,
-        cut=cuts[best], camera=camera, assumed=tuple(_assumed(film, settings, common, None, None, math.nan)),
-        doubts=tuple(doubts),
+        together=False, text="", picture=picture,
+        regions=(best.region, *(each.region for each, _, _ in results if each is not best)), cut=best.windows,
+        camera=camera, assumed=tuple(_assumed(film, settings, common, None, None, math.nan)), doubts=tuple(doubts),
     )  # fmt: skip
     return _graded(looked)
 
@@ -344,8 +384,42 @@ def _of_rows(
 
 def _shown(film: Film, light: FilmLight, count: int, tell: Tell, turn: int = 0) -> Iterator[FloatArray]:
     for k, frame in enumerate(islice(film.frames(), count)):
-        tell("read", turn * count + k, 2 * count)
+        tell("read", turn * count + k, 3 * count)
         yield light.of(frame)[0]
+
+
+def _found(seen: PathMoments, most: int, tell: Callable[[int, int], None] = lambda done, of: None) -> Found:
+    """The vibrations, where there is none beside those of a wandering too."""
+    found = find(seen, most, tell)
+    if found.lines and not _wanders(seen, found):
+        return found
+    moved, sure = _moved(seen)
+    if moved < max(LEAST_MOTION, _CERTAIN * sure):
+        return found
+    faster = find(seen, most, tell, slowest=_SLOWEST_OF_WANDERING)
+    return faster if faster.lines and not _wanders(seen, faster) else found
+
+
+def _wanders(seen: PathMoments, found: Found) -> bool:
+    """Whether the strongest vibration is slow and leaves much of the motion: a part of a wandering."""
+    line = found.lines[0]
+    slow = _alias(line.hz, seen.rate_hz) < _SLOW * seen.rate_hz / SLOWEST
+    return slow and _left(seen, found) > max(_UNEXPLAINED * _shown_by(line, seen.exposure_s), _LEAST_WANDERING)
+
+
+def _alias(hz: float, rate_hz: float) -> float:
+    """Where a frequency is in a plain spectrum, Hz."""
+    return abs(hz - rate_hz * round(hz / rate_hz))
+
+
+def _left(seen: PathMoments, found: Found) -> float:
+    """Standard deviation of what the vibrations leave of the places, in all directions, pixels."""
+    return math.sqrt(max(float((found.residual**2).sum(axis=2).mean()) - _noise(seen), 0.0))
+
+
+def _shown_by(line: Line, exposure_s: float) -> float:
+    """Standard deviation of the mean places of a vibration, pixels."""
+    return line.ellipse[0] / math.sqrt(2) * abs(float(np.sinc(line.hz * exposure_s)))
 
 
 def _strength(seen: PathMoments, found: Found) -> float:
@@ -356,13 +430,19 @@ def _strength(seen: PathMoments, found: Found) -> float:
     return found.lines[0].ellipse[0] / max(noise, 1e-12)
 
 
-def _alike(one: Found, other: Found) -> bool:
-    """Whether two regions have one motion."""
-    if not (one.lines and other.lines):
+def _apart(one: Followed, every: Sequence[Followed]) -> float:
+    """How much a region moves beside the one that moves most like it, pixels."""
+    relative = [beside(other.moments, one.moments) for other in every if other is not one]
+    return min((_moved(each)[0] for each in relative if each is not None), default=math.inf)
+
+
+def _moves_alike(one: PathMoments, other: PathMoments) -> bool:
+    """Whether two regions have one motion: what they move apart is little of what they move."""
+    apart = beside(one, other)
+    if apart is None:
         return False
-    a, b = one.lines[0], other.lines[0]
-    near = abs(a.hz - b.hz) < 0.01 * a.hz
-    return near and float(np.abs(a.amplitude - b.amplitude).max()) < 0.3 * float(np.abs(a.amplitude).max())
+    moved, sure = _moved(one)
+    return moved > _CERTAIN * sure and _moved(apart)[0] < _APART * moved
 
 
 def _path_moments(
@@ -408,8 +488,7 @@ def _plain(seen: PathMoments, found: Found) -> float:
     """The frequency of the largest value of a plain spectrum of the places, Hz."""
     if not found.lines:
         return math.nan
-    hz = found.lines[0].hz
-    return abs(hz - seen.rate_hz * round(hz / seen.rate_hz))
+    return _alias(found.lines[0].hz, seen.rate_hz)
 
 
 def _models(found: Found, scene: Scene, seen: PathMoments) -> list[ProcessSum | None]:
@@ -486,7 +565,10 @@ def _graded(looked: Looked) -> Looked:
     if len(looked.lines) == MOST_LINES and looked.lines[-1].ellipse[0] > _COMPARABLE * line.ellipse[0]:
         return replace(looked, grade=2, because="the motion is more than three vibrations")
     left = looked.rest
-    shown = line.ellipse[0] / math.sqrt(2) * abs(float(np.sinc(line.hz * looked.exposure_s)))
+    shown = _shown_by(line, looked.exposure_s)
+    if _wanders(looked.seen, found):
+        wanders = f"it wanders by {looked.moved:.2g} pixels rms, and no frequency stands out of that"
+        return replace(looked, grade=2, because=wanders)
     why = []
     if len(parts) > 1:
         small = "the blur is too small" if len(parts) > _FEW else "these frames are not enough"

@@ -14,13 +14,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import ndimage
+from scipy import ndimage, signal
 
 from aolink.identification.vibration import PathMoments
-from aolink.numerics.arrays import FloatArray
+from aolink.jobs.look_follow import REACH, followed, window, windows
+from aolink.numerics.arrays import BoolArray, FloatArray, Indices
 
 SMOOTH = 1.5
 """Standard deviation of the Gaussian that images are smoothed by, pixels."""
@@ -29,6 +30,15 @@ MARGIN = 4
 _ROUNDS = 2
 _LEAST_LIVELY = 0.03
 """Share of the most lively region's motion below which another is not looked at."""
+_ENOUGH_EDGES = 0.2
+"""Share of the greatest mean square of gradients from which on a part has enough edges."""
+_FEWEST = 8
+"""Frames in which a region must be seen."""
+_LEAST_QUARTER = 12
+"""Pixels along a quarter of a region."""
+_MIXED = 0.5
+"""Share of a region's motion by which that of a quarter differs where something else is in it."""
+_CERTAIN = 4.0
 _LEAST_WIDTH = 0.25
 """Least variance of an edge, pixels squared."""
 _EDGE = 0.05
@@ -44,11 +54,10 @@ class Region:
     columns: int
     rows: int
 
-    def cut(self, frames: FloatArray, margin: int = 0) -> FloatArray:
-        """The region's pixels of frames (..., rows, columns), and so many about it."""
-        return frames[
-            ..., self.y - margin : self.y + self.rows + margin, self.x - margin : self.x + self.columns + margin
-        ]
+    def cut(self, frame: FloatArray, margin: int = 0, moved: tuple[int, int] = (0, 0)) -> FloatArray:
+        """The region's pixels of a frame (rows, columns), and so many about it; NaN beyond the picture."""
+        x, y = self.x + moved[0] - margin, self.y + moved[1] - margin
+        return window(frame, x, y, self.columns + 2 * margin, self.rows + 2 * margin)
 
 
 def moments_of(
@@ -141,31 +150,152 @@ def _fit(
     return mean, mean_variance, spread, spread_variance, np.array(gain)
 
 
-def lively(frames: Iterable[FloatArray], size: int, most: int) -> tuple[list[Region], FloatArray]:
-    """The regions that move most, none over another: where variance in time times gradient is largest; and the mean of
-    the frames (rows, columns)."""
-    total = squares = None
-    count = 0
-    for frame in frames:
+@dataclass(frozen=True, eq=False)
+class Followed:
+    """A region that was followed through a film."""
+
+    region: Region
+    """Where it is in the first frame."""
+    windows: FloatArray
+    """Its pixels with `MARGIN` more on each side, (K, rows, columns); the last ones seen where it is not."""
+    known: BoolArray
+    """In which frames it is seen, (K,)."""
+    travel: FloatArray
+    """How far its window has gone since the first of these, x and y, pixels, (K, 2)."""
+    moments: PathMoments
+
+    @classmethod
+    def of(
+        cls, region: Region, windows: FloatArray, known: BoolArray, travel: FloatArray, times_s: FloatArray,
+        exposure_s: float, rate_hz: float,
+    ) -> Followed:  # fmt: skip
+        """With its moments."""
+        part, _ = moments_of(windows[known], times_s[known], exposure_s, rate_hz)
+        K = len(known)
+        mean, spread = np.zeros((K, 1, 2)), np.zeros((K, 1, 3))
+        mean_variance, spread_variance = np.full((K, 1, 2), np.inf), np.full((K, 1, 3), np.inf)
+        mean[known], mean_variance[known] = part.mean + (travel[known] @ part.axes[0].T)[:, None], part.mean_variance
+        spread[known], spread_variance[known] = part.spread, part.spread_variance
+        moments = replace(
+            part, times_s=times_s, mean=mean, mean_variance=mean_variance, spread=spread,
+            spread_variance=spread_variance,
+        )  # fmt: skip
+        return cls(region, windows, known, travel, moments)
+
+    def quarter(self, number: int) -> Followed:
+        """One of its quarters, along the rows."""
+        row, column = divmod(number, 2)
+        columns, rows = self.region.columns // 2, self.region.rows // 2
+        x, y, of = column * columns, row * rows, self.moments
+        windows = self.windows[:, y : y + rows + 2 * MARGIN, x : x + columns + 2 * MARGIN]
+        region = Region(self.region.x + x, self.region.y + y, columns, rows)
+        return self.of(region, windows, self.known, self.travel, of.times_s, of.exposure_s, of.rate_hz)
+
+    def livelier_quarter(self, hz: float) -> Followed | None:
+        """The quarter that moves most at a frequency, where one moves in another way than all of it: something else is
+        in it. None where none does, or that is not seen."""
+        if min(self.region.columns, self.region.rows) < 2 * _LEAST_QUARTER:
+            return None
+        whole = _swing(self.moments, hz)[0]
+        quarters = [self.quarter(number) for number in range(4)]
+        apart = [beside(each.moments, self.moments) for each in quarters]
+        swings = [_swing(each, hz) for each in apart if each is not None]
+        if not any(swing > max(_MIXED * whole, _CERTAIN * chance) for swing, chance in swings):
+            return None
+        return max(quarters, key=lambda each: _swing(each.moments, hz)[0])
+
+
+def _swing(seen: PathMoments, hz: float) -> tuple[float, float]:
+    """How far the mean places go at a frequency, pixels, and what chance shows of that."""
+    total = chance = 0.0
+    for d in range(2):
+        known = np.isfinite(seen.mean_variance[:, 0, d])
+        if known.sum() > _FEWEST:
+            place = signal.detrend(seen.mean[known, 0, d])
+            turn = np.exp(-2j * np.pi * hz * seen.times_s[known])
+            total += float(np.abs(turn @ place) * 2 / len(place)) ** 2
+            chance += 4 * float(place.var()) / len(place)
+    return math.sqrt(total), math.sqrt(chance)
+
+
+def measured(
+    region: Region, cuts: FloatArray, gone: Indices, times_s: FloatArray, exposure_s: float, rate_hz: float
+) -> Followed | None:
+    """A region that is followed in its cuts, `REACH` and `MARGIN` larger on each side, after the picture as a whole has
+    gone so far, (K, 2); None where it is hardly seen."""
+    places, known = followed(cuts, REACH)
+    if known.sum() < _FEWEST:
+        return None
+    latest = np.maximum(np.maximum.accumulate(np.where(known, np.arange(len(known)), -1)), int(known.argmax()))
+    travel = (gone + places - (gone + places)[known.argmax()]).astype(np.float64)
+    held = windows(cuts, places, REACH)[latest]
+    return Followed.of(region, held, known, travel, times_s, exposure_s, rate_hz)
+
+
+def beside(seen: PathMoments, rest: PathMoments) -> PathMoments | None:
+    """The motion of a region beside that of another one; None where that one is seen along one direction only."""
+    if not np.isfinite(rest.mean_variance).any(axis=(0, 1)).all():
+        return None
+    turn = seen.axes[0] @ rest.axes[0].T
+    squares = np.array([
+        [turn[0, 0] ** 2, 2 * turn[0, 0] * turn[0, 1], turn[0, 1] ** 2],
+        [turn[0, 0] * turn[1, 0], turn[0, 0] * turn[1, 1] + turn[0, 1] * turn[1, 0], turn[0, 1] * turn[1, 1]],
+        [turn[1, 0] ** 2, 2 * turn[1, 0] * turn[1, 1], turn[1, 1] ** 2],
+    ])  # fmt: skip
+    unknown = ~np.isfinite(rest.mean_variance).all(axis=2, keepdims=True)
+    variance = [np.where(np.isfinite(each), each, 0.0) for each in (rest.mean_variance, rest.spread_variance)]
+    return replace(
+        seen, mean=seen.mean - rest.mean @ turn.T, spread=seen.spread - rest.spread @ squares.T,
+        mean_variance=np.where(unknown, np.inf, seen.mean_variance + variance[0] @ (turn**2).T),
+        spread_variance=np.where(unknown, np.inf, seen.spread_variance + variance[1] @ (squares**2).T),
+    )  # fmt: skip
+
+
+def lively(
+    frames: Iterable[FloatArray], size: int, most: int, gone: FloatArray
+) -> tuple[list[Region], Region | None, FloatArray]:
+    """The regions that move most, none over another: where variance in time times gradient is largest; one that has
+    edges and moves least, if there is any; and the mean of the frames (rows, columns).
+
+    Frames are moved back by the picture's own travel.
+    """
+    total = squares = common = None
+    left, top = np.ceil(np.maximum(-gone.min(axis=0), 0)).astype(int)
+    right, bottom = np.ceil(np.maximum(gone.max(axis=0), 0)).astype(int)
+    for frame, (x, y) in zip(frames, gone, strict=True):
         image = ndimage.gaussian_filter(frame, SMOOTH)
+        if gone.any():
+            image = ndimage.shift(image, (-y, -x), order=1, mode="nearest")
+            inner = np.s_[top : image.shape[0] - bottom : 2, left : image.shape[1] - right : 2]
+            if common is None:  # and what is left of that: a shift of all, and the light
+                common = np.stack([*np.gradient(image), image, np.ones_like(image)], axis=-1)
+            fit = np.linalg.lstsq(common[inner].reshape(-1, 4), image[inner].ravel() - common[inner][..., 2].ravel())
+            image = image - common @ fit[0]
         total = image if total is None else total + image
         squares = image**2 if squares is None else squares + image**2
-        count += 1
     assert total is not None
     assert squares is not None
-    mean = total / count
-    variance = np.maximum(squares / count - mean**2, 0.0)
+    mean = total / len(gone)
+    variance = np.maximum(squares / len(gone) - mean**2, 0.0)
     # What noise makes everywhere is no motion.
     variance = np.maximum(variance - 2 * np.median(variance), 0.0)
     y, x = np.gradient(mean)
-    moving = ndimage.uniform_filter(variance * (x * x + y * y), size)
+    gradient = x * x + y * y
+    moving, edges = (ndimage.uniform_filter(each, size) for each in (variance * gradient, gradient))
     rows, columns = moving.shape
     half = size // 2 + MARGIN + 1
-    moving[:half], moving[rows - half :], moving[:, :half], moving[:, columns - half :] = 0, 0, 0, 0
+    whole = np.zeros(moving.shape, dtype=np.bool_)
+    whole[half + top : rows - half - bottom, half + left : columns - half - right] = True
+    if not whole.any():
+        whole[half : rows - half, half : columns - half] = True
+    moving = np.where(whole, moving, 0.0)
     found: list[Region] = []
     brightest = float(moving.max())
+    still = np.where(whole & (edges > _ENOUGH_EDGES * edges[whole].max()), edges**2 / (moving + 1e-3 * brightest), 0.0)
     while len(found) < most and moving.max() > _LEAST_LIVELY * brightest:
         r, c = (int(k) for k in np.unravel_index(int(moving.argmax()), moving.shape))
         found.append(Region(c - size // 2, r - size // 2, size, size))
-        moving[max(0, r - size) : r + size, max(0, c - size) : c + size] = 0
-    return found, mean
+        for each in (moving, still):
+            each[max(0, r - size) : r + size, max(0, c - size) : c + size] = 0
+    r, c = (int(k) for k in np.unravel_index(int(still.argmax()), still.shape))
+    return found, Region(c - size // 2, r - size // 2, size, size) if still[r, c] else None, mean

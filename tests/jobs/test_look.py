@@ -278,3 +278,51 @@ def test_a_tone_at_a_multiple_of_the_frame_rate_is_told_from_no_bent_line() -> N
     still = look(array_film(line_film(600.0, 0.0), "line"), settings, "line")
     assert GRADES[still.grade] == "no answer"
     assert "1000 Hz" in still.because
+
+
+def by_hand(hz: float, amplitude: float, *, shakes: bool = False, count: int = 80) -> Any:
+    """Frames of a texture by a camera in the hand, which wanders by 15 pixels; a part of it, or the camera, vibrates
+    along 20 degrees at 25 frames/s, exposed throughout."""
+    rng, fine, pad, shape = np.random.default_rng(3), 8, 30, (150, 190)
+    big = (shape[0] + 2 * pad, shape[1] + 2 * pad)
+    target, ground = (ndimage.spline_filter(240 * ndimage.gaussian_filter(rng.normal(size=big), 2.0)) for _ in range(2))
+    y, x = np.indices(big)
+    part = ndimage.gaussian_filter(((abs(x - pad - 100) < 26) & (abs(y - pad - 80) < 26)) * 1.0, 1.0)
+    hand = ndimage.gaussian_filter1d(rng.normal(size=(count * fine, 2)).cumsum(axis=0), 3.0 * fine, axis=0)
+    hand = 15 * (hand - hand[0]) / np.abs(hand - hand[0]).max()
+    t = (np.arange(count * fine) + 0.5) / fine / 25
+    swing = amplitude * np.sin(2 * np.pi * hz * t)[:, None] * np.sin(np.radians([20.0, 110.0]))
+
+    def moved(picture: Any, by: Any, order: int = 3) -> Any:
+        return ndimage.shift(picture, by, order=order, mode="nearest", prefilter=False)
+
+    frames = np.zeros((count, *shape))
+    for k, (camera, own) in enumerate(zip(hand, swing, strict=True)):
+        seen = camera + own if shakes else camera
+        share = moved(part, camera + own, 1)
+        shown = moved(target, camera + own) * share + moved(ground, seen) * (1 - share)
+        frames[k // fine] += shown[pad:-pad, pad:-pad] / fine
+    return np.clip(np.rint(120 + frames + rng.normal(0, 1.0, frames.shape)), 0, 255).astype(np.uint8)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("shakes", [False, True])
+def test_what_travels_is_followed_and_a_camera_in_the_hand_is_told_from_the_target(shakes: bool) -> None:
+    settings = FilmSettings(rate_hz=25.0, exposure_s=0.04)
+    looked = look(array_film(by_hand(32.0, 1.2, shakes=shakes), "hand"), settings, "hand")
+    assert looked.grade < 2
+    assert holds(looked, 32.0)
+    assert looked.camera is shakes
+    assert looked.lines[0].ellipse[0] == pytest.approx(1.2, rel=0.1 if looked.grade == 0 else 0.3)
+    still = look(array_film(by_hand(32.0, 0.0), "hand"), settings, "hand")
+    assert still.camera
+    assert still.grade == 2
+
+
+@pytest.mark.slow
+def test_light_that_flickers_is_said_and_taken_out() -> None:
+    lamp = 1 + 0.1 * np.sin(2 * np.pi * 100.3 * np.arange(80) / 25)
+    frames = np.clip(np.rint(scene(32.0, 1.2) * lamp[:, None, None] * 0.8), 0, 255).astype(np.uint8)
+    looked = look(array_film(frames, "lamp"), FilmSettings(rate_hz=25.0, exposure_s=0.04), "lamp")
+    assert holds(looked, 32.0)
+    assert any("flickers" in each for each in looked.doubts)
