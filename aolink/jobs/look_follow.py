@@ -24,7 +24,7 @@ _FAR = 0.25
 """Share of a picture's side by which it may have travelled before it is compared with a later frame."""
 _STEP = 10
 """Pixels that a region may go from one frame to the next."""
-_LEAST_LIKE = 0.3
+_LEAST_LIKE = 0.5
 """Correlation below which a region is not seen in a frame."""
 _TYPICAL = 0.75
 """Rank, among the frames by how much a region shows, of the one that the others are compared with."""

@@ -293,7 +293,7 @@ def by_hand(hz: float, amplitude: float, *, shakes: bool = False, count: int = 8
     t = (np.arange(count * fine) + 0.5) / fine / 25
     swing = amplitude * np.sin(2 * np.pi * hz * t)[:, None] * np.sin(np.radians([20.0, 110.0]))
 
-    def moved(picture: Any, by: Any, order: int = 3) -> Any:
+    def moved(picture: Any, by: Any, order: Any = 3) -> Any:
         return ndimage.shift(picture, by, order=order, mode="nearest", prefilter=False)
 
     frames = np.zeros((count, *shape))
