@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import subprocess
 import wave
@@ -17,11 +18,13 @@ from aolink.errors import ImportingError
 from aolink.films.film import array_film
 from aolink.importing.frames import FilmSettings
 from aolink.jobs.look import GRADES, Looked, look
+from aolink.jobs.look_page import write_page
 from aolink.jobs.look_words import as_json, paragraph
 from aolink.recording.reader import Recording
 from aolink.rig import load_rig, parse_rig
 from tests.jobs.test_look_spots import shaken
-from tests.needs import needed
+from tests.needs import missing, needed
+from tests.viewing import browser
 
 RATE, EXPOSURE = 50.0, 0.67 / 37.3
 """With .67 cycles in an exposure and .746 from frame to frame: 37.3 Hz at 50 frames a second."""
@@ -196,6 +199,29 @@ def test_the_command_writes_a_rig_file_a_recording_a_page_the_path_and_a_tone(ao
     again = aolink("look", "film.npz")
     assert again.returncode != 0
     assert "exists already" in again.stderr
+
+
+@pytest.mark.slow
+def test_the_page_shows_all_its_pictures_in_a_browser_without_network(tmp_path: Path) -> None:
+    if browser.program() is None:
+        missing("chromium", FileNotFoundError("chromium: apt-get install chromium"))
+    looked = look(array_film(scene(32.0, 1.2), "plate"), FilmSettings(rate_hz=25.0, exposure_s=0.04), "plate")
+    write_page(looked, page := tmp_path / "page.html", "plate.npy", [], overwrite=False)
+    assert page.stat().st_size < 2_000_000
+
+    async def seen() -> tuple[list[int], str, list[str]]:
+        async with browser.browser() as tab:
+            await tab.open(page.as_uri())
+            widths = await tab.run("[...document.images].map(each => each.complete ? each.naturalWidth : 0)")
+            return widths, await tab.run("document.body.innerText"), tab.errors
+
+    widths, text, errors = asyncio.run(seen())
+    assert len(widths) >= 3
+    assert all(width > 100 for width in widths)
+    assert "Believe it" in text
+    assert "32.0" in text
+    assert not errors
+    assert "://" not in page.read_text().replace("http://www.w3.org", "")
 
 
 @pytest.mark.slow
