@@ -35,6 +35,13 @@ def report(
         typer.Option(min=0, metavar="N", help="Exposure to draw, counted from 0; by default the most blurred."),
     ] = None,
     lenslet: LensletOption = None,
+    witness: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="LOG.csv",
+            help="What another instrument saw, as time_s, x [um] or gyro [rad/s] ...: it serves as the truth.",
+        ),
+    ] = None,
     width_mm: Annotated[
         float, typer.Option(min=30, max=1000, metavar="MM", help="Width on paper; 88 fits a column.")
     ] = 180.0,
@@ -46,6 +53,7 @@ def report(
     path's histogram and the intensity profile. pupil: maps over the lenslets. scene: a picture as it came, restored,
     and at rest.
     """
+    from aolink.jobs.witness import align, read_log
     from aolink.plotting.files import save_figure
     from aolink.plotting.report import write_report
 
@@ -53,14 +61,19 @@ def report(
         source = context.get_parameter_source(name)
         if source is not None and source.name == "COMMANDLINE":
             raise typer.BadParameter(f"--{name.replace('_', '-')} goes with --figure NAME")
+    if figure is not None and witness is not None:
+        raise typer.BadParameter("--witness goes without --figure")
     recording = open_recording(recorded, side=side or [])
     spot = common.spot_of(recording.rig.sensor, lenslet) if lenslet else 0
     with progress("read", recording.n_frames) as tell:
+        aligned = None if witness is None else align(recording, read_log(witness))
         if figure is None:
-            write_report(recording, output, overwrite=overwrite, progress=tell)
+            write_report(recording, output, witness=aligned, overwrite=overwrite, progress=tell)
         else:
             save_figure(
                 recording, figure.value, output, estimators=estimator, exposure=frame, spot=spot, width_mm=width_mm,
                 overwrite=overwrite, progress=tell,
             )  # fmt: skip
+    if aligned is not None:
+        stdout.print(aligned.text, markup=False)
     stdout.print(f"written: {output}", markup=False)

@@ -73,6 +73,8 @@ class UnusedCounter:
         return tuple(sorted(self._found.values(), key=lambda each: -each.exposures))
 
 
+_BEYOND_95 = 1.959964
+"""Standard deviations to each side of a 95 % interval."""
 _NUMBER = re.compile(r"\d+(\.\d+)?(e[+-]?\d+)?")
 
 
@@ -99,6 +101,8 @@ class Score:
     """The same error for the end state."""
     path_rmse: float
     """Root mean square error of the path, slope units."""
+    coverage: float
+    """Share of the path that is inside 95 % intervals."""
     nis: Consistency
     start_nees: Consistency
     end_nees: Consistency
@@ -121,6 +125,7 @@ class Scorer:
     def __init__(self) -> None:
         self._exposures = self._states = 0
         self._start, self._end, self._path = RunningMean(), RunningMean(), RunningMean()
+        self._coverage = RunningMean()
         self._start_nees, self._end_nees, self._nis = RunningMean(), RunningMean(), RunningMean()
         self._measurements = self._estimated = self._measured = self._gated = 0
         self._looks = False
@@ -143,7 +148,9 @@ class Scorer:
         if truth is None:
             return
         self._exposures += 1
-        self._path.add(np.mean((estimate.path - truth.path)[truth.known] ** 2, keepdims=True))
+        error = (estimate.path - truth.path)[truth.known]
+        self._path.add(np.mean(error**2, keepdims=True))
+        self._coverage.add(np.mean(np.abs(error) <= _BEYOND_95 * estimate.path_sd[truth.known], keepdims=True))
         if estimate.end_state.shape != truth.end_state.shape:
             return  # states of another rig file's plant
         at_start, at_end = estimate.start_state - truth.start_state, estimate.end_state - truth.end_state
@@ -162,7 +169,7 @@ class Scorer:
         return Score(
             exposures=self._exposures, estimated=self._estimated, measured=self._measured, looks=self._looks,
             unused=self._unused.result(), gated=self._gated, start_rmse=math.sqrt(self._start.mean),
-            end_rmse=math.sqrt(self._end.mean), path_rmse=math.sqrt(self._path.mean),
+            end_rmse=math.sqrt(self._end.mean), path_rmse=math.sqrt(self._path.mean), coverage=self._coverage.mean,
             nis=_consistency(self._nis, self._measurements),
             start_nees=_consistency(self._start_nees, self._states),
             end_nees=_consistency(self._end_nees, self._states), verdict=self._verdict,
@@ -238,7 +245,8 @@ def score_table(by_name: Mapping[str, Score], only: Container[str] = ()) -> Scor
     if any(each.exposures for each in scores):
         columns = {
             "RMSE start": lambda each: _rmse(each.start_rmse), "RMSE end": lambda each: _rmse(each.end_rmse),
-            "RMSE path": lambda each: _rmse(each.path_rmse), **columns,
+            "RMSE path": lambda each: _rmse(each.path_rmse),
+            "path in 95 %": lambda each: "-" if math.isnan(each.coverage) else f"{each.coverage:.2f}", **columns,
             "NEES start": lambda each: _mean(each.start_nees), "NEES end": lambda each: _mean(each.end_nees),
         }  # fmt: skip
     if any(each.gated for each in scores):

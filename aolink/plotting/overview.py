@@ -102,7 +102,7 @@ class Overview:
 
 def overview(
     series: Series, estimators: Sequence[str] | None = None, *, output: int = 0, progress: Progress = no_progress,
-    also: Also = NOTHING,
+    also: Also = NOTHING, known: Callable[[Exposure], Exposure] | None = None,
 ) -> Overview:  # fmt: skip
     """Read a series once, for any of the figures.
 
@@ -116,6 +116,8 @@ def overview(
         Called with the number of exposures read.
     also:
         Functions that get the messages of other topics, as `aolink.series.Series.steps` takes them.
+    known:
+        Gives exposures with what a witness knows of them as their truth.
 
     Raises
     ------
@@ -130,6 +132,7 @@ def overview(
     gathered = _Gathered(series, names, output)
     for number, step in enumerate(series.steps(names, also=gathered.beside(also)), 1):
         check_frame(series, step.exposure)
+        step.exposure = known(step.exposure) if known else step.exposure
         gathered.add(step)
         progress(number)
     return gathered.result()

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from html import escape
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
@@ -31,6 +31,8 @@ from aolink.units import duration, with_unit
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+    from aolink.exposure import Exposure
 
 _DPI = 150
 """Resolution of the pictures in a figure, dots per inch."""
@@ -63,9 +65,18 @@ pre { font-size: .75rem; white-space: pre-wrap; overflow-wrap: anywhere; }
 """
 
 
+class Witness(Protocol):
+    """What another instrument knows of a recording's motion (`aolink.jobs.witness`)."""
+
+    @property
+    def text(self) -> str: ...
+    def seen(self, exposure: Exposure) -> Exposure: ...
+
+
 def write_report(
-    recording: Recording, path: str | Path, *, overwrite: bool = False, progress: Progress = no_progress
-) -> Path:
+    recording: Recording, path: str | Path, *, witness: Witness | None = None, overwrite: bool = False,
+    progress: Progress = no_progress,
+) -> Path:  # fmt: skip
     """Write a page of HTML about the content of a recording and the quality of its estimates.
 
     It has three figures: the most blurred exposure; errors with NIS; losses with latencies. Figures, style and all else
@@ -73,6 +84,8 @@ def write_report(
 
     Parameters
     ----------
+    witness:
+        Another instrument's account of the motion, which serves as the truth.
     overwrite:
         Whether a file of that name may be replaced.
     progress:
@@ -92,14 +105,16 @@ def write_report(
         paper(),
         writing(path, overwrite=overwrite, sources=recording.files, suffix=".html", error=ExportError) as partial,
     ):
-        view = overview(recording, progress=progress, also=dict.fromkeys(recording.counts, counted.see))
+        also = dict.fromkeys(recording.counts, counted.see)
+        view = overview(recording, progress=progress, also=also, known=None if witness is None else witness.seen)
         found = score_table(view.scores)
         parts = [
             f"<h1>{escape(name)}</h1>", _note(f"A report by aolink {version('aolink')}."), "<h2>The session</h2>",
             facts_table(_facts(recording, recording_facts(recording, counted))),  # damage is known after all was read
-            *map(_note, lacks(recording)), "<h2>The estimates</h2>",
+            *map(_note, lacks(recording) if witness is None else [witness.text]), "<h2>The estimates</h2>",
             _table(["estimator", *found.heads], [[name, *cells] for name, cells in found.rows.items()]),
-            *map(_note, found.notes), "<h2>Figures</h2>", '<div class="row pairs">', *_figures(recording, view),
+            *map(_note, found.notes), "<h2>Figures</h2>", '<div class="row pairs">',
+            *_figures(recording, view, witness),
             f"</div><h2>Configuration</h2><pre>{escape(recording.rig.toml)}</pre>",
         ]  # fmt: skip
         partial.write_text(html_page(name, parts), encoding="utf-8")
@@ -122,11 +137,12 @@ def _facts(recording: Recording, facts: Mapping[str, Any]) -> dict[str, str]:
     }
 
 
-def _figures(recording: Recording, view: Overview) -> list[str]:
+def _figures(recording: Recording, view: Overview, witness: Witness | None) -> list[str]:
     if not len(view):
         return [_note("It holds no exposure: there is nothing to draw.")]
     number, (width, height) = view.most_blurred, _SIZE_MM
     step = step_of(recording, number)
+    step.exposure = step.exposure if witness is None else witness.seen(step.exposure)
     reasons = (f"; {name}: {e.status.name.lower()} ({e.reason})" for name, e in step.estimates.items() if e.reason)
     caption = f"Exposure {number} (frame {step.exposure.frame_id}), the most blurred{''.join(reasons)}"
     figure = new_figure(width, height * (1.45 if recording.rig.sensor.directions == 2 else 1.0))
