@@ -45,9 +45,8 @@ class Step:
     """Log time of the message that completed it, ns; 0 where there is no log."""
 
 
-Also = Mapping[str, Callable[[Any], None]]
-"""Functions that get a recording's messages (`aolink.recording.messages.RecordedMessage`) as they are read, by
-topic."""
+Also = Mapping[str, Callable[[str, int, Any], None]]
+"""Functions that get a recording's messages as they are read, by topic: topic, log time in ns, message."""
 NOTHING: Also = MappingProxyType({})
 
 

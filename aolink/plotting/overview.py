@@ -170,11 +170,11 @@ class _Gathered:
         timed = [topics.LATENCY, *map(topics.estimation_topic, self.names)]
         return {**also, **{topic: partial(self._see, also.get(topic)) for topic in timed}}
 
-    def _see(self, before: Callable[[Any], None] | None, recorded: Any) -> None:
+    def _see(self, before: Callable[[str, int, Any], None] | None, topic: str, time_ns: int, message: Any) -> None:
         if before is not None:
-            before(recorded)
-        row, message = topics.named(recorded.topic), recorded.message
-        name = recorded.topic.removeprefix(row.name)
+            before(topic, time_ns, message)
+        row = topics.named(topic)
+        name = topic.removeprefix(row.name)
         for curve in row.curves:
             if curve.is_in(message):
                 points = self.timings.setdefault(f"{name} {curve.label}".strip(), [])

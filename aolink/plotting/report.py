@@ -105,7 +105,7 @@ def write_report(
         paper(),
         writing(path, overwrite=overwrite, sources=recording.files, suffix=".html", error=ExportError) as partial,
     ):
-        also = dict.fromkeys(recording.counts, counted.see)
+        also = dict.fromkeys(recording.counts, counted.take)
         view = overview(recording, progress=progress, also=also, known=None if witness is None else witness.seen)
         found = score_table(view.scores)
         parts = [

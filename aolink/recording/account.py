@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any, Self
 
 import numpy as np
+from google.protobuf.message import Message
 from numpy.typing import NDArray
 
 from aolink.recording.schemas_pb2 import CommandAnswer
@@ -136,6 +137,15 @@ class Account:
         self._without: dict[str, WithoutEffect] = {}
         self._reported_until = 0
         """First step for which no report has come."""
+
+    def take(self, topic: str, time_ns: int, message: Message) -> None:
+        """Take the next message of the session, of any topic."""
+        if isinstance(message, CommandBlock):
+            self.commanded(message)
+        elif isinstance(message, CommandAnswer):
+            self.answered(message)
+        elif isinstance(message, Applied):
+            self.reported(message)
 
     def commanded(self, block: CommandBlock) -> None:
         """Note that a block is sent for the first time."""

@@ -10,17 +10,16 @@ from datetime import UTC, datetime
 from typing import Any
 
 from foxglove_schemas_protobuf.Log_pb2 import Log
+from google.protobuf.message import Message
 
 from aolink.estimation import Status
 from aolink.estimation.score import UnusedCounter
 from aolink.recording import topics
 from aolink.recording.account import STEPS, Account, Commands
 from aolink.recording.convert import verdict_of
-from aolink.recording.messages import RecordedMessage
 from aolink.recording.reader import Recording
-from aolink.recording.schemas_pb2 import CommandAnswer, ExposureInfo
 from aolink.recording.schemas_pb2 import Estimate as EstimateMessage
-from aolink.wire.messages_pb2 import Applied, CommandBlock
+from aolink.recording.schemas_pb2 import ExposureInfo
 
 _LOSSES = (
     "frames_lost", "frames_incomplete", "scenes_lost", "scenes_incomplete", "connection_sequence_gaps",
@@ -43,21 +42,15 @@ class Counted:
         self._verdicts: dict[str, dict[str, Any]] = {}
         self._account = Account()
 
-    def see(self, recorded: RecordedMessage) -> None:
+    def take(self, topic: str, time_ns: int, message: Message) -> None:
         """Take the next message."""
-        message: Any = recorded.message
-        if isinstance(message, CommandBlock):
-            self._account.commanded(message)
-        elif isinstance(message, CommandAnswer):
-            self._account.answered(message)
-        elif isinstance(message, Applied):
-            self._account.reported(message)
-        elif isinstance(message, ExposureInfo) and recorded.topic == topics.EXPOSURE:
+        self._account.take(topic, time_ns, message)
+        if isinstance(message, ExposureInfo) and topic == topics.EXPOSURE:
             if self._last is not None and message.first_step - self._last != self._period:
                 self._gaps.append(message.first_step - self._last - self._period)
             self._last = message.first_step
         elif isinstance(message, EstimateMessage):
-            name = recorded.topic.removeprefix(topics.ESTIMATE)
+            name = topic.removeprefix(topics.ESTIMATE)
             self._counts[name] += 1
             if (verdict := verdict_of(message)) is not None and verdict.exposures:
                 self._verdicts[name] = asdict(verdict) | {"text": verdict.text}
@@ -88,7 +81,7 @@ def recording_facts(recording: Recording, counted: Counted | None = None) -> dic
     if counted is None:
         counted = Counted(recording)
         for recorded in recording.messages():  # all of them, because one that cannot be used is found when it is read
-            counted.see(recorded)
+            counted.take(recorded.topic, recorded.log_time_ns, recorded.message)
     gaps, estimates, commands = counted.result()
     return {
         "file": str(recording.path),

@@ -229,7 +229,7 @@ class Recording(RecordedMessages, Series):
             now, see = raw.log_time_ns, also.get(raw.topic)
             message = (None if see else self.decoded_run(raw)) or self.decoded(raw)
             if see and message is not None:
-                see(RecordedMessage(raw.topic, now, raw.sequence, message))
+                see(raw.topic, now, message)
             yield from walk.take(raw.topic, raw.log_time_ns, message)
         yield from walk.flush(now)
 
@@ -299,9 +299,9 @@ class Recording(RecordedMessages, Series):
         """The restored pictures that `aolink deblur` wrote, exposure by exposure."""
         found = Restorations()
         for recorded in self.messages(*Restorations.TOPICS):
-            found.see(recorded)
-            yield from found.taken()
-        yield from found.taken(ended=True)
+            found.take(recorded.topic, recorded.log_time_ns, recorded.message)
+            yield from found.whole()
+        yield from found.whole(ended=True)
 
     def _take_side(self, rig: Rig | None) -> None:
         """Put the estimates of side files in the place of the file's own."""
@@ -344,14 +344,14 @@ class Restorations:
     def __init__(self) -> None:
         self._found: list[tuple[schemas_pb2.Restoration, dict[str, RawImage]]] = []
 
-    def see(self, recorded: RecordedMessage) -> None:
+    def take(self, topic: str, time_ns: int, message: Message) -> None:
         """Take a message on one of the topics."""
-        if isinstance(recorded.message, schemas_pb2.Restoration):
-            self._found.append((recorded.message, {}))
-        elif isinstance(recorded.message, RawImage) and self._found:
-            self._found[-1][1][recorded.topic] = recorded.message
+        if isinstance(message, schemas_pb2.Restoration):
+            self._found.append((message, {}))
+        elif isinstance(message, RawImage) and self._found:
+            self._found[-1][1][topic] = message
 
-    def taken(self, *, ended: bool = False) -> Iterator[RestoredPictures]:
+    def whole(self, *, ended: bool = False) -> Iterator[RestoredPictures]:
         """The pictures that are whole, each once; the last are whole with the next, or when the messages ended."""
         while len(self._found) > (not ended):
             info, pictures = self._found.pop(0)

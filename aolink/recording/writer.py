@@ -146,8 +146,8 @@ class RecordingWriter:
         self._thread = threading.Thread(target=self._run, name="aolink-recorder", daemon=True)
         self._thread.start()
 
-    def write(self, topic: str, message: Message, log_time_ns: int) -> None:
-        """Record a message. Raises RecordingError if the file can no longer be written."""
+    def take(self, topic: str, time_ns: int, message: Message) -> None:
+        """Record a message with its log time, ns. Raises RecordingError if the file can no longer be written."""
         if self._error:
             raise self._error
         data = message.SerializeToString()  # fields by their numbers: without maps always the same bytes
@@ -156,7 +156,7 @@ class RecordingWriter:
         if topic not in self._classes:
             self._classes[topic] = type(message)
         self._put_bytes += len(data)
-        self._queue.append((topic, None if self._lead is None else message, data, log_time_ns))
+        self._queue.append((topic, None if self._lead is None else message, data, time_ns))
 
     def _wait_for_room(self) -> None:
         while self._is_full():
@@ -181,7 +181,7 @@ class RecordingWriter:
         return 0.0 if since is None else time.monotonic() - since
 
     def close(self, end_metadata: dict[str, str] | None = None) -> None:
-        """Write the queued messages, the index and ``end_metadata``. Raises RecordingError as `write` does."""
+        """Write the queued messages, the index and ``end_metadata``. Raises RecordingError as `take` does."""
         if self._closed:
             return
         self._closed = True

@@ -34,13 +34,13 @@ from aolink.session.commanding import Inputs
 from aolink.session.controlling import Controlling, facts, served
 from aolink.session.estimating import BesideTheLoop
 from aolink.session.excitation import Excitation
-from aolink.session.journal import Sink
+from aolink.session.journal import Sink, View
 from aolink.session.loop import ESTIMATES_S, SessionLoop
 from aolink.session.report import EstimatorReport, Report
 from aolink.session.waiting import Aside
 from aolink.signals import Interrupted
 
-__all__ = ["EstimatorReport", "Report", "Sink", "record"]
+__all__ = ["EstimatorReport", "Report", "Sink", "View", "record"]
 
 _PROGRESS_S = 0.1
 """In real time: time between two reports of the progress, s."""
@@ -95,7 +95,7 @@ def record(
     inputs: Inputs | None = None,
     control: str = "",
     force: bool = False,
-    sinks: Sequence[Sink] = (),
+    sinks: Sequence[View] = (),
     overwrite: bool = False,
     options: WriteOptions | None = None,
     reconnect_s: float = 0.0,

@@ -11,12 +11,10 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from aolink.assembly import Assembler
 from aolink.devices.interfaces import Mirror, Time
 from aolink.estimation import Estimate
 from aolink.exposure import Exposure
 from aolink.recording import topics
-from aolink.recording.account import Account
 from aolink.rig import MirrorDriver, Rig
 from aolink.session.controlling import MARGIN_S, Controlling
 from aolink.session.journal import Journal
@@ -50,11 +48,11 @@ class Commanding:
 
     def __init__(
         self, rig: Rig, time: Time, mirror: Mirror, inputs: Inputs | None, controlling: Controlling | None,
-        assembler: Assembler, account: Account, journal: Journal, latencies: LatencyBook,
+        journal: Journal, latencies: LatencyBook,
     ) -> None:  # fmt: skip
         self._rig, self._time, self._mirror, self._controlling = rig, time, mirror, controlling
         self._inputs = inputs or partial(rig.drive.inputs, fast_step_s=rig.timing.fast_step_s)
-        self._assembler, self._account, self._journal, self._latencies = assembler, account, journal, latencies
+        self._journal, self._latencies = journal, latencies
         self._step_ns = rig.timing.fast_step_ns
         self._first_step = 0
         self._end_step: int | None = None
@@ -131,11 +129,7 @@ class Commanding:
             u = control.loop.inputs(first, n_steps) if control else self._inputs(first - self._first_step, n_steps)
             now = self._time.now_ns()
             block = self._mirror.send_block(first, u, cause, now)
-            if control is not None:
-                control.commanded(block)
-            self._account.commanded(block)
-            self._assembler.add_command(block)
-            self._journal.record(topics.COMMAND, block, now)
+            self._journal.take(topics.COMMAND, now, block)
             self._latencies.sent(block, self._time.now_ns())
             self.queued_until += n_steps
 
@@ -159,6 +153,6 @@ class Commanding:
         if first_step < self.queued_until:
             # No later than the first changed step: the limits apply from the input that the controller continues from.
             self.queued_until = min(first_step, max(self.device_step() + 1, self._mirror.withdraw(first_step)))
-        self._journal.record(topics.CONTROL, message, log_time_ns)
+        self._journal.take(topics.CONTROL, log_time_ns, message)
         for warning in warnings:
             self._journal.warn(warning)

@@ -7,6 +7,7 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
+from google.protobuf.message import Message
 
 from aolink.control import Act, ControllerRow, ControlLoop, State, find_controller
 from aolink.estimation import Estimate
@@ -61,14 +62,11 @@ class Controlling:
         ended = max(0, (device_step - self._first_step - self._steps) // self._period + 1)
         return self._first_step + ended * self._period + self._steps + self.loop.delay_steps
 
-    def commanded(self, block: wire.CommandBlock) -> None:
-        """Take a block as it was sent."""
-        self.loop.commanded(block.first_step, np.array(block.u).reshape(block.n_steps, self._n_inputs))
-
-    def applied(self, applied: wire.Applied) -> None:
-        """Take a report of the inputs that the mirror held."""
-        if applied.u:
-            self.loop.applied(applied.first_step, np.array(applied.u).reshape(applied.n_steps, self._n_inputs))
+    def take(self, topic: str, time_ns: int, message: Message) -> None:
+        """Take a block of inputs as it was sent, or a report of the inputs that the mirror held."""
+        if isinstance(message, wire.CommandBlock | wire.Applied) and message.u:
+            tell = self.loop.commanded if isinstance(message, wire.CommandBlock) else self.loop.applied
+            tell(message.first_step, np.array(message.u).reshape(message.n_steps, self._n_inputs))
 
     def see(
         self, exposure: Exposure, estimate: Estimate | None, earliest_step: int

@@ -42,44 +42,46 @@ class _Said:
 
 
 class Sink(Protocol):
-    """Takes a session's messages as they are recorded."""
-
-    may_wait: bool
-    """Whether it may take time; set by the session, or by a replay."""
+    """Takes the messages of a session, or of a recording, in their order."""
 
     def take(self, topic: str, time_ns: int, message: Message) -> None:
         """Take the next message, with its topic and its log time, ns."""
 
 
-class Journal:
-    """Writes a session's messages into its recording and hands them to other sinks, and notes warnings and counts in
-    its `Report`."""
+class View(Sink, Protocol):
+    """A sink that is no part of the session."""
 
-    def __init__(self, writer: RecordingWriter, report: Report, time: Time, sinks: Sequence[Sink] = ()) -> None:
+    may_wait: bool
+    """Whether it may take time; set by the session, or by a replay."""
+
+
+class Journal:
+    """The stream of a session's messages, which it hands to its sinks; warnings and counts go into its `Report` too."""
+
+    def __init__(self, writer: RecordingWriter, report: Report, time: Time) -> None:
         self.report = report
-        self._writer, self._sinks = writer, list(sinks)
-        for sink in sinks:
-            sink.may_wait = time.virtual
-        self._time = time
+        self.sinks: list[Sink] = []
+        """The recorder comes before those that have more to record of a message."""
+        self._writer, self._time = writer, time
         self._said: dict[str, _Said] = {}
         """The warnings by their kind."""
 
-    def record(self, topic: str, message: Message, log_time_ns: int) -> None:
-        """Record a message, and give it to the session's sinks; one that fails gets no more."""
-        self._writer.write(topic, message, log_time_ns)
-        for sink in list(self._sinks):
-            try:
-                sink.take(topic, log_time_ns, message)
-            except Exception as error:  # a session must not end because its picture fails
-                self._sinks.remove(sink)
-                self.warn(f"a sink of this session's messages failed, and gets no more: {error}")
+    def take(self, topic: str, time_ns: int, message: Message) -> None:
+        """Hand a message to all sinks."""
+        for sink in self.sinks:
+            sink.take(topic, time_ns, message)
+
+    def shown_by(self, view: View) -> Sink:
+        """A view as a sink of this session, which gets no more when it has failed."""
+        view.may_wait = self._time.virtual
+        return _Guarded(view, self)
 
     def log(self, text: str, level: Log.Level.ValueType = Log.INFO) -> None:
         """Record a sentence about the session."""
         now = self._time.now_ns()
         entry = Log(level=level, message=text, name="aolink")
         entry.timestamp.FromNanoseconds(now)
-        self.record(topics.LOG, entry, now)
+        self.take(topics.LOG, now, entry)
 
     def warn(self, text: str, level: Log.Level.ValueType = Log.WARNING) -> None:
         """Record a warning, which the report has as well. Of those that differ only in their numbers, `_AT_ONCE` are
@@ -95,9 +97,6 @@ class Journal:
             said.left_out += 1
             warnings[said.place] = f"{said.newest} (and {said.left_out} more of this kind)"
 
-    def latency(self, latency: pb.Latency, log_time_ns: int) -> None:
-        self.record(topics.LATENCY, latency, log_time_ns)
-
     def clock(self, device: Device, sampled: ClockSampled) -> None:
         """Record the comparison of a device's clock with the host's."""
         clock, exchange, report = device.clock, sampled.exchange, self.report
@@ -110,7 +109,7 @@ class Journal:
             sample.frequency_ppm, sample.sigma_ns = clock.frequency_ppm, sigma_ns
             report.clock_offset_ns, report.clock_frequency_ppm = sample.offset_ns, sample.frequency_ppm
             report.clock_sigma_ns = sigma_ns
-        self.record(topics.CLOCK, sample, exchange.host_receive_ns)
+        self.take(topics.CLOCK, exchange.host_receive_ns, sample)
         if sampled.step is not None:
             size_s, period_s = sampled.step.size_ns / 1e9, (sampled.step.before_ns - sampled.step.after_ns) / 1e9
             direction = "forward" if size_s > 0 else "back"
@@ -138,7 +137,23 @@ class Journal:
                 if text not in self.report.warnings:
                     self.warn(text)
             if known := {count: number for count, number in each.items() if count in _COUNTS}:
-                self.record(topics.CONNECTION, pb.ConnectionStatistics(device=name, **known), now)
+                self.take(topics.CONNECTION, now, pb.ConnectionStatistics(device=name, **known))
+
+
+class _Guarded:
+    """A view that may fail: a session must not end because its picture does."""
+
+    def __init__(self, view: View, journal: Journal) -> None:
+        self._view: View | None = view
+        self._journal = journal
+
+    def take(self, topic: str, time_ns: int, message: Message) -> None:
+        if self._view is not None:
+            try:
+                self._view.take(topic, time_ns, message)
+            except Exception as error:
+                self._view = None
+                self._journal.warn(f"a sink of this session's messages failed, and gets no more: {error}")
 
 
 def command_answer(mirror: Mirror, answered: CommandAnswered, receive_ns: int) -> pb.CommandAnswer:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 from foxglove_schemas_protobuf.Log_pb2 import Log
+from google.protobuf.message import Message
 
 from aolink.devices.interfaces import Time
 from aolink.estimation import Estimate
@@ -12,6 +13,7 @@ from aolink.estimation.verdict import Fit
 from aolink.exposure import Exposure
 from aolink.recording import convert, topics
 from aolink.recording import schemas_pb2 as pb
+from aolink.recording.exposures import ExposureAssembly
 from aolink.rig import Rig
 from aolink.session.estimating import Estimating, Outcome
 from aolink.session.journal import Journal
@@ -33,7 +35,7 @@ class LiveExposures:
         control: TellController | None, serves: str,
     ) -> None:  # fmt: skip
         self._rig, self._time, self._journal, self._latencies = rig, time, journal, latencies
-        self._report = journal.report
+        self._report, self._assembly = journal.report, ExposureAssembly(rig)
         self._estimating, self._control, self._serves = estimating, control, serves
         self.newest_frame = 0
         """The newest frame that commands can depend on."""
@@ -42,10 +44,18 @@ class LiveExposures:
         self._hanging: set[str] = set()
         """The estimators that hang."""
 
-    def take(self, exposures: Sequence[Exposure], log_time_ns: int) -> None:
-        """Take the next exposures."""
+    def take(self, topic: str, time_ns: int, message: Message) -> None:
+        """Take the next message of the session; a report or a frame may complete exposures."""
+        self._take_exposures(self._assembly.take(topic, message), time_ns)
+
+    def flush(self, now_ns: int) -> None:
+        """Take the exposures that are still incomplete at the session's end."""
+        self._take_exposures(self._assembly.flush(), now_ns)
+
+    def _take_exposures(self, exposures: Sequence[Exposure], log_time_ns: int) -> None:
         for exposure in exposures:
             self._report.exposures += 1
+            self._assembly.number(exposure)  # it keeps the number until then
             self._unsettled[exposure.frame_id] = []
             outcomes = self._estimating.offer(exposure)
             if self._control is not None and not self._serves:
@@ -71,13 +81,13 @@ class LiveExposures:
         for outcome in outcomes:
             name, frame_id, message = outcome.estimator, outcome.exposure.frame_id, outcome.message
             if message is not None:
-                self._journal.record(topics.estimate_topic(name), message, log_time_ns)
+                self._journal.take(topics.estimate_topic(name), log_time_ns, message)
                 self._say_verdict(name, message)
                 if self._control is not None and name == self._serves:
                     self._control(outcome.exposure, outcome.estimate(self._rig), log_time_ns)
             if name in self._report.estimation:
                 self._report.estimation[name].add(outcome)
-                self._journal.record(topics.estimation_topic(name), outcome.account(), log_time_ns)
+                self._journal.take(topics.estimation_topic(name), log_time_ns, outcome.account())
             outcomes_so_far = self._unsettled[frame_id]
             if message is not None and all(each.message is None for each in outcomes_so_far):
                 self._know(frame_id, self._time.now_ns())

@@ -7,11 +7,13 @@ mirror. The same loop runs in real time and on virtual time; on virtual time it 
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Sequence
+from functools import partial
 
 from foxglove_schemas_protobuf.Log_pb2 import Log
 
-from aolink.assembly import Assembler, Frame
+from aolink.assembly import Frame
 from aolink.devices import interfaces
 from aolink.devices.clock import QUERY_PERIOD_S, SUSPICION_PERIOD_S, WARM_UP_QUERIES
 from aolink.devices.interfaces import Camera, ClockSampled, CommandAnswered, Device, Event, Mirror, Returned, Time
@@ -24,7 +26,7 @@ from aolink.rig import Rig
 from aolink.session.commanding import Commanding, Inputs, lead_steps
 from aolink.session.controlling import Controlling
 from aolink.session.estimating import Estimating, InTheLoop
-from aolink.session.journal import Journal, Sink, command_answer
+from aolink.session.journal import Journal, View, command_answer
 from aolink.session.live import LiveExposures
 from aolink.session.received import ReceivedFrames
 from aolink.session.report import EstimatorReport, LatencyBook, Report
@@ -58,7 +60,7 @@ class SessionLoop:
 
     def __init__(
         self, rig: Rig, time: Time, camera: Camera, mirror: Mirror, writer: RecordingWriter, driver: Driver,
-        inputs: Inputs | None = None, sinks: Sequence[Sink] = (), beside: Estimating | None = None,
+        inputs: Inputs | None = None, views: Sequence[View] = (), beside: Estimating | None = None,
         report: Report | None = None, controlling: Controlling | None = None,
     ) -> None:  # fmt: skip
         self.report = report or Report()
@@ -70,7 +72,6 @@ class SessionLoop:
         self._controlling = controlling
         if controlling is not None:
             self.report.control = controlling.report
-        self._assembler = Assembler(rig)
         self._step_ns = rig.timing.fast_step_ns
         self._first_step = _NOT_YET
         self._devices: list[Camera | Mirror] = [camera, mirror] if mirror.commanded else [camera]
@@ -91,14 +92,18 @@ class SessionLoop:
         self._returned: list[Device] = []
         """Vanished devices that have been identified again; their clocks are being queried."""
         self._account = Account(self.report.commands)
-        self._journal = Journal(writer, self.report, time, sinks)
-        self._latencies = LatencyBook(self.report, self._journal.latency, commanded=mirror.commanded)
-        self._frames = ReceivedFrames(rig, time, camera, mirror, self._journal, self._latencies)
-        self._commanding = Commanding(
-            rig, time, mirror, inputs, controlling, self._assembler, self._account, self._journal, self._latencies
+        self._journal = Journal(writer, self.report, time)
+        self._latencies = LatencyBook(
+            self.report, partial(self._journal.take, topics.LATENCY), commanded=mirror.commanded
         )
+        self._frames = ReceivedFrames(rig, time, camera, mirror, self._journal, self._latencies)
+        self._commanding = Commanding(rig, time, mirror, inputs, controlling, self._journal, self._latencies)
         control, serves = (None, "") if controlling is None else (self._commanding.control, controlling.estimator)
         self._live = LiveExposures(rig, time, self._journal, self._latencies, self._estimating, control, serves)
+        shown = [self._journal.shown_by(each) for each in views]
+        controls = [controlling] if controlling is not None else []
+        # The account first: the recorder may be what has failed. The exposures last: they make messages themselves.
+        self._journal.sinks += [self._account, writer, *shown, *controls, self._live]
 
     def run(self, exposures: int, stop: Callable[[], bool], progress: Callable[[int], None]) -> None:
         self._estimating.get_ready(stop)
@@ -146,15 +151,13 @@ class SessionLoop:
     def close_account(self) -> None:
         """End each commanded step that is still open: no more answers and reports of the mirror will come."""
         now = self._time.now_ns()
-        last_answers = [command_answer(self._mirror, each, now) for each in self._mirror.last_answers()]
-        for each in last_answers:
-            self._account.answered(each)
-        if self._parked_from is not None:
-            self._account.parked_from(self._parked_from)
-        self._account.close()
-        self._count_tries()
-        for each in last_answers:  # the recording may be what has failed
-            self._journal.record(topics.ANSWER, each, now)
+        with contextlib.ExitStack() as every:  # also where the recorder has failed
+            every.callback(self._count_tries)
+            every.callback(self._account.close)
+            if self._parked_from is not None:
+                every.callback(self._account.parked_from, self._parked_from)
+            for each in reversed(list(self._mirror.last_answers())):
+                every.callback(self._journal.take, topics.ANSWER, now, command_answer(self._mirror, each, now))
 
     def finish_estimates(self, patience_s: float = ESTIMATES_S) -> None:
         """Wait for the estimates under way, and record exposures without an estimate as skipped."""
@@ -363,7 +366,7 @@ class SessionLoop:
         self._collect_reports()
         now = self._time.now_ns()
         self._take(self._camera, list(self._camera.flush()), now)
-        self._live.take(self._assembler.flush(), now)
+        self._live.flush(now)
         self.finish_estimates()
         self._latencies.close(self._time.now_ns())
         self.close_account()
@@ -395,7 +398,7 @@ class SessionLoop:
             elif isinstance(event, wire.Applied):
                 self._take_applied(event, receive_ns)
             elif isinstance(event, wire.Truth):
-                self._journal.record(topics.TRUTH, event, receive_ns)
+                self._journal.take(topics.TRUTH, receive_ns, event)
             elif isinstance(event, ClockSampled):
                 self._journal.clock(device, event)
             elif isinstance(event, CommandAnswered):
@@ -409,20 +412,15 @@ class SessionLoop:
                 self._journal.log(f"{device.name}: {event.text}", level)
 
     def _take_frame(self, frame: Frame, receive_ns: int) -> None:
-        frame = self._frames.take(frame, receive_ns)
         if not frame.plane:
             self._last_frame_ns = receive_ns
             if self._mirror.commanded and not self._time.virtual:
                 # A mirror may report nothing at all, so that no gap shows.
                 late = frame.first_step - round(_GRACE_S * 1e9) // self._step_ns
                 self._take(self._mirror, self._mirror.await_reports(late, receive_ns), receive_ns)
-            self._live.take(self._assembler.add_frame(frame), receive_ns)
+        self._frames.take(frame, receive_ns)
 
     def _take_applied(self, applied: wire.Applied, receive_ns: int) -> None:
-        self._journal.record(topics.APPLIED, applied, receive_ns)
-        self._account.reported(applied)
-        if self._controlling is not None:
-            self._controlling.applied(applied)
         is_report = applied.source not in (wire.Applied.AWAITED, wire.Applied.NOT_REPORTED)
         if is_report and applied.first_step >= self._first_step:  # not before the clock is known
             since_zero_ns = (applied.first_step + applied.n_steps) * self._step_ns
@@ -433,12 +431,11 @@ class SessionLoop:
             end = applied.first_step + applied.n_steps
             end = end if self._end_step is None else min(end, self._end_step)
             self.report.steps_parked += max(0, end - max(applied.first_step, self._first_step))  # of this session
-        self._live.take(self._assembler.add_applied(applied), receive_ns)
+        self._journal.take(topics.APPLIED, receive_ns, applied)
 
     def _take_answer(self, answer: CommandAnswered, receive_ns: int) -> None:
         ack, message = answer.ack, command_answer(self._mirror, answer, receive_ns)
-        self._account.answered(message)
-        self._journal.record(topics.ANSWER, message, receive_ns)
+        self._journal.take(topics.ANSWER, receive_ns, message)
         if ack is None:
             return
         self._latencies.acknowledged(ack.block_id, receive_ns)

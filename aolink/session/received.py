@@ -10,7 +10,7 @@ from aolink.recording import convert, topics
 from aolink.recording import schemas_pb2 as pb
 from aolink.rig import Rig
 from aolink.session.journal import Journal
-from aolink.session.report import LatencyBook
+from aolink.session.report import LatencyBook, Report
 
 _ALIGNED = 0.2
 """Largest standard deviation of an exposure's alignment without a warning, as a part of the exposure: estimates'
@@ -36,24 +36,12 @@ class ReceivedFrames:
         """Note that the camera was started again: it does not number the exposures that it has missed."""
         self._restarted = set(self._newest_steps)
 
-    def take(self, frame: Frame, receive_ns: int) -> Frame:
-        """Record a frame; gives it with the host's time of its start and all frames lost before it."""
+    def take(self, frame: Frame, receive_ns: int) -> None:
+        """Make messages of a frame, with the host's time of its start and all frames lost before it."""
         frame = self._with_host_time(self._with_missed(frame), receive_ns)
-        info, image = convert.frame_messages(frame)
-        of_scene = bool(frame.plane)
-        self._journal.record(topics.SCENE_EXPOSURE if of_scene else topics.EXPOSURE, info, receive_ns)
-        self._journal.record(topics.SCENE if of_scene else topics.IMAGE, image, receive_ns)
-        report = self._journal.report
-        if of_scene:
-            report.scenes_received += 1
-            report.scenes_incomplete += frame.chunks_lost > 0
-            report.scenes_lost += frame.frames_lost_before
-            return frame
-        report.frames_received += 1
-        report.frames_incomplete += frame.chunks_lost > 0
-        report.frames_lost += frame.frames_lost_before
-        exposure_ns = self._timing.exposure_steps * self._timing.fast_step_ns
-        if self._check_alignment and frame.alignment_sigma_ns > _ALIGNED * exposure_ns:
+        report, exposure_ns = self._journal.report, self._timing.exposure_steps * self._timing.fast_step_ns
+        self._count(report, frame)
+        if not frame.plane and self._check_alignment and frame.alignment_sigma_ns > _ALIGNED * exposure_ns:
             self._check_alignment = False
             report.warnings.append(
                 "which of the mirror's fast steps an exposure covers is known only to"
@@ -61,14 +49,23 @@ class ReceivedFrames:
                 f" of estimates are reliable up to {_ALIGNED:g}; give delay_s and delay_sd_s of the devices as well as"
                 " they are known"
             )
-        if self._latencies is not None:
+        if not frame.plane and self._latencies is not None:
             host_end_ns, _ = self._camera.clock.host_ns(frame.device_end_ns)
             latency = pb.Latency(
                 frame_id=frame.frame_id, exposure_end_ns=host_end_ns, first_byte_ns=frame.host_first_byte_ns,
                 complete_ns=frame.host_receive_ns,
             )  # fmt: skip
             self._latencies.frame(latency)
-        return frame
+        info, image = convert.frame_messages(frame)
+        self._journal.take(topics.SCENE_EXPOSURE if frame.plane else topics.EXPOSURE, receive_ns, info)
+        self._journal.take(topics.SCENE if frame.plane else topics.IMAGE, receive_ns, image)
+
+    @staticmethod
+    def _count(report: Report, frame: Frame) -> None:
+        kind = "scenes" if frame.plane else "frames"
+        lost = {"received": 1, "incomplete": frame.chunks_lost > 0, "lost": frame.frames_lost_before}
+        for name, count in lost.items():
+            setattr(report, f"{kind}_{name}", getattr(report, f"{kind}_{name}") + count)
 
     def _with_missed(self, frame: Frame) -> Frame:
         """The frame with a count of the exposures that the camera has missed before it was started again."""

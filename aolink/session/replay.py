@@ -18,10 +18,9 @@ from aolink.errors import RecordingError
 from aolink.estimation import Driver, Estimate
 from aolink.exposure import Exposure
 from aolink.recording import convert, topics
-from aolink.recording.messages import RecordedMessage
 from aolink.recording.reader import Recording, opened
 from aolink.recording.reestimate import Skipped
-from aolink.session.journal import Sink
+from aolink.session.journal import View
 from aolink.wire import messages_pb2 as wire
 
 _NAP_S = 0.1
@@ -29,7 +28,7 @@ _NAP_S = 0.1
 
 
 def replay(
-    recording: Recording | str | Path, names: str | Sequence[str], *, rate: float = 0.0, sinks: Sequence[Sink] = (),
+    recording: Recording | str | Path, names: str | Sequence[str], *, rate: float = 0.0, sinks: Sequence[View] = (),
     stop: Callable[[], bool] = lambda: False, now_s: Callable[[], float] = time.monotonic,
     sleep: Callable[[float], None] = time.sleep,
 ) -> Iterator[tuple[Exposure, list[Estimate]]]:  # fmt: skip
@@ -56,13 +55,10 @@ def replay(
         for sink in sinks:
             sink.take(topic, time_ns, message)
 
-    def see(recorded: RecordedMessage) -> None:
-        give(recorded.topic, recorded.log_time_ns, recorded.message)
-
     for sink in sinks:
         sink.may_wait = True
     others = [each for each in recording.counts if not each.startswith(topics.ESTIMATE)] if sinks else []
-    for step in skipped.steps(dict.fromkeys(others, see)):
+    for step in skipped.steps(dict.fromkeys(others, give)):
         exposure = step.exposure
         if stop():
             break

@@ -202,7 +202,7 @@ class LatencyBook:
     had skipped it. (`EstimatorReport` has the time of each estimator.)
     """
 
-    def __init__(self, report: Report, record: Callable[[pb.Latency, int], None], *, commanded: bool) -> None:
+    def __init__(self, report: Report, record: Callable[[int, pb.Latency], None], *, commanded: bool) -> None:
         self._report, self._record, self._commanded = report, record, commanded
         self._open: dict[int, pb.Latency] = {}
         self._blocks: dict[int, int] = {}
@@ -250,6 +250,6 @@ class LatencyBook:
         latency = self._open.pop(frame_id)
         self._blocks.pop(frame_id, None)
         self._known.discard(frame_id)
-        self._record(latency, now_ns)
+        self._record(now_ns, latency)
         self._report.latencies.append(latency)
         del self._report.latencies[:-_KEPT_LATENCIES]

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from aolink.estimation import exposure_model
 from aolink.recording import topics
 from aolink.recording.exposures import Walk
-from aolink.recording.messages import RawMessage, RecordedMessage
+from aolink.recording.messages import RawMessage
 from aolink.restoration import deblur
 from aolink.rig import Rig
 from aolink.series import Step
@@ -66,7 +66,7 @@ class LiveSender(Sender):
         self._steps += self._walk.take(topic, time_ns, message)
         self._now_ns = time_ns
         if is_drawn(topic):
-            self.see(RecordedMessage(topic, time_ns, 0, message))
+            self.see(topic, time_ns, message)
 
     def leave_out(self, messages: int) -> None:
         """Note that so many messages were left out here, because the view is too slow."""

@@ -117,24 +117,24 @@ class RecordingSender(Sender):
         recording, look, drawing = self._recording, self._look, self.drawing
         restorations, starts = Restorations(), dict[int, int]()
         shown = [topic for topic in recording.counts if is_drawn(topic)]
-        also: dict[str, Callable[[RecordedMessage], None]] = dict.fromkeys(Restorations.TOPICS, restorations.see)
+        also: dict[str, Callable[[str, int, Any], None]] = dict.fromkeys(Restorations.TOPICS, restorations.take)
         if look.exposures is None:
             also |= dict.fromkeys(shown, self.see)
         else:
             for each in self._messages_of_part(shown):
-                self.see(each)
+                self.see(each.topic, each.log_time_ns, each.message)
         for steps, following in self._read(also):
             timebase = self.send(steps, following=following)
             if topics.RESTORATION in recording.counts:
                 starts |= {each.exposure.frame_id: each.exposure.first_step for each in steps}
-                scene.log_restored(drawing, timebase, starts, list(restorations.taken()))
+                scene.log_restored(drawing, timebase, starts, list(restorations.whole()))
             yield self.sent
         if self.timebase is None:
             raise ViewerError(
                 f"there is no exposure in {recording.path}, so nothing to view; `aolink info` says what it holds"
             )
         self.send(())
-        scene.log_restored(drawing, self.timebase, starts, list(restorations.taken(ended=True)))
+        scene.log_restored(drawing, self.timebase, starts, list(restorations.whole(ended=True)))
         for k, (name, loop) in enumerate(look.loops.items()):
             part = loop[look.exposures.start : look.exposures.stop] if look.exposures is not None else loop
             motion.log_residual(drawing, self.timebase, name, part, series_colour(k))

@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 from itertools import groupby
 
 import rerun as rr
+from google.protobuf.message import Message
 
 from aolink.colours import by_rank
 from aolink.estimation.score import Scorer, score_table
@@ -40,9 +41,9 @@ class Sender:
         self._scorers = {name: Scorer() for name in drawing.estimators}
         self._skipped: Counter[str] = Counter()
 
-    def see(self, recorded: RecordedMessage) -> None:
+    def see(self, topic: str, time_ns: int, message: Message) -> None:
         """Take a message that is drawn as it is."""
-        self._messages.append(recorded)
+        self._messages.append(RecordedMessage(topic, time_ns, 0, message))
 
     def send(self, steps: Sequence[Step], *, following: Exposure | None = None) -> Timebase:
         """Draw the next exposures, and the messages that have come; gives the timebase.

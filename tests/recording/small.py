@@ -81,5 +81,5 @@ def copied(
     ) as writer:
         for each in recording.messages():
             for message in change(each.topic, each.message):
-                writer.write(each.topic, message, each.log_time_ns)
+                writer.take(each.topic, each.log_time_ns, message)
     return writer.paths

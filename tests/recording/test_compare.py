@@ -88,7 +88,7 @@ def with_numbers(path: Path, rows: list[list[float]]) -> Recording:
     """A recording in which each row stands in a topic of its own."""
     with RecordingWriter(path, load_rig("section-vi"), {}, 0, deterministic=True) as writer:
         for k, row in enumerate(rows):
-            writer.write(f"{topics.ESTIMATE}{k}", pb.Estimate(nis=row), k)
+            writer.take(f"{topics.ESTIMATE}{k}", k, pb.Estimate(nis=row))
     return Recording(path)
 
 
@@ -158,7 +158,7 @@ def test_exposures_that_were_skipped_are_skipped_again(recorded: Session, tmp_pa
             for each in recording.messages():
                 for message in change(each.topic, each.message):
                     topic = topics.estimation_topic("o1") if isinstance(message, pb.Estimation) else each.topic
-                    writer.write(topic, message, each.log_time_ns)
+                    writer.take(topic, each.log_time_ns, message)
         return Recording(target)
 
     recording = write(tmp_path / "skipped.mcap")
@@ -205,7 +205,7 @@ def test_messages_far_from_their_counterparts_are_found(recorded: Session, tmp_p
         for kept in (False, True):
             for each in one.messages():
                 if (each.topic == topics.IMAGE) is kept and not each.topic.startswith(topics.ESTIMATE):
-                    writer.write(each.topic, each.message, each.log_time_ns)
+                    writer.take(each.topic, each.log_time_ns, each.message)
     found = compare(one, Recording(tmp_path / "b.mcap"))
     assert found[topics.EXPOSURE].same
     assert found[topics.COMMAND].same

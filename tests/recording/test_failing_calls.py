@@ -82,7 +82,7 @@ def write(source: Recording, target: Path, options: WriteOptions) -> str:
         facts = {"session": "a"}
         with RecordingWriter(target, source.rig, facts, source.start_ns, overwrite=True, options=options) as writer:
             for each in source.messages():
-                writer.write(each.topic, each.message, each.log_time_ns)
+                writer.take(each.topic, each.log_time_ns, each.message)
     except RecordingError as error:
         return str(error)
     return ""

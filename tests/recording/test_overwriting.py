@@ -38,7 +38,7 @@ class Writing:
     def write(self, until: str = "", wait: Callable[[], bool] = lambda: True) -> None:
         """Write the messages up to the first on a topic, and wait for what is to happen then."""
         for each in self.recording.messages():
-            self.writer.write(each.topic, each.message, each.log_time_ns)
+            self.writer.take(each.topic, each.log_time_ns, each.message)
             if each.topic == until:
                 break
         wait_until(wait)
@@ -47,7 +47,7 @@ class Writing:
         """Write until the writer ends it with an error."""
 
         def written() -> bool:
-            self.writer.write(topics.LOG, Log(), 0)
+            self.writer.take(topics.LOG, 0, Log())
             return False
 
         wait_until(written)

@@ -143,7 +143,7 @@ def test_the_file_is_flushed_by_the_messages_own_time(recorded: Session, tmp_pat
     messages = [m for m in Recording(recorded.path).messages() if not m.topic.startswith("/estimate")]
     writer = RecordingWriter(path, rig, {}, 0, deterministic=True)
     for each in messages:
-        writer.write(each.topic, each.message, each.log_time_ns)
+        writer.take(each.topic, each.log_time_ns, each.message)
     newest = messages[-1].log_time_ns
     due = sum(m.log_time_ns < newest - 200_000_000 for m in messages)
     written = 0
@@ -260,7 +260,7 @@ def test_a_file_without_text_where_the_rig_should_be(tmp_path: Path) -> None:
 
 def test_whatever_goes_wrong_in_the_writers_thread_reaches_the_session(tmp_path: Path) -> None:
     writer = RecordingWriter(tmp_path / "a.mcap", load_rig("section-vi"), {}, 0)
-    writer.write(topics.LOG, Log(message="before the epoch"), -1)  # not a time that the format knows
+    writer.take(topics.LOG, -1, Log(message="before the epoch"))  # not a time that the format knows
     with pytest.raises(RecordingError, match="cannot write"):
         writer.close({"ended": "complete"})
     assert Recording(tmp_path / "a.mcap").metadata.get("ended") is None
@@ -288,7 +288,7 @@ def test_a_disk_that_does_not_answer_is_an_error_when_the_queue_is_full(
 
     def record_much() -> None:
         for k in range(1_000_000):
-            writer.write(topics.LOG, Log(message=os.urandom(50_000).hex()), k * 200_000_000)
+            writer.take(topics.LOG, k * 200_000_000, Log(message=os.urandom(50_000).hex()))
 
     with pytest.raises(RecordingError, match="slow"):
         record_much()
@@ -320,7 +320,7 @@ def test_a_writer_that_is_never_idle_synchronises_all_the_same(tmp_path: Path, m
     monkeypatch.setattr(time, "monotonic", monotonic)
     writer = RecordingWriter(path, load_rig("section-vi"), {}, 0)
     for k in range(2000):  # 8 MB, in 500 portions
-        writer.write(topics.LOG, Log(message="x" * 4000), k)
+        writer.take(topics.LOG, k, Log(message="x" * 4000))
     may_write.set()
     writer.close()
     assert sizes == sorted(sizes)

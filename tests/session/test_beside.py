@@ -502,7 +502,7 @@ def test_over_a_long_gap_the_first_inputs_are_forgotten() -> None:
 
 def test_the_next_command_knows_a_frame_that_is_estimated_whatever_the_order() -> None:
     recorded: list[pb.Latency] = []
-    book = LatencyBook(Report(), lambda latency, now: recorded.append(latency), commanded=True)
+    book = LatencyBook(Report(), lambda now, latency: recorded.append(latency), commanded=True)
     for frame in (1, 2, 3):
         book.frame(pb.Latency(frame_id=frame, complete_ns=10 * frame))
     book.estimated(2, 25, 25)

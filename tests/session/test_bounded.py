@@ -128,7 +128,7 @@ def test_a_mirror_that_reports_nothing(tmp_path: Path, controller: str) -> None:
 def test_without_a_mirror_a_latency_ends_with_its_estimate() -> None:
     recorded: list[tuple[int, int]] = []
     book = LatencyBook(
-        Report(), lambda latency, now: recorded.append((latency.estimated_ns, now)), commanded=False
+        Report(), lambda now, latency: recorded.append((latency.estimated_ns, now)), commanded=False
     )  # fmt: skip
     for frame in (1, 2):
         book.frame(schemas.Latency(frame_id=frame))
@@ -140,7 +140,7 @@ def test_without_a_mirror_a_latency_ends_with_its_estimate() -> None:
 
 def test_a_latency_whose_command_never_comes_ends_some_time() -> None:
     recorded: list[int] = []
-    book = LatencyBook(Report(), lambda latency, now: recorded.append(latency.frame_id), commanded=True)
+    book = LatencyBook(Report(), lambda now, latency: recorded.append(latency.frame_id), commanded=True)
     for frame in range(1, 5001):
         book.frame(schemas.Latency(frame_id=frame, complete_ns=frame))
         book.estimated(frame, frame, frame)

@@ -144,13 +144,13 @@ def test_a_disk_is_not_too_slow_for_a_process_that_did_not_run(tmp_path: Path) -
     message = Log(message="x" * 5000)
     with RecordingWriter(tmp_path / "a.mcap", RIG, {}, 0) as writer:
         for k in range(10_000):
-            writer.write(topics.LOG, message, k)
+            writer.take(topics.LOG, k, message)
         before = sys.getswitchinterval()
         sys.setswitchinterval(1000)
         until_s = time.monotonic() + 5.2
         while time.monotonic() < until_s:
             pass
-        writer.write(topics.LOG, message, 10_000)
+        writer.take(topics.LOG, 10_000, message)
         sys.setswitchinterval(before)
     assert Recording(tmp_path / "a.mcap").counts[topics.LOG] == 10_001
 

@@ -178,10 +178,10 @@ def test_a_quantity_is_a_message_and_a_row(
     recording, live, told = recorded[0], sender(), 0
     with RecordingWriter(tmp_path / "t.mcap", recording.rig, recording.metadata, 0, deterministic=True) as writer:
         for each in recording.messages():
-            writer.write(each.topic, each.message, each.log_time_ns)
+            writer.take(each.topic, each.log_time_ns, each.message)
             if each.topic == topics.EXPOSURE:
                 message = temperature(device="mirror", kelvin=293.0 + 0.01 * told)
-                writer.write("/temperature", message, each.log_time_ns)
+                writer.take("/temperature", each.log_time_ns, message)
                 told += 1
     warm = Recording(tmp_path / "t.mcap")
     for each in warm.messages():

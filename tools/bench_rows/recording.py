@@ -42,22 +42,22 @@ _ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
 def _session(path: Path, seconds: float) -> list[float]:
     """A 1 kHz loop that records a command, a report and, 50 times a second, a frame; times of its calls, s."""
     with RecordingWriter(path, load_rig("section-vi"), {}, time.time_ns()) as writer:
-        return _loop(seconds, writer.write)
+        return _loop(seconds, writer.take)
 
 
-def _loop(seconds: float, write: Callable[[str, Message, int], object]) -> list[float]:
+def _loop(seconds: float, write: Callable[[str, int, Message], object]) -> list[float]:
     """Times of the calls of a 1 kHz loop, s."""
     image = np.random.default_rng(1).integers(100, 200, (64, 64), dtype=np.uint16)
     spent = []
     begin, k = time.monotonic(), 0
     while time.monotonic() - begin < seconds:
         now, start = time.time_ns(), time.perf_counter()
-        write(topics.COMMAND, wire.CommandBlock(block_id=k + 1, first_step=k, n_steps=1, u=[0.1]), now)
-        write(topics.APPLIED, wire.Applied(block_id=k + 1, first_step=k, n_steps=1, u=[0.1]), now)
+        write(topics.COMMAND, now, wire.CommandBlock(block_id=k + 1, first_step=k, n_steps=1, u=[0.1]))
+        write(topics.APPLIED, now, wire.Applied(block_id=k + 1, first_step=k, n_steps=1, u=[0.1]))
         if k % 20 == 0:
-            write(topics.EXPOSURE, schemas_pb2.ExposureInfo(frame_id=k // 20 + 1), now)
+            write(topics.EXPOSURE, now, schemas_pb2.ExposureInfo(frame_id=k // 20 + 1))
             frame = RawImage(width=64, height=64, encoding="mono16", step=128, data=image.tobytes())
-            write(topics.IMAGE, frame, now)
+            write(topics.IMAGE, now, frame)
         spent.append(time.perf_counter() - start)
         k += 1
         time.sleep(max(0.0, begin + k * 1e-3 - time.monotonic()))
@@ -85,7 +85,7 @@ def recording_rate(effort: Effort) -> Row:
     def ours() -> None:
         with tempfile.TemporaryDirectory() as folder, RecordingWriter(Path(folder) / "a", rig, {}, 0) as writer:
             for k, message in enumerate(messages):
-                writer.write(topics.APPLIED, message, k * 1_000_000)
+                writer.take(topics.APPLIED, k * 1_000_000, message)
 
     def plain() -> None:
         with tempfile.TemporaryFile() as file:
@@ -113,7 +113,7 @@ def record_long(path: Path, exposures: int, name: str = "section-vi-lively") -> 
             )  # fmt: skip
             info, image = convert.frame_messages(frame)
             for topic, message in ((topics.APPLIED, applied), (topics.EXPOSURE, info), (topics.IMAGE, image)):
-                writer.write(topic, message, now)
+                writer.take(topic, now, message)
 
 
 def reestimation(effort: Effort) -> list[Row]:
