@@ -69,7 +69,7 @@ def loop_stall(effort: Effort) -> Row:
     without a recorder."""
     with tempfile.TemporaryDirectory() as folder:
         spent = np.array(_session(Path(folder) / "a.mcap", effort.share * _LOOP_S)) * 1e3
-    alone = np.array(_loop(effort.share * _LOOP_S, lambda topic, message, now: message.SerializeToString())) * 1e3
+    alone = np.array(_loop(effort.share * _LOOP_S, lambda topic, now, message: message.SerializeToString())) * 1e3
     (p999, worst), (alone_999, alone_worst) = (np.percentile(each, [99.9, 100]) for each in (spent, alone))
     return Row(
         "loop's wait for the recorder, 1 kHz", f"worst {worst:.2f} ms, 99.9 % {p999:.2f}",
