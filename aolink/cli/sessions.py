@@ -75,7 +75,11 @@ def record(
         bool, typer.Option("--force", help="With --control: close the loop even if it is unstable by the model.")
     ] = False,
     view: Annotated[
-        bool, typer.Option("--view", help="Show the session live in Rerun, which skips exposures if it is too slow.")
+        bool,
+        typer.Option(
+            "--view",
+            help="Show the session live in Rerun, all that a saved view shows; what it is too slow for is left out.",
+        ),
     ] = False,
     inputs: Annotated[
         list[str] | None,

@@ -39,7 +39,8 @@ _MOST_BEHIND_S = 2.0
 """In real time, how long messages may wait for the view."""
 _END_S = 60.0
 """Longest wait at the end until the viewer has all data, s."""
-_NICENESS = 5
+_NICENESS = 15
+"""Below the estimators: where all cores are busy, the view is what comes late."""
 
 
 class LiveView:
