@@ -339,8 +339,10 @@ def _of_regions(
     light = signal.detrend(best.windows.mean(axis=(1, 2))).std() / abs(best.windows.mean())
     if light > _FLICKER:
         doubts.append(f"the light flickers by {light:.1%} rms, as lamps on mains do: that is taken out")
-    hz = f"{found.lines[0].hz:.3g}" if found.lines else ""
-    others = sorted({f"{each.lines[0].hz:.3g}" for _, _, each in results if each.lines} - {hz})
+    # Another alias is the same motion, less well seen.
+    rate, own = common["rate_hz"], [_alias(line.hz, common["rate_hz"]) for line in found.lines]
+    tops = [each.lines[0].hz for _, _, each in results if each.lines]
+    others = sorted({f"{hz:.3g}" for hz in tops if all(abs(_alias(hz, rate) - a) > _SAME / seen.span_s for a in own)})
     if others and not camera:
         doubts.append(f"other parts of the picture vibrate at {' and '.join(others)} Hz: choose one with --at X,Y")
     moved, sure = _moved(seen)

@@ -6,11 +6,13 @@ the frame in which it shows most, by its normalised correlation nearby.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 
 import numpy as np
 from scipy import fft, ndimage, signal
 
+from aolink.errors import ImportingError
 from aolink.numerics.arrays import BoolArray, FloatArray, Indices
 
 REACH = 24
@@ -28,6 +30,8 @@ _LEAST_LIKE = 0.5
 """Correlation below which a region is not seen in a frame."""
 _TYPICAL = 0.75
 """Rank, among the frames by how much a region shows, of the one that the others are compared with."""
+_CUT = 0.4
+"""Share of the correlation before below which the picture is another one."""
 _BETTER = 0.8
 """Share of what differs at the place before that may be left at another one."""
 
@@ -41,8 +45,11 @@ def details(images: FloatArray) -> FloatArray:
 
 
 def travels(frames: Iterable[FloatArray]) -> FloatArray:
-    """How far the picture as a whole has gone since the first frame, x and y, pixels, (K, 2); zero up to one pixel."""
-    gone: list[FloatArray] = []
+    """How far the picture as a whole has gone since the first frame, x and y, pixels, (K, 2); zero up to one pixel.
+
+    Raises `ImportingError` where a film is cut: it shows another thing from some frame on.
+    """
+    gone, likes = list[FloatArray](), list[float]()
     base, key, window, by = np.zeros(2), None, np.ones((1, 1)), 1
     for frame in frames:
         if key is None:
@@ -56,6 +63,8 @@ def travels(frames: Iterable[FloatArray]) -> FloatArray:
             key, power = spectrum, float((small * window).var() * small.size)
         alike = fft.irfft2(spectrum * key.conj(), s=small.shape)
         r, c = (int(k) for k in np.unravel_index(int(alike.argmax()), alike.shape))
+        own = float((small * window).var() * small.size)
+        likes.append(float(alike.max()) / math.sqrt(max(own * power, 1e-300)))
         if alike.max() - alike[0, 0] < _SURE * power:
             r = c = 0
         near = alike[np.ix_((r + _ABOUT) % rows, (c + _ABOUT) % columns)]
@@ -63,7 +72,11 @@ def travels(frames: Iterable[FloatArray]) -> FloatArray:
         r, c = r - rows * (2 * r > rows), c - columns * (2 * c > columns)
         gone.append(base + by * (np.array([c, r]) + fine[::-1]))
         if abs(r) > _FAR * rows or abs(c) > _FAR * columns:
-            base, key, power = gone[-1], spectrum, float((small * window).var() * small.size)
+            base, key, power = gone[-1], spectrum, own
+    for k in range(1, len(likes)):
+        before = float(np.median(likes[:k]))
+        if before > _LEAST_LIKE and max(likes[k:]) < _CUT * before:
+            raise ImportingError(f"frame {k + 1} and those after it show something else: cut the film there")
     path = np.array(gone)
     return path if np.abs(path).max() > 1 else np.zeros_like(path)
 

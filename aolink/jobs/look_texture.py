@@ -291,7 +291,9 @@ def lively(
     moving = np.where(whole, moving, 0.0)
     found: list[Region] = []
     brightest = float(moving.max())
-    still = np.where(whole & (edges > _ENOUGH_EDGES * edges[whole].max()), edges**2 / (moving + 1e-3 * brightest), 0.0)
+    still = np.where(
+        whole & (edges > _ENOUGH_EDGES * edges[whole].max(initial=0.0)), edges**2 / (moving + 1e-3 * brightest), 0.0
+    )
     while len(found) < most and moving.max() > _LEAST_LIVELY * brightest:
         r, c = (int(k) for k in np.unravel_index(int(moving.argmax()), moving.shape))
         found.append(Region(c - size // 2, r - size // 2, size, size))

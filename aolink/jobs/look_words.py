@@ -8,6 +8,8 @@ from typing import Any
 from aolink.identification.vibration import Line, Part
 from aolink.jobs.look import GRADES, Looked
 
+_LEAST_HARMONIC = 0.05
+"""Share of the first vibration from which on a harmonic is spoken of."""
 _MOST_NAMED = 12
 """Aliases that are named."""
 
@@ -20,7 +22,9 @@ def paragraph(looked: Looked) -> str:
     else:
         said = [f"{grade}{f': {looked.because}' if looked.because else ''}."]
         said += [described(looked, k) for k, n in enumerate(looked.harmonics) if n == 1]
-        if harmonics := sorted({n for n in looked.harmonics if n > 1}):
+        least = _LEAST_HARMONIC * looked.found.lines[0].ellipse[0]
+        pairs = zip(looked.found.lines, looked.harmonics, strict=True)
+        if harmonics := sorted({n for line, n in pairs if n > 1 and line.ellipse[0] > least}):
             said.append(f"Its harmonics {', '.join(map(str, harmonics))} show too.")
         if looked.plain_hz and abs(looked.plain_hz - looked.found.lines[0].hz) > 0.01 * looked.plain_hz:
             what = "A plain spectrum of this film says" if looked.rows is None else "Your frame rate alone would say"

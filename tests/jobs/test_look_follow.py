@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from scipy import ndimage
 
+from aolink.errors import ImportingError
 from aolink.jobs.look_follow import followed, travels, window
 
 
@@ -18,6 +20,14 @@ def test_a_picture_that_travels_far_is_followed_to_a_fraction_of_a_pixel() -> No
     assert np.abs(travels(frames) - path).max() < 0.6
     still = [big[100:220, 250:410] + 0.02 * rng.normal(size=(120, 160)) for _ in range(5)]
     assert not travels(still).any()
+
+
+def test_a_film_that_is_cut_is_refused_with_its_frame() -> None:
+    rng = np.random.default_rng(1)
+    first, second = (ndimage.gaussian_filter(rng.normal(size=(120, 160)), 2.0) for _ in range(2))
+    with pytest.raises(ImportingError, match="frame 7"):
+        travels([first] * 6 + [second] * 9)
+    assert np.abs(travels([first] * 6 + [second] + [first] * 6)[:6]).max() < 0.1  # a flash is no cut
 
 
 def test_a_region_is_followed_where_it_is_seen() -> None:
