@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy import signal
+from scipy import interpolate, signal
 
 from aolink.errors import ExportError
 from aolink.estimation.score import Scorer
@@ -29,7 +29,9 @@ def motion(seed: int = 0, hz: tuple[float, float] = (4.0, 60.0), seconds: float 
     return np.asarray(path / path.std())
 
 
-def written(path: Path, moved: FloatArray, unit: str, *, offset: float, drift: float, begin: float) -> Path:
+def written(
+    path: Path, moved: FloatArray, unit: str, *, offset: float, drift: float, begin: float, seed: int = 0
+) -> Path:
     """A log of a motion whose first value is ``begin`` before the recording, in axes and a scale of its own."""
     middle = (EXPOSURES * 0.05 - 0.05 / 16) / 2
     t = np.arange(moved.shape[1]) / RATE - begin
@@ -37,7 +39,9 @@ def written(path: Path, moved: FloatArray, unit: str, *, offset: float, drift: f
     for _ in range({"um": 0, "rad/s": 1, "m/s^2": 2}[unit]):
         moved = np.gradient(moved, axis=1) * RATE
     values = 3.7 * AXES @ moved + 5
-    values += (1e-4 if "s^2" in unit else 0.01) * values.std() * np.random.default_rng(5).normal(size=values.shape)
+    values += (
+        (1e-4 if "s^2" in unit else 0.01) * values.std() * np.random.default_rng([5, seed]).normal(size=values.shape)
+    )
     table = np.column_stack([own, values.T])
     np.savetxt(path, table, delimiter=",", fmt="%.10g", header=f"time_s,x [{unit}],y [{unit}]", comments="")
     return path
@@ -49,7 +53,7 @@ def exposed(moved: FloatArray, begin: float, seed: int = 0, error: float = 0.1) 
     t = starts + np.tile(np.arange(16) * 0.04 / 16, EXPOSURES)
     at = np.arange(moved.shape[1]) / RATE - begin
     wrong = error * np.repeat(np.random.default_rng(seed + 100).normal(size=(2, EXPOSURES)), 16, axis=1)
-    return t, np.array([np.interp(t, at, each) for each in moved]) + wrong
+    return t, np.asarray(interpolate.make_interp_spline(at, moved, k=3, axis=1)(t)) + wrong
 
 
 @pytest.mark.slow
@@ -58,7 +62,7 @@ def test_offsets_drifts_scales_and_axes_are_found_within_their_errors(unit: str,
     off, drifts = [], []
     for seed in range(8):
         moved, begin = motion(seed), 2.0 + 0.4 * seed
-        log = written(tmp_path / "log.csv", moved, unit, offset=1234.5, drift=1e-4, begin=begin)
+        log = written(tmp_path / "log.csv", moved, unit, offset=1234.5, drift=1e-4, begin=begin, seed=seed)
         found = aligned(*exposed(moved, begin, seed), EXPOSURES, read_log(log))
         off.append((found.offset_s - 1234.5) / found.offset_sd_s)
         drifts.append((found.drift - 1e-4) / found.drift_sd)
@@ -67,7 +71,7 @@ def test_offsets_drifts_scales_and_axes_are_found_within_their_errors(unit: str,
         if unit == "um":
             np.testing.assert_allclose(found.axes, np.linalg.inv(3.7 * AXES), atol=0.01)
     for pulls in (off, drifts):
-        assert 0.2 < float(np.sqrt(np.mean(np.square(pulls)))) < (2.2 if unit == "m/s^2" else 1.6)
+        assert 0.2 < float(np.sqrt(np.mean(np.square(pulls)))) < 1.6
 
 
 @pytest.mark.slow
