@@ -33,7 +33,9 @@ from aolink.rig import load_rig, parse_rig
 from aolink.session import record
 from aolink.simulation.model import simulate
 from tests.commands import command_server, simulated_rig
+from tests.jobs.test_look import line_film
 from tests.jobs.test_look_spots import shaken
+from tests.jobs.test_witness import from_truth
 from tests.kinds import must_be
 from tests.needs import needed
 
@@ -166,6 +168,8 @@ def laboratory(tmp_path_factory: pytest.TempPathFactory) -> Path:
     np.savez(folder / "film.npz", frames=frames, rate_hz=rate)
     np.savez(folder / "wide.npz", frames=np.pad(frames, ((0, 0), (7, 7), (200, 200)), mode="edge"), rate_hz=rate)
     tifffile.imwrite(folder / "film.tif", np.stack(list(shaken().frames())))
+    np.save(folder / "line.npy", line_film())
+    from_truth(Recording(folder / "session.mcap"), folder / "gyro.csv")
     np.savetxt(folder / "psf.csv", np.full((1, 9), 1 / 9), delimiter=",")
     (folder / "log.csv").write_text("time,x,y\n0.0,0.0,0.0\n0.1,5.0,1.0\n")
     return folder
