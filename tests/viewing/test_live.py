@@ -50,6 +50,7 @@ def values(entity: dict[str, list[Any]], column: str) -> list[Any]:
     return [value for value in entity.get(column, []) if value is not None]
 
 
+@pytest.mark.slow
 def test_it_shows_what_a_saved_view_shows(recorded: tuple[Recording, Entities], tmp_path: Path) -> None:
     recording, ours = recorded
     theirs = read_rrd(save_rrd(recording, tmp_path / "saved.rrd"))
