@@ -177,6 +177,15 @@ class Refined:
         return self.value < other.value
 
 
+def turned_covariances(q: FloatArray) -> FloatArray:
+    """What makes xx, xy and yy of a covariance those along the rows of q, (3, 3)."""
+    return np.array([
+        [q[0, 0] ** 2, 2 * q[0, 0] * q[0, 1], q[0, 1] ** 2],
+        [q[0, 0] * q[1, 0], q[0, 0] * q[1, 1] + q[0, 1] * q[1, 0], q[0, 1] * q[1, 1]],
+        [q[1, 0] ** 2, 2 * q[1, 0] * q[1, 1], q[1, 1] ** 2],
+    ])  # fmt: skip
+
+
 class Vibration:
     """The likelihood of lines in a film."""
 
@@ -202,9 +211,7 @@ class Vibration:
                 q, upper = np.linalg.qr(self._root[:, r, d, None] * self.slow)
                 known = np.abs(np.diag(upper)) > 1e-9 * max(np.abs(np.diag(upper)).max(), 1e-300)
                 self._drift[r, d] = q * known
-        self._turn = [np.array([[q[0, 0] ** 2, 2 * q[0, 0] * q[0, 1], q[0, 1] ** 2],
-                                [q[0, 0] * q[1, 0], q[0, 0] * q[1, 1] + q[0, 1] * q[1, 0], q[0, 1] * q[1, 1]],
-                                [q[1, 0] ** 2, 2 * q[1, 0] * q[1, 1], q[1, 1] ** 2]]) for q in seen.axes]  # fmt: skip
+        self._turn = [turned_covariances(each) for each in seen.axes]
         self.w_constant = np.where(np.isfinite(seen.constant_sd), seen.constant_sd**-2.0, 0.0)
         # Directions in which a region is seen at all, orthonormal rows (k, 2): an edge is seen across itself.
         known = np.concatenate([seen.axes[r, self._root[:, r].any(axis=0)] for r in range(R)])

@@ -28,6 +28,7 @@ from aolink.jobs.look_rows import as_moments, assumed, bands_of, find_target, gr
 from aolink.jobs.look_scene import LEAST_MOTION, Scene
 from aolink.jobs.look_spots import Spots, find_spots
 from aolink.jobs.look_texture import MARGIN, Followed, Region, beside, lively, measured
+from aolink.limits import check_room
 from aolink.numerics.arrays import BoolArray, FloatArray
 
 FRAMES = 500
@@ -299,7 +300,9 @@ def _of_regions(
         _, still, picture = lively(_shown(film, light, count, tell, 1), size, 1, gone)
     whole = np.rint(gone).astype(np.int64)
     all_regions, around = [*regions, *([still] if still else [])], MARGIN + REACH
-    cuts = np.empty((len(all_regions), count, size + 2 * around, size + 2 * around))
+    side = size + 2 * around
+    check_room(8 * len(all_regions) * count * side**2, f"parts of {size} pixels of {count} frames", ImportingError)
+    cuts = np.empty((len(all_regions), count, side, side))
     for k, shown in enumerate(_shown(film, light, count, tell, 2)):
         for number, region in enumerate(all_regions):
             cuts[number, k] = region.cut(shown, around, whole[k])
@@ -324,7 +327,7 @@ def _of_regions(
         if travelling := any(_shown_by(line, common["exposure_s"]) > LEAST_MOTION for line in lines):
             results = relative
             doubts.append("what travels with the whole picture, as by a camera in the hand, is taken out")
-    best, seen, found = max(results, key=lambda one: _strength(*one[1:]))
+    best, seen, found = strongest = max(results, key=lambda one: _strength(*one[1:]))
     if found.lines and (quarter := best.livelier_quarter(found.lines[0].hz)):
         doubts.append("parts of this region move in different ways: the quarter that moves most is described")
         best, seen = quarter, quarter.moments
@@ -350,7 +353,7 @@ def _of_regions(
         **common, seen=seen, found=found, moved=moved if moved > max(LEAST_MOTION, _CERTAIN * sure) else 0.0,
         blur=0.0, grade=0, because="", plain_hz=_plain(seen, found), sd=math.nan, spots=None, scene=None,
         together=False, text="", picture=picture,
-        regions=(best.region, *(each.region for each, _, _ in results if each is not best)), cut=best.windows,
+        regions=(best.region, *(one[0].region for one in results if one is not strongest)), cut=best.windows,
         camera=camera, assumed=tuple(_assumed(film, settings, common, None, None, math.nan)), doubts=tuple(doubts),
     )  # fmt: skip
     return _graded(looked)

@@ -124,8 +124,7 @@ def followed(cuts: FloatArray, reach: int) -> tuple[Indices, BoolArray]:
                 at = low + np.array([c, r])
             there = at - low
             like = alike[there[1], there[0]] / np.sqrt(max(own[there[1], there[0]] * size, 1e-300))
-            whole = np.isfinite(_at(cuts[k], at, reach)).all()
-            places[k], seen[k] = at, like > _LEAST_LIKE and bool(whole)
+            places[k], seen[k] = at, like > _LEAST_LIKE and bool(np.isfinite(_at(cuts[k], at, reach)).all())
     return places, seen
 
 

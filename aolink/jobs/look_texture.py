@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import ndimage, signal
 
-from aolink.identification.vibration import PathMoments
+from aolink.identification.vibration import PathMoments, turned_covariances
 from aolink.jobs.look_follow import REACH, followed, window, windows
 from aolink.numerics.arrays import BoolArray, FloatArray, Indices
 
@@ -237,11 +237,7 @@ def beside(seen: PathMoments, rest: PathMoments) -> PathMoments | None:
     if not np.isfinite(rest.mean_variance).any(axis=(0, 1)).all():
         return None
     turn = seen.axes[0] @ rest.axes[0].T
-    squares = np.array([
-        [turn[0, 0] ** 2, 2 * turn[0, 0] * turn[0, 1], turn[0, 1] ** 2],
-        [turn[0, 0] * turn[1, 0], turn[0, 0] * turn[1, 1] + turn[0, 1] * turn[1, 0], turn[0, 1] * turn[1, 1]],
-        [turn[1, 0] ** 2, 2 * turn[1, 0] * turn[1, 1], turn[1, 1] ** 2],
-    ])  # fmt: skip
+    squares = turned_covariances(turn)
     unknown = ~np.isfinite(rest.mean_variance).all(axis=2, keepdims=True)
     variance = [np.where(np.isfinite(each), each, 0.0) for each in (rest.mean_variance, rest.spread_variance)]
     return replace(

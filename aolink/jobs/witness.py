@@ -3,8 +3,9 @@
 A log has a time and one to three columns: positions, rates (integrated once) or accelerations (twice), in any unit and
 in axes of its own. The recording's outputs are a linear map of the columns, with something slow beside it, at an offset
 between the clocks and a drift of one against the other. All offsets are tried by correlation; the best is refined
-by least squares. It is refused where one in a hundred logs of the same spectrum, their phases drawn at random, does
-as well at the best of their offsets. What is left then serves as the truth of the recording's exposures.
+by least squares. It is refused where it explains less than half of the motion, or one in a hundred logs of the same
+spectrum, their phases drawn at random, does as well at the best of their offsets. What is left then serves as the truth
+of the recording's exposures.
 """
 
 from __future__ import annotations
@@ -43,8 +44,8 @@ _AS_WELL = 9.0
 """Chi-square by which another offset may be worse that fits as well."""
 _DRIFT = 2e-4
 """Standard deviation of the drift of two clocks."""
-_ONE_FREQUENCY = 0.5
-"""Share of the motion that must be explained where a log of the same spectrum does as well: of one frequency."""
+_LEAST_EXPLAINED = 0.5
+"""Share of the motion that a witness of it explains."""
 _STEPS = 12
 
 
@@ -211,13 +212,19 @@ def aligned(
     # As many degrees of freedom as exposures: an estimator's errors last one.
     worse = exposures * len(p) * np.log((1 - shares) / (1 - min(top, 1 - 1e-9)))
     peaks = np.flatnonzero((shares >= np.roll(shares, 1)) & (shares >= np.roll(shares, -1)) & (worse < _AS_WELL))
-    if max(others) >= top and (top < _ONE_FREQUENCY or len(peaks) < 2):
+    # Of a motion of one frequency a random log of the same spectrum does as well, and so do other offsets.
+    if max(others) >= top and len(peaks) < 2:
         raise ExportError(
             f"{log.name} does not show the motion of this recording: at the best offset it explains {top:.0%}, and one"
             " in a hundred random logs does as well"
         )
     also = -coarse.grid[peaks[peaks != best]]
     found = _refined(replace(log, columns=columns), t, p, count, float(coarse.grid[best]), exposures)
+    if found.explained < _LEAST_EXPLAINED:
+        raise ExportError(
+            f"{log.name} explains {found.explained:.0%} of the motion of this recording, and {_LEAST_EXPLAINED:.0%} are"
+            " needed to trust its offset: integrals of noisy rates or accelerations explain little"
+        )
     return replace(found, also_s=also + found.offset_s + float(coarse.grid[best]), clock=clock, estimator=name)
 
 

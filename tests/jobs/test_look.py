@@ -346,6 +346,17 @@ def test_what_travels_is_followed_and_a_camera_in_the_hand_is_told_from_the_targ
 
 
 @pytest.mark.slow
+def test_of_a_region_with_two_motions_the_quarter_that_moves_is_described() -> None:
+    """Half of it is still: as one motion, blur and means would contradict each other."""
+    settings = FilmSettings(rate_hz=25.0, exposure_s=0.04)
+    looked = look(array_film(scene(32.0, 1.2), "plate"), settings, "plate", at=(88, 48))
+    assert [(each.x, each.y, each.columns) for each in looked.regions] == [(68, 28, 20)]
+    assert any("quarter" in each for each in looked.doubts)
+    assert looked.lines[0].hz == pytest.approx(32.0, abs=0.02)
+    assert looked.lines[0].ellipse[0] == pytest.approx(1.2, rel=0.1)
+
+
+@pytest.mark.slow
 def test_light_that_flickers_is_said_and_taken_out() -> None:
     lamp = 1 + 0.1 * np.sin(2 * np.pi * 100.3 * np.arange(80) / 25)
     frames = np.clip(np.rint(scene(32.0, 1.2) * lamp[:, None, None] * 0.8), 0, 255).astype(np.uint8)
