@@ -339,9 +339,9 @@ def _of_regions(
         doubts.append("all of the picture moves alike: it is the camera that moves")
     elif rest is None:
         doubts.append("nothing else in the picture has edges: whether the camera moves is not seen")
-    light = signal.detrend(best.windows.mean(axis=(1, 2))).std() / abs(best.windows.mean())
-    if light > _FLICKER:
-        doubts.append(f"the light flickers by {light:.1%} rms, as lamps on mains do: that is taken out")
+    flicker = signal.detrend(best.windows.mean(axis=(1, 2))).std() / abs(best.windows.mean())
+    if flicker > _FLICKER:
+        doubts.append(f"the light flickers by {flicker:.1%} rms, as lamps on mains do: that is taken out")
     # Another alias is the same motion, less well seen.
     rate, own = common["rate_hz"], [_alias(line.hz, common["rate_hz"]) for line in found.lines]
     tops = [each.lines[0].hz for _, _, each in results if each.lines]
