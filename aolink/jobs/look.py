@@ -251,7 +251,7 @@ def _of_spots(
     moments = _path_moments(seen, scene.unit, times_s, exposure_s, rate, 0.0 if kernel else sd)
     together = n > 1 and _one_motion(list(zip(*seen, strict=True)))
     each = moments.together() if together else moments.part([0])
-    found = _found(each, MOST_LINES, lambda done, of: tell("frequencies", done, of))
+    found = vibrations(each, MOST_LINES, lambda done, of: tell("frequencies", done, of))
     if kernel is None and found.lines and found.lines[0].ellipse[1] > _ROUND * sd:
         # What swings across the motion was taken for the kernel.
         sd = math.sqrt(max(sd**2 + float(found.constant[:, [0, 2]].mean()), 0.25 * sd**2))
@@ -317,11 +317,11 @@ def _of_regions(
     travelling = bool(gone.any()) and len(every) > 1
     if travelling:  # what moves as another region does is the rest of the picture, wherever the search has put that
         rest = min(every[at is not None :], key=lambda one: _apart(one, every) * (0.5 if one.region is still else 1.0))
-    results = [(each, each.moments, _found(each.moments, 2)) for each in every if each is not rest]
+    results = [(each, each.moments, vibrations(each.moments, 2)) for each in every if each is not rest]
     doubts = list(_of_film(film))
     if travelling and rest:
         beside_rest = [(each, beside(each.moments, rest.moments)) for each, _, _ in results]
-        relative = [(each, seen, _found(seen, 2)) for each, seen in beside_rest if seen is not None]
+        relative = [(each, seen, vibrations(seen, 2)) for each, seen in beside_rest if seen is not None]
         # What is left of a travel by interpolation is no motion.
         lines = [line for _, _, found in relative for line in found.lines[:1]]
         if travelling := any(_shown_by(line, common["exposure_s"]) > LEAST_MOTION for line in lines):
@@ -333,7 +333,7 @@ def _of_regions(
         best, seen = quarter, quarter.moments
         if travelling and rest:
             seen = beside(seen, rest.moments) or seen
-        found = _found(seen, 2)
+        found = vibrations(seen, 2)
     camera = rest is not None and _moves_alike(seen, rest.moments)
     if camera:
         doubts.append("all of the picture moves alike: it is the camera that moves")
@@ -393,8 +393,8 @@ def _shown(film: Film, light: FilmLight, count: int, tell: Tell, turn: int = 0) 
         yield light.of(frame)[0]
 
 
-def _found(seen: PathMoments, most: int, tell: Callable[[int, int], None] = lambda done, of: None) -> Found:
-    """The vibrations, where there is none beside those of a wandering too."""
+def vibrations(seen: PathMoments, most: int, tell: Callable[[int, int], None] = lambda done, of: None) -> Found:
+    """The vibrations; where the slow part of a wandering hides or is taken for one, those that are faster."""
     found = find(seen, most, tell)
     if found.lines and not _wanders(seen, found):
         return found

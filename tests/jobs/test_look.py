@@ -16,8 +16,9 @@ from scipy import ndimage
 
 from aolink.errors import ImportingError
 from aolink.films.film import array_film
+from aolink.identification.vibration import PathMoments
 from aolink.importing.frames import FilmSettings
-from aolink.jobs.look import GRADES, Looked, look
+from aolink.jobs.look import GRADES, Looked, look, vibrations
 from aolink.jobs.look_page import write_page
 from aolink.jobs.look_words import as_json, paragraph
 from aolink.recording.reader import Recording
@@ -343,6 +344,33 @@ def test_what_travels_is_followed_and_a_camera_in_the_hand_is_told_from_the_targ
     still = look(array_film(by_hand(32.0, 0.0), "hand"), settings, "hand")
     assert still.camera
     assert still.grade == 2
+
+
+def wandering(seed: int, amplitude: float, count: int = 150, fine: int = 16) -> PathMoments:
+    """A wandering of 20 pixels and a vibration of 32 Hz, 25 frames/s exposed throughout."""
+    rng = np.random.default_rng(seed)
+    walk = ndimage.gaussian_filter1d(rng.normal(size=(count * fine, 2)).cumsum(axis=0), 3.0 * fine, axis=0)
+    walk = 20 * (walk - walk[0]) / np.abs(walk - walk[0]).max()
+    t = (np.arange(count * fine) + 0.5) / fine / 25
+    path = walk + amplitude * np.sin(2 * np.pi * 32 * t)[:, None] * (0.94, 0.34)
+    inside = path.reshape(count, fine, 2)
+    mean = inside.mean(axis=1)
+    C = np.einsum("kfi,kfj->kij", inside - mean[:, None], inside - mean[:, None]) / fine
+    spread = np.stack([C[:, 0, 0], C[:, 0, 1], C[:, 1, 1]], axis=1)
+    return PathMoments(
+        times_s=(np.arange(count) + 0.5) / 25, exposure_s=0.04, rate_hz=25.0,
+        mean=(mean + 0.01 * rng.normal(size=mean.shape))[:, None], mean_variance=np.full((count, 1, 2), 1e-4),
+        spread=(spread + 0.02 * rng.normal(size=spread.shape))[:, None], spread_variance=np.full((count, 1, 3), 4e-4),
+        constant_sd=np.ones((1, 3)), axes=np.eye(2)[None],
+    )  # fmt: skip
+
+
+@pytest.mark.slow
+def test_a_vibration_beside_a_wandering_is_found_and_none_in_that_alone() -> None:
+    for seed in range(100, 108):
+        found = vibrations(wandering(seed, 1.2), 2)
+        assert any(abs(part.best - 32) < 0.1 for part in found.sets[0]), seed
+        assert not vibrations(wandering(seed, 0.0), 2).lines
 
 
 @pytest.mark.slow
