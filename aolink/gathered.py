@@ -20,7 +20,7 @@ from aolink.numerics.chi_square import chi_square_quantile
 from aolink.optics.camera import to_density
 from aolink.optics.frame import spot_windows
 from aolink.optics.scene import SceneSensor
-from aolink.optics.sensor import BaseSensor, Sensor
+from aolink.optics.sensor import BaseSensor, RegionSensor, Sensor
 from aolink.recording import topics
 from aolink.rig import Rig
 from aolink.series import Step
@@ -100,6 +100,9 @@ class Blur:
         """The measured slope: what other software measured, or the density's mean, missing pixels counting as dark."""
         if self.exposure.slopes is not None:
             return float(self.exposure.slopes[self.output])
+        if isinstance(self.sensor, RegionSensor):
+            seen = self.sensor.texture.seen(to_density(self.sensor, self.exposure.pixels))
+            return math.nan if seen is None else float(seen.mean @ self.sensor.texture.axes[:, self.output])
         return float(np.nansum(self.line.centres * self.measured) * self.line.pixel_width)
 
     @property
@@ -110,6 +113,9 @@ class Blur:
     def predicted(self, name: str) -> FloatArray:
         """Density in each pixel that a path predicts, as `exposure_density` gives it, (pixels,)."""
         line = self.line
+        if isinstance(self.sensor, RegionSensor):
+            at_rest, places = self.sensor.at_rest.sum(axis=self.output), line.centres - self.paths[name][:, None]
+            return np.asarray(np.interp(places, line.centres, at_rest).mean(axis=0) * line.pixel_width)
         u = (line.edges - self.paths[name][:, None]) / math.sqrt(2 * line.kernel.variance)
         share = np.diff(np.interp(u, _ERF_AT, _ERF).mean(axis=0)) / (2 * line.pixel_width)
         return np.asarray(self.sensor.light_of(self.output) * share)

@@ -17,7 +17,7 @@ from aolink.numerics.rms import rms
 from aolink.optics.camera import to_density
 from aolink.optics.centroid import centre_of_gravity
 from aolink.optics.frame import spot_windows
-from aolink.optics.sensor import BaseSensor
+from aolink.optics.sensor import BaseSensor, RegionSensor
 from aolink.rig import Rig
 
 # A pixel counts if its density exceeds this many sd of noise: pixels far from the spot only add noise.
@@ -142,7 +142,7 @@ def measure_interaction(
 
 def check_spots(rig: Rig) -> None:
     """Raise CalibrationError for a sensor that sees no slopes in two directions."""
-    if rig.sensor.directions == 1:
+    if rig.sensor.directions == 1 or isinstance(rig.sensor, RegionSensor):
         raise CalibrationError("an interaction matrix needs a sensor of kind 'spots'")
 
 

@@ -48,7 +48,7 @@ def look(
     file to go on with, and a recording with estimates.
     """
     from aolink.importing.recording import import_film
-    from aolink.jobs.look import ESTIMATOR
+    from aolink.jobs.look import ESTIMATORS
     from aolink.jobs.look import look as look_at
     from aolink.jobs.look_page import write_page, write_path, write_tone
     from aolink.jobs.look_words import as_json as numbers
@@ -81,17 +81,17 @@ def look(
     if not as_json:
         stdout.print(paragraph(looked), markup=False)
     commands, written = [], {"page": page, "path": None, "tone": None, "rig": None, "recording": None}
-    if looked.text:
+    if looked.recorded is not None:
         rig = parse_rig(looked.text)
         with writing(rig_file, overwrite=overwrite, sources=[source], error=ImportingError) as partial:
             partial.write_text(looked.text, encoding="utf-8")
         with TemporaryDirectory(dir=folder, prefix=".look-") as temporary:
             imported = Path(temporary) / recording.name
-            assert looked.scene is not None
-            import_film(looked.scene.cut(looked.sd), rig, looked.scene.settings, imported, sources=[source])
+            import_film(looked.recorded[0], rig, looked.recorded[1], imported, sources=[source])
             if looked.moves:
+                of = ESTIMATORS[looked.spots is not None]
                 with progress("estimate", looked.frames) as tell:
-                    write_reestimated(Recording(imported), [ESTIMATOR], recording, overwrite=overwrite, progress=tell)
+                    write_reestimated(Recording(imported), [of], recording, overwrite=overwrite, progress=tell)
             else:
                 imported.replace(recording)
         written |= {"rig": rig_file, "recording": recording}

@@ -12,6 +12,7 @@ import numpy as np
 
 from aolink.numerics.arrays import FloatArray
 from aolink.optics.camera import effective_noise_density, shot_gain
+from aolink.optics.sensor import RegionSensor
 from aolink.rig import Rig
 
 MOST_MODES = 3
@@ -46,7 +47,35 @@ def broken_assumptions(rig: Rig) -> Iterator[tuple[str, str]]:
 
     The spot's motion is judged for plants that move one spot each, along one axis or both.
     """
-    sensor, plant, timing = rig.sensor, rig.plant, rig.timing
+    plant, timing = rig.plant, rig.timing
+    if not isinstance(rig.sensor, RegionSensor):
+        yield from _of_spots(rig)
+    if plant.n_outputs > _MOST_OUTPUTS:
+        return
+    count, swings = _modes(rig)
+    fastest = float(swings.max(initial=0.0))
+    if count > MOST_MODES:
+        yield (
+            "plant.A",
+            f"{count} eigenmodes of the plant move the spot along one axis, estimators were judged with up to"
+            f" {MOST_MODES}: with more, intervals of profile may be too narrow; compare them with those of moments",
+        )
+    if fastest > MOST_SWINGS + _ROUNDING:
+        yield (
+            "timing.exposure_steps",
+            f"the plant's fastest eigenmode swings {fastest:.3g} times in an exposure, estimators were judged up to"
+            f" {MOST_SWINGS:g}: beyond, the blur shows its amplitude and not its phase; shorten the exposure",
+        )
+    if fastest * STEPS_IN_SWING > timing.exposure_steps * (1 + _ROUNDING):
+        yield (
+            "timing.fast_step_s",
+            f"the plant's fastest eigenmode has {timing.exposure_steps / fastest:.2g} fast steps in one swing,"
+            f" estimators were judged from {STEPS_IN_SWING} on: the model has no motion inside a step; make it shorter",
+        )
+
+
+def _of_spots(rig: Rig) -> Iterator[tuple[str, str]]:
+    sensor, plant = rig.sensor, rig.plant
     kernel = math.sqrt(2 * float(np.linalg.eigvalsh(sensor.kernel.covariance)[0])) / sensor.pixel_width
     if kernel < LEAST_KERNEL_PIXELS - _ROUNDING:
         yield (
@@ -75,26 +104,6 @@ def broken_assumptions(rig: Rig) -> Iterator[tuple[str, str]]:
             "plant.process_noise",
             f"the plant moves the spot by {widths:.3g} sds of the kernel (sd), estimators were judged up to"
             f" {MOST_PATH_WIDTHS:g}: beyond, a blur is thin and long, and more paths explain it than they follow",
-        )
-    count, swings = _modes(rig)
-    fastest = float(swings.max(initial=0.0))
-    if count > MOST_MODES:
-        yield (
-            "plant.A",
-            f"{count} eigenmodes of the plant move the spot along one axis, estimators were judged with up to"
-            f" {MOST_MODES}: with more, intervals of profile may be too narrow; compare them with those of moments",
-        )
-    if fastest > MOST_SWINGS + _ROUNDING:
-        yield (
-            "timing.exposure_steps",
-            f"the plant's fastest eigenmode swings {fastest:.3g} times in an exposure, estimators were judged up to"
-            f" {MOST_SWINGS:g}: beyond, the blur shows its amplitude and not its phase; shorten the exposure",
-        )
-    if fastest * STEPS_IN_SWING > timing.exposure_steps * (1 + _ROUNDING):
-        yield (
-            "timing.fast_step_s",
-            f"the plant's fastest eigenmode has {timing.exposure_steps / fastest:.2g} fast steps in one swing,"
-            f" estimators were judged from {STEPS_IN_SWING} on: the model has no motion inside a step; make it shorter",
         )
 
 

@@ -14,6 +14,7 @@ from aolink.estimation.frames.frame_data import Profile, SpotWindows
 from aolink.estimation.kalman.filter import BlurFilter, Filter, PathFilter
 from aolink.estimation.kalman.filterpy_engine import FilterpyMoments
 from aolink.estimation.kalman.path_moments import Observation, PathMoments
+from aolink.estimation.kalman.region_moments import RegionMoments
 from aolink.estimation.kalman.steady_gain import steady_gain
 from aolink.estimation.model.exposure_model import exposure_model
 from aolink.estimation.moments.joint_moments import JointMoments
@@ -21,7 +22,7 @@ from aolink.estimation.moments.windowed import WindowedMoments
 from aolink.estimation.options import Options
 from aolink.estimation.pixels.joint_pixels import JointProfile
 from aolink.numerics.arrays import FloatArray
-from aolink.optics.sensor import SpotSensor
+from aolink.optics.sensor import RegionSensor, SpotSensor
 from aolink.plant.alike import alike_systems
 from aolink.rig import Rig
 
@@ -39,6 +40,8 @@ def open_loop(rig: Rig, options: Options) -> Filter:
 
 def paper(rig: Rig, options: Options, *orders: int) -> Filter:
     """The filters of Mishra & Wen with these moments."""
+    if isinstance(rig.sensor, RegionSensor):
+        return _of_region(rig, options, *orders)
     gain = _steady_gain(rig) if orders == (1,) else None
     if options.engine == "filterpy":
         theirs = FilterpyMoments(rig.plant, orders, gain)
@@ -55,6 +58,13 @@ def paper(rig: Rig, options: Options, *orders: int) -> Filter:
     return _blur_filter(rig, options, observation)
 
 
+def _of_region(rig: Rig, options: Options, *orders: int, models_noise: bool = False) -> Filter:
+    assert isinstance(rig.sensor, RegionSensor)
+    if 1 not in orders or options.engine != "aolink":
+        raise EstimatorError("a region's path is estimated by o1, o3 and moments with aolink's own engine: use moments")
+    return _blur_filter(rig, options, RegionMoments(rig.sensor.texture, orders, models_noise=models_noise))
+
+
 @lru_cache(maxsize=4)
 def _steady_gain(rig: Rig) -> FloatArray | None:
     """The steady-state gain of o1 by the noise in the rig file, one for all axes or one each; None if there is none."""
@@ -69,6 +79,8 @@ def _steady_gain(rig: Rig) -> FloatArray | None:
 
 
 def moments(rig: Rig, options: Options) -> Filter:
+    if isinstance(rig.sensor, RegionSensor):
+        return _of_region(rig, options, 1, 2, models_noise=True)
     if rig.plant.n_outputs == 1:
         _warm_up_line(rig)
     if alike_systems(rig.plant) is not None:

@@ -20,6 +20,7 @@ import numpy as np
 from aolink.errors import EstimatorError
 from aolink.extensions import names_with, row_named
 from aolink.limits import check_room
+from aolink.optics.sensor import RegionSensor
 from aolink.plant.alike import MANY_STATES, alike_systems
 from aolink.rig import Rig
 
@@ -134,6 +135,8 @@ def _many_spots_refusal(rig: Rig, name: str = "moments") -> str | None:
 
 def _pixels_refusal(rig: Rig) -> str | None:
     """Why profile cannot work on a rig; it has another form for many equal systems."""
+    if isinstance(rig.sensor, RegionSensor):
+        return f"profile takes the kernel of a spot, {rig.name} sees a region: use moments"
     if alike_systems(rig.plant) is not None:
         return None
     if rig.plant.n_states > MANY_STATES:

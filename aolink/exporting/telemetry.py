@@ -17,13 +17,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from aolink.errors import ExportError
 from aolink.estimation.frames.measure import profiles_of
 from aolink.exporting.arrays import ESTIMATE, EXPOSURE, TRUTH, Variable, arrays
 from aolink.exporting.common import Progress, check_frame, facts, needed
 from aolink.numerics.arrays import FloatArray
 from aolink.optics.camera import to_density
 from aolink.optics.centroid import centre_of_gravity
-from aolink.optics.sensor import BaseSensor
+from aolink.optics.sensor import BaseSensor, RegionSensor
 from aolink.series import Series
 
 _IN_IMAGES = ("pixels", "inputs")
@@ -105,6 +106,8 @@ def _system(aot: Any, series: Series, found: Mapping[str, Variable]) -> Any:
 
 def _centres(sensor: BaseSensor, pixels: NDArray[np.uint16], mask: NDArray[np.bool_]) -> FloatArray:
     """Centres of gravity of frames, slope units, (frames, outputs); NaN where a window is dark or has lost a pixel."""
+    if isinstance(sensor, RegionSensor):
+        raise ExportError("an AOT file has the centres of spots, and this recording's sensor sees a region")
     line = sensor.profile
     each = [profiles_of(sensor, frame, whole) for frame, whole in zip(pixels, mask, strict=True)]
     counts, good = np.array([e.counts for e in each]), np.array([e.mask for e in each])

@@ -23,7 +23,7 @@ from aolink.exposure import Exposure
 from aolink.numerics.arrays import BoolArray, FloatArray
 from aolink.optics.camera import effective_noise_density, shot_gain
 from aolink.optics.kernel import pixel_masses
-from aolink.optics.sensor import Sensor
+from aolink.optics.sensor import RegionSensor, Sensor
 from aolink.plant.lifting import input_response, output_rows
 from aolink.rig import Rig
 
@@ -150,6 +150,10 @@ def readings(rig: Rig, exposures: Sequence[Exposure], *, plant_known: bool = Tru
         )
     if any(each.slopes is not None for each in exposures):
         raise IdentificationError("the recording holds slopes and no pixels: identification needs the blur")
+    if isinstance(rig.sensor, RegionSensor):
+        raise IdentificationError(
+            f"{rig.name} sees a region, and this identifies by spots: `aolink look FILM` takes both"
+        )
     if rig.plant.delays:
         raise IdentificationError(
             "one plant moves several spots that the camera exposes row by row (sensor.row_time_s): identify it from a"

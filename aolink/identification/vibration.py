@@ -24,6 +24,7 @@ import numpy as np
 from scipy import optimize, special, stats
 
 from aolink.numerics.arrays import ComplexArray, FloatArray
+from aolink.optics.texture import turned_covariances
 
 SLOWEST = 50
 """Frames in a cycle of the slowest vibration that is told from a drift."""
@@ -175,15 +176,6 @@ class Refined:
 
     def __lt__(self, other: Refined) -> bool:
         return self.value < other.value
-
-
-def turned_covariances(q: FloatArray) -> FloatArray:
-    """What makes xx, xy and yy of a covariance those along the rows of q, (3, 3)."""
-    return np.array([
-        [q[0, 0] ** 2, 2 * q[0, 0] * q[0, 1], q[0, 1] ** 2],
-        [q[0, 0] * q[1, 0], q[0, 0] * q[1, 1] + q[0, 1] * q[1, 0], q[0, 1] * q[1, 1]],
-        [q[1, 0] ** 2, 2 * q[1, 0] * q[1, 1], q[1, 1] ** 2],
-    ])  # fmt: skip
 
 
 class Vibration:

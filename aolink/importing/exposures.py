@@ -35,6 +35,7 @@ from aolink.importing.frames import (
 from aolink.numerics.arrays import BoolArray, FloatArray
 from aolink.optics.camera import to_density
 from aolink.optics.centroid import weighted_centroid
+from aolink.optics.sensor import RegionSensor
 from aolink.rig import Rig
 from aolink.series import Series, in_memory
 from aolink.wire.messages_pb2 import Applied
@@ -71,16 +72,20 @@ def imported(film: Film, rig: Rig, settings: FilmSettings, account: FilmAccount)
         raise ImportingError(f"--film scale={settings.scale:g} must be above 0 for pictures; there is --film invert")
     light = FilmLight(film, settings)
     cut = _windows(film, rig, settings.places)
-    defects = find_defects(film, light, math.sqrt(rig.sensor.kernel.variance) / rig.sensor.pixel_width)
+    of_spots = not isinstance(rig.sensor, RegionSensor)
+    sd = math.sqrt(rig.sensor.kernel.variance) / rig.sensor.pixel_width
+    defects = find_defects(film, light, sd) if of_spots else np.zeros(film.shape, np.bool_)
     if defects.any():
         account.notes += (defects_note(defects, of_rig=not settings.places),)
         light = FilmLight(film, settings, defects)
     offset = rig.sensor.black_level if settings.invert or settings.subtract_median else 0.0
-    scale = settings.scale or default_scale(film, rig)
+    scale = settings.scale or default_scale(film, rig.sensor.full_scale)
     inputs = _Inputs(film, rig, settings, times)
     account.notes += inputs.notes
     groups = grouped(film, settings.frames_per_exposure, times.periods, lambda frame: cut(*light.of(frame)))
-    shine = _brightness([_spot_light(offset + scale * group.mean, ~group.bad, rig) for group in groups])
+    shine = np.ones(film.count)
+    if of_spots:
+        shine = _brightness([_spot_light(offset + scale * group.mean, ~group.bad, rig) for group in groups])
     if len(shine) and (change := change_of(shine)):
         shown = f"from {shine[0]:.2f} to {shine[-1]:.2f} of the rig file's"
         account.notes += (
@@ -88,7 +93,7 @@ def imported(film: Film, rig: Rig, settings: FilmSettings, account: FilmAccount)
         )
     black = rig.sensor.black_level
     groups = grouped(film, settings.frames_per_exposure, times.periods, lambda frame: cut(*light.of(frame)))
-    for group, bright in zip(groups, shine.tolist(), strict=True):
+    for group, bright in zip(groups, shine.tolist(), strict=of_spots):
         mean = group.mean
         if settings.scale is None and film.dtype.kind == "f" and mean.max() > 1.0:
             what = f"floating-point values up to {mean.max():.6g}, where 1.0 would be full scale"

@@ -267,11 +267,11 @@ def counts_of(
     return np.clip(np.nan_to_num(whole), 0, rig.sensor.full_scale).astype(np.uint16), usable & ~outside
 
 
-def default_scale(film: Film, rig: Rig) -> float:
+def default_scale(film: Film, full_scale: int) -> float:
     """Counts for a pixel value of one: full scale becomes full scale, but numbers of 16 bits stay as they are."""
     if film.dtype.kind in "iu":
-        return 1.0 if film.dtype.itemsize > 1 else (rig.sensor.full_scale + 1) / (film.full_scale + 1)
-    return float(rig.sensor.full_scale)
+        return 1.0 if film.dtype.itemsize > 1 else (full_scale + 1) / (film.full_scale + 1)
+    return float(full_scale)
 
 
 @dataclass(frozen=True, eq=False)

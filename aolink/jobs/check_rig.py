@@ -7,6 +7,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import chain
 from typing import Literal, get_args
 
 import numpy as np
@@ -18,7 +19,7 @@ from aolink.estimation.assumptions import broken_assumptions
 from aolink.estimation.frames.moments import least_significance, significance_scale, spot_significance
 from aolink.numerics.arrays import FloatArray
 from aolink.optics.kernel import exposure_density
-from aolink.optics.sensor import Sensor
+from aolink.optics.sensor import RegionSensor, Sensor
 from aolink.plant.check import nominal_path
 from aolink.plant.lifting import lift
 from aolink.plant.observability import observability
@@ -59,8 +60,9 @@ def check_rig(rig: Rig) -> list[Finding]:
     try:
         with np.errstate(all="ignore"):
             path, sd = nominal_path(_different_copies(rig))
+            of_spots = () if isinstance(rig.sensor, RegionSensor) else (_check_sensor(rig), _check_signal(rig, path))
             findings = [
-                *_check_rows(rig), *_check_sensor(rig), *_check_signal(rig, path), *_check_motion(rig, path),
+                *_check_rows(rig), *chain(*of_spots), *_check_motion(rig, path),
                 *_check_field(rig, path, sd), *_check_mirror(rig), *_check_observability(rig),
                 *(_warning(*each) for each in broken_assumptions(rig)),
             ]  # fmt: skip

@@ -25,16 +25,17 @@ from aolink.identification.vibration import MOST_LINES, SLOWEST, Found, Line, Pa
 from aolink.importing.frames import FilmLight, FilmSettings, film_times, nonlinear_note
 from aolink.jobs.look_follow import REACH, travels
 from aolink.jobs.look_rows import as_moments, assumed, bands_of, find_target, grade_of
-from aolink.jobs.look_scene import LEAST_MOTION, Scene
+from aolink.jobs.look_scene import LEAST_MOTION, FastSteps, Scene, first_of, region_text
 from aolink.jobs.look_spots import Spots, find_spots
-from aolink.jobs.look_texture import MARGIN, Followed, Region, beside, lively, measured
+from aolink.jobs.look_texture import Followed, Region, beside, lively, measured
 from aolink.limits import check_room
 from aolink.numerics.arrays import BoolArray, FloatArray
+from aolink.optics.texture import MARGIN, turned_covariances
 
 FRAMES = 500
 """Frames that are looked at, from the first on."""
-ESTIMATOR = "profile"
-"""The estimator of the paths of spots."""
+ESTIMATORS = {True: "profile", False: "moments"}
+"""The estimator of the paths of spots, and that of a region's."""
 _CERTAIN = 2.0
 """Motion that chance does not show, in standard deviations."""
 _KERNEL_KNOWN = 0.25
@@ -107,8 +108,6 @@ class Looked:
     scene: Scene | None
     together: bool
     """Whether several spots have one motion in common."""
-    text: str
-    """The rig file of spots; empty for a region."""
     regions: tuple[Region, ...]
     picture: FloatArray
     """Mean of the frames, (rows, columns)."""
@@ -120,6 +119,10 @@ class Looked:
     """What was assumed, and what follows where it is wrong."""
     doubts: tuple[str, ...]
     """What else to know."""
+    text: str = ""
+    """The rig file; empty where there is none."""
+    recorded: tuple[Film, FilmSettings] | None = None
+    """What makes its recording."""
     rows: BandsFound | None = None
     """Of a target in a film that was exposed row by row."""
 
@@ -227,7 +230,7 @@ def look(
             return by_rows
     if at is None and (spots := _spots(film, settings, count, tell)) is not None:
         return _of_spots(film, settings, name, spots, kernel, starts + exposure_s / 2, common, tell)
-    return _of_regions(film, settings, starts + exposure_s / 2, common, at, size, tell)
+    return _of_regions(film, settings, name, starts + exposure_s / 2, common, at, size, tell)
 
 
 def _spots(film: Film, settings: FilmSettings, count: int, tell: Tell) -> Spots | None:
@@ -259,7 +262,7 @@ def _of_spots(
     blurs = np.nan_to_num(np.median(each.spread[:, 0, [0, 2]], axis=0)) - found.constant[0, [0, 2]]
     spread = math.sqrt(max(float(blurs.sum()), 0.0))
     walks = () if found.lines else tuple(_wandering([one[d] for one in seen], scene) for d in (0, 1))
-    text = scene.text(sd, _models(found, scene, each) if found.lines else walks, together=together)
+    text = scene.text(sd, _models(found, scene.unit, each) if found.lines else walks, together=together)
     doubts = [*_of_film(film), *_doubts(spots)]
     if not together and n > 1:
         doubts.append("the spots move on their own: the first, brightest one is described")
@@ -267,13 +270,14 @@ def _of_spots(
         **common, seen=each, found=found, moved=moved if moved > max(LEAST_MOTION, _CERTAIN * sure) else 0.0,
         blur=spread, grade=0, because="", plain_hz=_plain(each, found), sd=sd, spots=spots, scene=scene,
         together=together, text=text, regions=(), picture=spots.mean, cut=spots.light[:, 0], camera=False,
+        recorded=(scene.cut(sd), scene.settings),
         assumed=tuple(_assumed(film, settings, common, spots, kernel, sd)), doubts=tuple(doubts),
     )  # fmt: skip
     return _graded(looked)
 
 
 def _of_regions(
-    film: Film, settings: FilmSettings, times_s: FloatArray, common: Common,
+    film: Film, settings: FilmSettings, name: str, times_s: FloatArray, common: Common,
     at: tuple[float, float] | None, size: int, tell: Tell,
 ) -> Looked:  # fmt: skip
     """What moves in up to four regions of a picture of anything."""
@@ -352,11 +356,26 @@ def _of_regions(
     looked = Looked(
         **common, seen=seen, found=found, moved=moved if moved > max(LEAST_MOTION, _CERTAIN * sure) else 0.0,
         blur=0.0, grade=0, because="", plain_hz=_plain(seen, found), sd=math.nan, spots=None, scene=None,
-        together=False, text="", picture=picture,
+        together=False, picture=picture,
         regions=(best.region, *(one[0].region for one in results if one is not strongest)), cut=best.windows,
         camera=camera, assumed=tuple(_assumed(film, settings, common, None, None, math.nan)), doubts=tuple(doubts),
     )  # fmt: skip
+    if found.lines and not travelling and best.reach < MARGIN - 1:
+        looked = _with_rig(looked, best, film, settings, name)
     return _graded(looked)
+
+
+def _with_rig(looked: Looked, region: Followed, film: Film, settings: FilmSettings, name: str) -> Looked:
+    """With the rig file of a region that stays in its place, and what is to be recorded."""
+    seen, found = looked.seen, looked.found
+    reference, noise = region.reference()
+    known = np.isfinite(seen.spread_variance[:, 0]).any(axis=0)
+    blur = turned_covariances(seen.axes[0].T) @ np.where(known, -found.constant[0], 0.0)
+    film, steps = first_of(film, looked.frames), FastSteps.of(looked.rate_hz, looked.exposure_s)
+    text = region_text(name, film, steps, _models(found, 1.0, seen), reference, noise, blur)
+    side, first = len(reference), region.region
+    middle = (first.x - MARGIN + (side - 1) / 2, first.y - MARGIN + (side - 1) / 2)
+    return replace(looked, text=text, recorded=(film, replace(settings, places=(middle,))))
 
 
 def _of_rows(
@@ -381,7 +400,7 @@ def _of_rows(
     return Looked(
         **common, seen=seen, found=found, moved=moved if moved > max(LEAST_MOTION, _CERTAIN * sure) else 0.0,
         blur=math.sqrt(sum(blurs)), grade=grade, because=because, plain_hz=_plain(seen, found), sd=math.nan, spots=None,
-        scene=None, together=False, text="", regions=(region,), picture=target.mean, cut=cut.images, camera=False,
+        scene=None, together=False, regions=(region,), picture=target.mean, cut=cut.images, camera=False,
         assumed=(of_film, *assumed(rows, settings.row_time_s, exposure_s), *others[1:]), doubts=tuple(_of_film(film)),
         rows=rows,
     )  # fmt: skip
@@ -496,23 +515,23 @@ def _plain(seen: PathMoments, found: Found) -> float:
     return _alias(found.lines[0].hz, seen.rate_hz)
 
 
-def _models(found: Found, scene: Scene, seen: PathMoments) -> list[ProcessSum | None]:
+def _models(found: Found, unit: float, seen: PathMoments) -> list[ProcessSum | None]:
     """The processes along x and y that estimate the path: a vibration that keeps its phase for a part of the film, with
     a damping of its own, and a drift."""
     models: list[ProcessSum | None] = []
     rest = np.nanmedian(np.where(np.isfinite(seen.mean_variance), seen.mean_variance, np.nan))
     left = float(found.residual.var() - rest)
-    drift = found.drift[:, 0] - found.drift[:, 0].mean(axis=0)
+    drift = (found.drift[:, 0] - found.drift[:, 0].mean(axis=0)) @ seen.axes[0]
     for d in range(2):
         parts = []
         for line in found.lines:
             sd = abs(line.amplitude[d]) / math.sqrt(2)
             if sd > LEAST_MOTION:
                 cycles = max(2 * math.pi * line.hz * seen.span_s / 4, 4.0)
-                parts.append(Process("resonance", (line.hz, 1 / cycles, sd / scene.unit)))
+                parts.append(Process("resonance", (line.hz, 1 / cycles, sd / unit)))
         slow = math.sqrt(max(float(drift[:, d].var()) - rest, left, 0.0))
         if slow > LEAST_MOTION:
-            parts.append(Process("ornstein-uhlenbeck", (seen.span_s / 10, slow / scene.unit)))
+            parts.append(Process("ornstein-uhlenbeck", (seen.span_s / 10, slow / unit)))
         models.append(ProcessSum(tuple(parts)) if parts else None)
     return models
 

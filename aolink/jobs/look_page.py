@@ -19,11 +19,14 @@ from aolink.files import writing
 from aolink.identification.vibration import Vibration
 from aolink.jobs.look import Looked
 from aolink.jobs.look_rows_page import draw_bands, draw_scan, rows_figures
-from aolink.jobs.look_texture import MARGIN
 from aolink.jobs.look_words import in_set, paragraph, size_of
 from aolink.numerics.arrays import FloatArray
+from aolink.optics.sensor import PIXEL
+from aolink.optics.texture import MARGIN
 from aolink.plotting.report import facts_table, html_page, picture_in_page
 from aolink.plotting.style import legend_above, new_figure, paper
+from aolink.restoration.psf import motion_psf
+from aolink.restoration.restore import restore
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -211,7 +214,7 @@ def _draw_evidence(looked: Looked, axes: Axes) -> None:
 
 
 def _played(looked: Looked) -> str:
-    """One blurred frame, and it played in slow motion inside its exposure: its sharpest like along the path."""
+    """One blurred frame, restored, and played in slow motion inside its exposure: its sharpest like along the path."""
     from PIL import Image
     from scipy import ndimage
 
@@ -231,6 +234,8 @@ def _played(looked: Looked) -> str:
     frames = [ndimage.shift(still, move[::-1], order=1, mode="nearest") for move in moves]
     edge = MARGIN if looked.regions else 0
     shown = [each[edge : each.shape[0] - edge, edge : each.shape[1] - edge] for each in (cut[number], *frames)]
+    psf = motion_psf((path[number] - path[number].mean(axis=0)).T, None, PIXEL, 1.0)
+    restored = restore(shown[0], psf).image
     low, high = float(shown[0].min()), float(max(shown[0].max(), shown[1].max()))
 
     def picture(values: FloatArray) -> Image.Image:
@@ -240,13 +245,16 @@ def _played(looked: Looked) -> str:
 
     def embedded(file: io.BytesIO, kind: str) -> str:
         data = base64.b64encode(file.getvalue()).decode()
-        return f'<img alt="" style="width: 48%" src="data:image/{kind};base64,{data}">'
+        return f'<img alt="" style="width: 32%" src="data:image/{kind};base64,{data}">'
 
-    blurred, film = io.BytesIO(), io.BytesIO()
+    blurred, sharp_one, film = io.BytesIO(), io.BytesIO(), io.BytesIO()
     picture(shown[0]).save(blurred, "PNG")
+    picture(restored).save(sharp_one, "PNG")
     first, *rest = (picture(each) for each in shown[1:])
     first.save(film, "GIF", save_all=True, append_images=rest, duration=80, loop=0)
     caption = (
-        f"Frame {number} as it was taken, and played in slow motion inside its exposure, along the path that was found."
+        f"Frame {number} as it was taken, restored with the path that was found as its blur, and played in slow motion"
+        " inside its exposure along that path."
     )
-    return f"<figure>{embedded(blurred, 'png')} {embedded(film, 'gif')}<figcaption>{caption}</figcaption></figure>"
+    shown_all = " ".join(embedded(*each) for each in ((blurred, "png"), (sharp_one, "png"), (film, "gif")))
+    return f"<figure>{shown_all}<figcaption>{caption}</figcaption></figure>"

@@ -1,14 +1,5 @@
-"""Moments of the path of a part of a picture, whatever it shows, in each exposure.
-
-To second order in the path about its mean, an exposure of a scene S that moves by p(t) is
-
-    g [S(x - m) + C : grad grad S(x - m) / 2] + b + noise,
-
-m the mean of p, C its covariance in the exposure. With a reference R in place of S that is one linear least-squares
-problem a frame, in derivatives of images that are smoothed by a Gaussian wider than the path's spread. R is the mean of
-the frames, each shifted back by its m: so C is known up to a constant, which is no more than R's own edges are wide.
-Where the grey values vary along one direction only, as at an edge, the path is known along that only.
-"""
+"""The regions of a film that move, whatever they show, and the moments of their paths in each exposure
+(`aolink.optics.texture`): the reference is the mean of the frames, each shifted back by its mean displacement."""
 
 from __future__ import annotations
 
@@ -19,14 +10,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import ndimage, signal
 
-from aolink.identification.vibration import PathMoments, turned_covariances
+from aolink.identification.vibration import PathMoments
 from aolink.jobs.look_follow import REACH, followed, window, windows
 from aolink.numerics.arrays import BoolArray, FloatArray, Indices
+from aolink.optics.texture import INSIDE, MARGIN, SMOOTH, Texture, turned_covariances
 
-SMOOTH = 1.5
-"""Standard deviation of the Gaussian that images are smoothed by, pixels."""
-MARGIN = 4
-"""Pixels about a region that derivatives and shifts need."""
 _ROUNDS = 2
 _LEAST_LIVELY = 0.03
 """Share of the most lively region's motion below which another is not looked at."""
@@ -41,8 +29,6 @@ _MIXED = 0.5
 _CERTAIN = 4.0
 _LEAST_WIDTH = 0.25
 """Least variance of an edge, pixels squared."""
-_EDGE = 0.05
-"""Information along the weaker axis, over that along the other, below which a region is an edge."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,17 +54,18 @@ def moments_of(
     Noise is what the fits leave, frame by frame.
     """
     images = ndimage.gaussian_filter(frames, (0, smooth, smooth))
-    reference = images.mean(axis=0)
-    inside = (slice(MARGIN, -MARGIN),) * 2
-    Q, edge = principal_axes(reference[inside])
+    texture = Texture(frames.mean(axis=0), smooth)
     moved = np.zeros((len(frames), 2))
     for _ in range(_ROUNDS):
-        spline = ndimage.spline_filter(reference)
-        fits = [_fit(image, spline, shift, Q, edge, smooth) for image, shift in zip(images, moved, strict=True)]
-        moved = np.array([each[0] for each in fits]) @ Q
+        fits = [texture.fit(image, shift) for image, shift in zip(images, moved, strict=True)]
+        moved = np.array([each.mean for each in fits]) @ texture.axes
         back = [ndimage.shift(image, -each[::-1], mode="nearest") for image, each in zip(images, moved, strict=True)]
-        reference = np.mean(back, axis=0)
-    mean, mean_variance, spread, spread_variance = (np.array([each[k] for each in fits])[:, None] for k in range(4))
+        texture.take(np.mean(back, axis=0))
+    names = ("mean", "mean_variance", "spread", "spread_variance")
+    mean, mean_variance, spread, spread_variance = (
+        np.array([getattr(each, n) for each in fits])[:, None] for n in names
+    )
+    reference, Q = texture.reference, texture.axes
     return PathMoments(
         times_s=times_s, exposure_s=exposure_s, rate_hz=rate_hz, mean=mean, mean_variance=mean_variance,
         spread=spread, spread_variance=spread_variance, axes=Q[None],
@@ -86,68 +73,18 @@ def moments_of(
     ), reference  # fmt: skip
 
 
-def principal_axes(image: FloatArray) -> tuple[FloatArray, bool]:
-    """The two axes of an image's gradients as rows (x, y), the stronger one first, and whether it is an edge."""
-    y, x = np.gradient(image)
-    tensor = np.array([[np.mean(x * x), np.mean(x * y)], [np.mean(x * y), np.mean(y * y)]])
-    values, vectors = np.linalg.eigh(tensor)
-    return vectors[:, ::-1].T.copy(), bool(values[0] < _EDGE * values[1])
-
-
 def _sharpness(reference: FloatArray, Q: FloatArray, smooth: float) -> FloatArray:
     """The most that the mean blur of a reference can be, uu, uv and vv, (3,): the variance of its edges, which would be
     wider otherwise. Of a Gaussian edge that is half the mean square of its first derivative over its second's."""
-    inside = (slice(MARGIN, -MARGIN),) * 2
     y, x = np.gradient(reference)
     widths = []
     for d in range(2):
         first = Q[d, 0] * x + Q[d, 1] * y
         hy, hx = np.gradient(first)
         second = Q[d, 0] * hx + Q[d, 1] * hy
-        width = float((first[inside] ** 2).mean() / max(2 * float((second[inside] ** 2).mean()), 1e-300)) - smooth**2
+        width = float((first[INSIDE] ** 2).mean() / max(2 * float((second[INSIDE] ** 2).mean()), 1e-300)) - smooth**2
         widths.append(max(width, _LEAST_WIDTH))
     return np.array([widths[0], math.sqrt(widths[0] * widths[1]), widths[1]])
-
-
-def _fit(
-    image: FloatArray, spline: FloatArray, shift: FloatArray, Q: FloatArray, edge: bool, smooth: float
-) -> tuple[FloatArray, ...]:
-    """Mean (2,), its variances, covariance (3,), its variances along the axes Q, and gain, about a shift (x, y)."""
-    about = ndimage.shift(spline, shift[::-1], mode="nearest", prefilter=False)
-    gy, gx = np.gradient(about)
-    first = [Q[d, 0] * gx + Q[d, 1] * gy for d in range(2)]
-    second = []
-    for d in range(2):
-        hy, hx = np.gradient(first[d])
-        second.append([Q[e, 0] * hx + Q[e, 1] * hy for e in range(2)])
-    columns = [about, np.ones_like(about), -first[0], second[0][0] / 2]
-    if not edge:
-        columns += [-first[1], second[0][1], second[1][1] / 2]
-    inside = (slice(MARGIN, -MARGIN),) * 2
-    A = np.stack([each[inside].ravel() for each in columns], axis=1)
-    y = image[inside].ravel()
-    scale = np.sqrt((A**2).sum(axis=0)) + 1e-300
-    pseudo = np.linalg.pinv((A / scale).T @ (A / scale)) @ (A / scale).T / scale[:, None]
-    x = pseudo @ y
-    left = (y - A @ x).reshape(about[inside].shape)
-    # Smoothing correlates the pixels' noise: P G sigma^2 G' P', and what is left is as smooth.
-    kept = ndimage.gaussian_filter(pseudo.reshape(len(pseudo), *left.shape), (0, smooth, smooth))
-    white = float((left**2).mean()) * 4 * math.pi * smooth**2
-    variance = white * (kept**2).sum(axis=(1, 2))
-    gain = x[0]
-    place = Q @ shift
-    mean, spread, mean_variance, spread_variance = place.copy(), np.zeros(3), np.full(2, np.inf), np.full(3, np.inf)
-    parts = [(0, 2, 0, 3)] + ([] if edge else [(1, 4, 2, 6)])
-    for d, k, s, j in parts:
-        step = x[k] / gain
-        mean[d] = place[d] + step
-        mean_variance[d] = variance[k] / gain**2
-        spread[s] = x[j] / gain - step**2
-        spread_variance[s] = variance[j] / gain**2
-    if not edge:
-        spread[1] = x[5] / gain - x[2] * x[4] / gain**2
-        spread_variance[1] = variance[5] / gain**2
-    return mean, mean_variance, spread, spread_variance, np.array(gain)
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,6 +118,25 @@ class Followed:
             spread_variance=spread_variance,
         )  # fmt: skip
         return cls(region, windows, known, travel, moments)
+
+    @property
+    def reach(self) -> float:
+        """How far it goes from where it is on the mean, pixels."""
+        return float(np.abs(self._places - self._places.mean(axis=0)).max())
+
+    @property
+    def _places(self) -> FloatArray:
+        """Mean place in each frame in which it is seen, x and y, pixels; as on the mean along an edge."""
+        mean, known = self.moments.mean[self.known, 0], np.isfinite(self.moments.mean_variance[self.known, 0])
+        return np.asarray(np.where(known, mean, 0.0) @ self.moments.axes[0])
+
+    def reference(self) -> tuple[FloatArray, float]:
+        """What it looks like where it is on the mean, (rows, columns), and a pixel's noise in a frame."""
+        seen, away = self.windows[self.known], self._places - self._places.mean(axis=0) - self.travel[self.known]
+        back = [ndimage.shift(each, -move[::-1], mode="nearest") for each, move in zip(seen, away, strict=True)]
+        # Immerkaer, Computer Vision and Image Understanding 64 (1996).
+        rough = ndimage.convolve(seen, np.array([[[1, -2, 1], [-2, 4, -2], [1, -2, 1]]]))
+        return np.mean(back, axis=0), float(np.abs(rough).mean() * math.sqrt(math.pi / 2) / 6)
 
     def quarter(self, number: int) -> Followed:
         """One of its quarters, along the rows."""

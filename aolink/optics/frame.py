@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from aolink.numerics.arrays import FloatArray
 from aolink.optics.kernel import exposure_density, pixel_mass, pixel_masses
 from aolink.optics.plane import exposure_density_2d
-from aolink.optics.sensor import BaseSensor, Kernel
+from aolink.optics.sensor import BaseSensor, Kernel, RegionSensor
 
 Scalar = TypeVar("Scalar", bound=np.generic)
 
@@ -33,6 +33,8 @@ def frame_density(sensor: BaseSensor, path: FloatArray) -> FloatArray:
 
     ``path`` is the positions of all spots at each fast step, slope units, (n_outputs, n_steps), in the sensor's order.
     """
+    if isinstance(sensor, RegionSensor):
+        return sensor.moved(path)
     edges = sensor.profile.edges
     if sensor.directions == 1:
         return exposure_density(sensor.kernel, edges, path)

@@ -13,10 +13,12 @@ from functools import cached_property
 from typing import Annotated, Any, Literal
 
 import numpy as np
+import scipy
 
 from aolink.errors import RigError
 from aolink.keys import Count, NotNegative, Positive, Within, array, checked, pair, read
 from aolink.numerics.arrays import BoolArray, FloatArray, Indices
+from aolink.optics.texture import Texture
 
 KERNEL_WIDTHS = {"sigma": 1.0, "sd": math.sqrt(2.0), "fwhm": 1 / (2 * math.sqrt(math.log(2.0)))}
 """How a kernel's width may be given, and the paper's sigma for one of it."""
@@ -45,6 +47,10 @@ class Kernel:
         """Covariance of the kernel on a plane, Sigma^2/2, slope units squared, (2, 2)."""
         width = self.sigma * np.eye(2) if self.matrix is None else np.array(self.matrix)
         return np.asarray(width @ width / 2)
+
+
+PIXEL = Kernel(shape="gaussian", sigma=math.sqrt(2 / 12))
+"""The blur of a square pixel of side one, as wide as a Gaussian can have it."""
 
 
 def row_starts_s(row_time_s: float | None, rows: int) -> FloatArray:
@@ -302,3 +308,35 @@ class SpotSensor(BaseSensor):
         # The density is right to second order in a pixel's width over the kernel's.
         covariance = self.kernel.covariance + np.eye(2) * half**2 / 3
         return 1 / (2 * math.pi * math.sqrt(float(np.linalg.det(covariance))))
+
+
+@dataclass(frozen=True, kw_only=True)
+class RegionSensor(SpotSensor):
+    """A square part of a camera's picture, whatever it shows, that one plant moves along x and y; the slope unit is a
+    pixel."""
+
+    kind: Literal["region"]  # type: ignore[assignment]
+    reference: tuple[tuple[NotNegative, ...], ...]
+    """Counts of the part at rest, row by row; its outer 4 pixels only show what may move in."""
+    blur: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """How much the reference is blurred itself: covariance of its path, xx, xy and yy, pixels squared."""
+    counts_per_density: Positive
+    """Counts of an intensity of one."""
+    kernel: Annotated[Kernel, read_kernel] = PIXEL
+    """Blur of the camera in restored pictures: without a table that of a square pixel."""
+
+    @cached_property
+    def at_rest(self) -> FloatArray:
+        """Densities of the reference, (rows, columns)."""
+        return (np.array(self.reference) - self.black_level) / self.counts_per_density
+
+    @cached_property
+    def texture(self) -> Texture:
+        """What moves."""
+        return Texture(self.at_rest)
+
+    def moved(self, path: FloatArray) -> FloatArray:
+        """Mean density in each pixel while the region moves along a path, x and y, (2, n_steps): (rows, columns)."""
+        spline = scipy.ndimage.spline_filter(self.at_rest)
+        frames = (scipy.ndimage.shift(spline, at[::-1], mode="nearest", prefilter=False) for at in path.T)
+        return np.asarray(sum(frames) / path.shape[1])

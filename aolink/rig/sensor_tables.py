@@ -5,9 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
+import numpy as np
+
 from aolink.errors import RigError
 from aolink.keys import Count, NotNegative, checked, read
-from aolink.optics.sensor import BaseSensor, Sensor, SpotSensor
+from aolink.optics.sensor import BaseSensor, RegionSensor, Sensor, SpotSensor
+from aolink.optics.texture import MARGIN
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,6 +33,8 @@ class CalibrationTable:
     """Kind, name and SHA-256 of each recording that was used."""
 
 
+_LEAST_SIDE, _MOST_SIDE = 2 * MARGIN + 8, 256
+"""Pixels along a region's side."""
 READ_NOISE = ("read_noise_counts", "read_noise_electrons")
 """Keys in place of ``noise_density``: standard deviation of a pixel by read-out noise, counts or electrons."""
 
@@ -42,7 +47,7 @@ def read_sensor(
 
     ``field`` and ``light`` follow from the lenslets where the rig file describes them.
     """
-    kind = checked(Literal["line", "spots"], values.get("kind"), "sensor.kind")
+    kind = checked(Literal["line", "spots", "region"], values.get("kind"), "sensor.kind")
     if field and "field" in values:
         raise RigError("sensor.field follows from [lenslets]: leave it out")
     given: dict[str, Any] = {"field": field} if field else {}
@@ -54,6 +59,13 @@ def read_sensor(
     if kind == "line":
         sensor: BaseSensor = read(Sensor, values, "sensor", **given)
         _check_line(sensor, axes * n_outputs)
+    elif kind == "region":
+        sensor = _read_region(values, given)
+        if (axes, n_outputs) != (1, 2):
+            raise RigError(
+                "sensor.kind = 'region' sees one thing move along x and y: it needs plant.axes = 1 and a plant.C of"
+                f" two rows, not {axes} with {n_outputs}"
+            )
     else:
         sensor = read(SpotSensor, values, "sensor", light=light, **given)
         _check_spots(sensor, axes, n_outputs)
@@ -72,6 +84,21 @@ def read_sensor(
         if name == "read_noise_electrons":
             density = sd / sensor.pixel_size / sensor.photoelectrons
         sensor = replace(sensor, noise_density=density**2 * sensor.pixel_size)
+    return sensor
+
+
+def _read_region(values: dict[str, Any], given: dict[str, Any]) -> RegionSensor:
+    side = len(values.get("reference") or ())
+    if given:
+        raise RigError("sensor.kind = 'region' is not behind [lenslets]: leave them out")
+    if not _LEAST_SIDE <= side <= _MOST_SIDE:
+        raise RigError(f"sensor.reference has {side} rows: a region has from {_LEAST_SIDE} to {_MOST_SIDE}")
+    window, field = (side, side), (-side / 2, side / 2)
+    sensor = read(RegionSensor, values, "sensor", grid=(1, 1), window=window, field=field, light=None)
+    if any(len(row) != side for row in sensor.reference):
+        raise RigError(f"sensor.reference has {side} rows that do not all have {side} pixels: a region is a square")
+    if not np.ptp(sensor.at_rest[MARGIN:-MARGIN, MARGIN:-MARGIN]):
+        raise RigError("sensor.reference shows nothing: its pixels are all alike")
     return sensor
 
 

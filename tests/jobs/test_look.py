@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from scipy import ndimage
 
 from aolink.errors import ImportingError
@@ -21,7 +22,9 @@ from aolink.importing.frames import FilmSettings
 from aolink.jobs.look import GRADES, Looked, look, vibrations
 from aolink.jobs.look_page import write_page
 from aolink.jobs.look_words import as_json, paragraph
+from aolink.optics.sensor import RegionSensor
 from aolink.recording.reader import Recording
+from aolink.recording.reestimate import reestimate
 from aolink.rig import load_rig, parse_rig
 from tests.jobs.test_look_spots import shaken
 from tests.needs import missing, needed
@@ -242,17 +245,64 @@ def test_without_matplotlib_there_is_an_answer_and_no_page(tmp_path: Path) -> No
     assert sorted(each.name for each in (tmp_path / "film-look").iterdir()) == ["film.mcap", "rig.toml"]
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(("summed", "opened"), [(40, 40), (40, 20), (30, 30), (20, 20), (25, 20)])
-def test_a_fork_of_32_hz_is_found_in_films_of_slow_cameras(summed: int, opened: int) -> None:
-    """Frames of a real film at 1000 frames/s averaged; 25 exposures a second see 32 Hz as 7."""
+def fork(summed: int, opened: int) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    """Frames of a real film at 1000 frames/s averaged, and themselves."""
     av = needed("av")
     with av.open(str(Path(__file__).parents[1] / "data" / "fork_32_hz.mp4")) as film:
         frames = np.stack([each.to_ndarray(format="gray")[60:140, 310:406] for each in film.decode(video=0)])
     count = len(frames) // summed
-    slow = frames[: count * summed].reshape(count, summed, *frames.shape[1:])[:, :opened].mean(axis=1)
+    frames = frames[: count * summed]
+    slow = frames.reshape(count, summed, *frames.shape[1:])[:, :opened].mean(axis=1)
+    return np.rint(slow).astype(np.uint8), frames
+
+
+@pytest.mark.slow
+def test_the_path_of_a_fork_is_that_of_its_single_frames(aolink: Run, tmp_path: Path) -> None:
+    """What `look` records of a real film of 25 frames/s, against the frames at 1000 frames/s that it was made of."""
+    slow, frames = fork(40, 40)
+    np.savez(tmp_path / "fork.npz", frames=slow, rate_hz=25.0, exposure_s=0.04)
+    done = aolink("look", "fork.npz", "-o", "fork")
+    assert done.returncode == 0, done.stderr
+    recording = Recording(tmp_path / "fork" / "film.mcap")
+    sensor = recording.rig.sensor
+    assert isinstance(sensor, RegionSensor)
+    # Where the region is: where the mean of the frames is most like its reference.
+    mean, side = frames.mean(axis=0), len(sensor.at_rest)
+    places = [(y, x) for y in range(mean.shape[0] - side + 1) for x in range(mean.shape[1] - side + 1)]
+    like = [np.corrcoef(mean[y : y + side, x : x + side].ravel(), sensor.at_rest.ravel())[0, 1] for y, x in places]
+    y, x = places[int(np.argmax(like))]
+    cut = frames[:, y : y + side, x : x + side] * (256 / sensor.counts_per_density)
+    seen = [sensor.texture.seen(each) for each in cut]
+    truth = np.array([each.mean @ sensor.texture.axes for each in seen if each]).reshape(-1, 40, 2)
+    at = (np.arange(40) + 0.5) / 40 * recording.rig.timing.exposure_steps - 0.5
+    for name in ("o3", "moments"):
+        made = reestimate(recording, [name])[name]
+        steps = np.arange(made[0].path.shape[1])
+        paths = np.array([[np.interp(at, steps, row) for row in each.path] for each in made]).swapaxes(1, 2)
+        error = paths[5:] - truth[5:]
+        assert np.sqrt((error**2).mean(axis=(0, 1))).max() < 0.1
+        assert np.mean([each.nis for each in made]) == pytest.approx(5.0, abs=1.5)
+    assert truth[..., 0].std() > 0.9
+    for command in (
+        ("deblur", "fork/film.mcap", "-o", "sharp.mcap"),
+        ("view", "sharp.mcap", "-o", "sharp.rrd"),
+        ("report", "sharp.mcap", "-o", "sharp.html"),
+        ("import", "fork.npz", "--rig", "fork/rig.toml", "--at", "51.5,40.5", "-o", "again.mcap"),
+        ("estimate", "again.mcap", "-e", "o3", "-o", "estimated.mcap"),
+    ):
+        done = aolink(*command)
+        assert done.returncode == 0, done.stderr
+    restored = aolink("info", "sharp.mcap")
+    assert "83" in restored.stdout
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("summed", "opened"), [(40, 40), (40, 20), (30, 30), (20, 20), (25, 20)])
+def test_a_fork_of_32_hz_is_found_in_films_of_slow_cameras(summed: int, opened: int) -> None:
+    """25 exposures a second see 32 Hz as 7."""
+    slow, _ = fork(summed, opened)
     settings = FilmSettings(rate_hz=1000 / summed, exposure_s=opened / 1000)
-    looked = look(array_film(np.rint(slow).astype(np.uint8), "fork"), settings, "fork")
+    looked = look(array_film(slow, "fork"), settings, "fork")
     assert looked.grade < 2
     assert looked.lines[0].hz == pytest.approx(31.97, abs=0.05)
     assert looked.lines[0].ellipse[0] == pytest.approx(1.5, abs=0.15)

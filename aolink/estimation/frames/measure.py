@@ -17,11 +17,14 @@ from aolink.estimation.frames.spots import Profiles, measure_spots, moments_of_f
 from aolink.exposure import Exposure
 from aolink.numerics.arrays import BoolArray, FloatArray, Indices
 from aolink.optics.camera import is_saturated, to_density
-from aolink.optics.sensor import BaseSensor, Sensor, SpotSensor
+from aolink.optics.sensor import BaseSensor, RegionSensor, Sensor, SpotSensor
 from aolink.rig import Rig
 
 MeasuredFrame = tuple[FrameData | None, str]
 """The measurements of an exposure, or None; and a remark about unusable parts, or an empty text."""
+
+_MOST_BAD = 0.1
+"""Share of a region's pixels that may be filled in."""
 
 
 class Measurements:
@@ -98,11 +101,13 @@ def measure(rig: Rig, exposure: Exposure, needs: Needs | None) -> MeasuredFrame:
     if exposure.slopes is not None:
         return _measured_slopes(rig, exposure.frame_id, exposure.slopes, needs)
     sensor = rig.sensor
+    if exposure.pixels.shape != sensor.shape:
+        return None, f"the frame has {exposure.pixels.shape} pixels, the rig's sensor {sensor.shape}"
+    if isinstance(sensor, RegionSensor):
+        return _of_region(sensor, exposure, needs)
     if has_flaws(sensor):
         exposure = without_flaws(sensor, exposure, needs)
     pixels = exposure.pixels
-    if pixels.shape != sensor.shape:
-        return None, f"the frame has {pixels.shape} pixels, the rig's sensor {sensor.shape}"
     if isinstance(sensor, SpotSensor):
         return measure_spots(sensor, rig.plant, pixels, exposure.mask, needs, _least_significance(sensor))
     sensor = sensor.profile
@@ -124,6 +129,32 @@ def measure(rig: Rig, exposure: Exposure, needs: Needs | None) -> MeasuredFrame:
     if needs.what != "moments":
         return Profile(density=density.reshape(rows), mask=usable.reshape(rows)), remark
     return measure_moments(sensor, pixels.reshape(rows), needs.orders), ""
+
+
+def _of_region(sensor: RegionSensor, exposure: Exposure, needs: Needs) -> MeasuredFrame:
+    """Mean and covariance of a region's path along the axes of its texture, as far as it shows them."""
+    from scipy import ndimage  # loads long
+
+    density, remark = to_density(sensor, exposure.pixels), ""
+    bad = ~exposure.mask | (exposure.pixels >= sensor.full_scale)
+    if sensor.defect_mask is not None:
+        bad |= sensor.defect_mask
+    if bad.any():
+        remark = f"{int(bad.sum())} of {bad.size} pixels cannot be used"
+        if bad.mean() > _MOST_BAD:
+            return None, remark
+        near = ndimage.distance_transform_edt(bad, return_distances=False, return_indices=True)
+        density, remark = density[tuple(near)], f"{remark}: filled in from those beside them"
+    seen = sensor.texture.seen(density)
+    if seen is None:
+        return None, "the reference is not seen, or went out of its margin"
+    means, spreads = sensor.texture.known_means, sensor.texture.known_spreads
+    value = [seen.mean[: len(means)]]
+    variance = [seen.mean_variance[: len(means)]]
+    if 2 in needs.orders:
+        value.append(seen.spread[: len(spreads)] + spreads @ np.array(sensor.blur))
+        variance.append(seen.spread_variance[: len(spreads)])
+    return Measurement(value=np.concatenate(value)[None], covariance=np.diag(np.concatenate(variance))[None]), remark
 
 
 def _measured_slopes(rig: Rig, frame_id: int, slopes: FloatArray, needs: Needs) -> MeasuredFrame:
