@@ -39,6 +39,8 @@ _SHOWN = 15
 """Exposures whose path is drawn."""
 _TONE_S, _TONE_HZ, _LOUD = 2.0, 44_100, 0.7
 _AUDIBLE = (20.0, 20_000.0)
+_BAND = 1.96
+"""Standard deviations to each side of a path."""
 _LARGE = 200
 """Pixels along a side of a picture that is played."""
 
@@ -176,7 +178,11 @@ def _draw_places(looked: Looked, axes: Axes) -> None:
         path = (looked.path(fine) + (drift - drift.mean(axis=0))[:, None]) @ along
         joined = np.concatenate([path, np.full((len(path), 1), np.nan)], axis=1)
         at = np.concatenate([fine, fine[:, -1:]], axis=1)
-        axes.plot(at.ravel(), joined.ravel(), color="tab:orange", linewidth=0.8, label="path in the exposures")
+        axes.plot(at.ravel(), joined.ravel(), color="tab:orange", linewidth=0.8, label="path in the exposures, 95 %")
+        band = _BAND * looked.rest / math.sqrt(2)
+        axes.fill_between(
+            at.ravel(), joined.ravel() - band, joined.ravel() + band, color="tab:orange", alpha=0.25, linewidth=0
+        )
     last = min(len(times) - 1, _SHOWN)
     axes.set(xlabel="time, s", ylabel="place, pixels", xlim=(times[0] - looked.exposure_s, times[last]))
     legend_above(axes)
