@@ -47,6 +47,10 @@ _LIKELY = 0.8
 """Aliases with this share of the best one's gain are refined too: readings of large motion are not exact."""
 _BLIND = 0.02
 """Least low-pass of the exposure by which amplitudes of the scan are divided."""
+_LARGE = 0.5
+"""Amplitude, pixels, from which on the blur hides the target's profile, so that several amplitudes are tried."""
+_SIZES = 2.0 ** np.arange(-1, 2.25, 0.25)
+"""Those, over what the scan says."""
 _DARKEST = 0.1
 """Contrast of a band, over the usual one's, from which on it is used."""
 _FRAMES_AT_ONCE = 64
@@ -126,7 +130,8 @@ class BandFit:
         self.t = times - self.middle_s
         self.span_s = float(np.ptp(self.t)) + 1 / bands.rate_hz
         length = W + 2 * _BEYOND
-        self.q = 2 * np.pi * np.arange(1, int(length / 2) + 1) / length
+        # Below half a wave a pixel, of which pixels show one phase only where all places at rest are alike.
+        self.q = 2 * np.pi * np.arange(1, math.ceil(length / 2)) / length
         self.x = np.arange(W) - (W - 1) / 2
         self.wave = np.exp(1j * self.q[:, None] * self.x)  # (M, W)
         along = self.delays / max(float(np.abs(self.delays).max()), 1e-300)
@@ -241,6 +246,16 @@ class BandFit:
         N, y, _ = self.normal(replace(state, profile=np.zeros_like(state.profile)))
         P = len(state.profile)
         return replace(state, profile=_solved(N[-P:, -P:], y[-P:], _RIDGE))
+
+    def starts(self, state: State, a: complex, hz: float) -> list[State]:
+        """A state with another line, from where its minima are searched: a wide profile that moves little and a
+        narrow one that moves far are two of them."""
+        if abs(a) < _LARGE:
+            return [replace(state, tones=(*state.tones, (a, hz)))]
+        tried = [self.profiled(replace(state, tones=(*state.tones, (a * size, hz)))) for size in _SIZES]
+        left = np.array([math.inf, *map(self.misfit, tried), math.inf])
+        lowest = np.flatnonzero((left[1:-1] < left[:-2]) & (left[1:-1] < left[2:]))
+        return [tried[k] for k in lowest[np.argsort(left[1:-1][lowest])][:2]]
 
     def misfit(self, state: State) -> float:
         """Weighted sum of squares of what a state leaves."""
@@ -429,8 +444,9 @@ def _lines(
             chosen.append(hz)
             low_pass = float(np.sinc(hz * fit.of.exposure_s))
             a = complex(amplitudes[k]) / math.copysign(max(abs(low_pass), _BLIND), low_pass)
-            new, covariance = fit.refined(replace(state, tones=(*state.tones, (a, hz))))
-            tried.append((fit.misfit(new), new, covariance))
+            for start in fit.starts(state, a, hz):
+                new, covariance = fit.refined(start)
+                tried.append((fit.misfit(new), new, covariance))
         _, state, covariance = min(tried, key=lambda each: each[0])
         fit.level(state)  # lines that beat slowly blur each band in its own way
         state, covariance = fit.refined(state)

@@ -5,6 +5,7 @@ A target that goes through many rows, as a bolt's edge, tape, or a line of light
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -180,6 +181,8 @@ def grade_of(found: BandsFound, exposure_s: float, rate_hz: float) -> tuple[int,
             f"it is a multiple of {rate_hz:.4g} Hz, and a target that at rest is bent so, and not straight or a"
             " parabola, looks the same"
         )
+    if any(is_shared(one - other, found, rate_hz) for (_, one), (_, other) in itertools.combinations(found.tones, 2)):
+        why.append("vibrations that are aliases of one another explain it, and so may one that is larger")
     if found.misfit > _MISFIT:
         why.append("the places move in another way too")
     return int(bool(why)), "; ".join(why)

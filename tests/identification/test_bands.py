@@ -13,12 +13,12 @@ FINE, SD, NOISE = 400, 1.6, 0.02
 
 def seen(
     *tones: tuple[float, complex], exposure: float = 1e-3, readout: float = 0.02, frames: int = 40, seed: int = 0,
-    bend: FloatArray | float = 0.0,
+    bend: FloatArray | float = 0.0, leaning: float = 2.0,
 ) -> Bands:  # fmt: skip
     """A Gaussian line in 60 bands of two rows, at 30 frames/s."""
     rng = np.random.default_rng(seed)
     delays = np.arange(120).reshape(60, 2) * readout / 120
-    rest = 15.3 + 2 * np.linspace(-1, 1, 120).reshape(60, 2) + np.reshape(bend, (-1, 1))
+    rest = 15.3 + leaning * np.linspace(-1, 1, 120).reshape(60, 2) + np.reshape(bend, (-1, 1))
     times = np.arange(frames) / 30
     inside = ((np.arange(FINE) + 0.5) / FINE - 0.5) * exposure
     images = np.empty((frames, 60, 32))
@@ -49,6 +49,22 @@ def test_a_line_is_found_in_its_alias_and_with_its_size(hz: float, a: complex, e
     assert abs(amplitude_of(found) - a) < 0.02 * abs(a)
     assert found.misfit == pytest.approx(1, abs=0.1)
     assert not found.bent
+
+
+@pytest.mark.slow
+def test_a_motion_that_hides_the_profile_is_found_with_its_size() -> None:
+    found = find(seen((467.84, 3.1j), exposure=8.04e-3, readout=0.0098, frames=90))
+    ((_, hz),) = found.tones
+    assert hz == pytest.approx(467.84, abs=0.01)
+    assert abs(amplitude_of(found) - 3.1j) < 0.06
+
+
+@pytest.mark.slow
+def test_a_target_that_meets_all_rows_of_pixels_alike_is_measured() -> None:
+    found = find(seen((431.7, 0.3), leaning=0.0))
+    ((a, hz),) = found.tones
+    assert hz == pytest.approx(431.7, abs=0.01)
+    assert abs(a) == pytest.approx(0.3, rel=0.03)
 
 
 @pytest.mark.slow
