@@ -249,8 +249,8 @@ class BandFit:
 
     def starts(self, state: State, a: complex, hz: float) -> list[State]:
         """A state with another line, from where its minima are searched: a wide profile that moves little and a
-        narrow one that moves far are two of them."""
-        if abs(a) < _LARGE:
+        narrow one that moves far are two of them. Beside a line the profile is known."""
+        if state.tones or abs(a) < _LARGE:
             return [replace(state, tones=(*state.tones, (a, hz)))]
         tried = [self.profiled(replace(state, tones=(*state.tones, (a * size, hz)))) for size in _SIZES]
         left = np.array([math.inf, *map(self.misfit, tried), math.inf])
@@ -349,12 +349,15 @@ class BandFit:
     def is_bent(self, state: State, place: FloatArray) -> bool:
         """Whether a straight line or a parabola at rest, and one line at a multiple of the frame rate, leave a pattern
         that all frames share."""
-        hz = np.array([each for _, each in state.tones])
-        if (np.abs(self.alias(hz)) < 1 / self.span_s).sum() > 1:
+        if self.has_patterns(state):
             return True
         good = self.weight > 0
         shared, noise = place.mean(axis=0)[good], place.var(axis=0)[good] / len(place)
         return float((shared**2 / noise).sum()) > float(stats.chi2.ppf(1 - CHANCE, int(good.sum())))
+
+    def has_patterns(self, state: State) -> bool:
+        """Whether more than one line is at a multiple of the frame rate."""
+        return sum(abs(float(self.alias(np.array(hz)))) < 1 / self.span_s for _, hz in state.tones) > 1
 
     def let_bend(self) -> None:
         """Take each band to be at rest where it is in the mean of the frames."""
@@ -451,4 +454,6 @@ def _lines(
         fit.level(state)  # lines that beat slowly blur each band in its own way
         state, covariance = fit.refined(state)
         place, info, sigma2 = fit.readings(state)
+        if fit.has_patterns(state):
+            break
     return state, place, info, sigma2, covariance
