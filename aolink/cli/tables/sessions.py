@@ -189,7 +189,9 @@ def demo_sentence(result: DemoResult) -> str:
         parts.append(f"the slopes left are, rms, {left}")
     if result.deblurred is not None and result.deblurred.psnr_restored:
         before, after = np.mean(result.deblurred.psnr_blurred), np.mean(result.deblurred.psnr_restored)
-        parts.append(f"the scene goes from {before:.1f} to {after:.1f} dB (PSNR)")
+        parts.append(
+            f"the scene, restored with the path of the spot beside it, goes from {before:.1f} to {after:.1f} dB (PSNR)"
+        )
     text = "; ".join(parts or ["the truth is not known here, and so no error either"])
     return f"{text[0].upper()}{text[1:]}."
 
@@ -204,5 +206,5 @@ def _path_known(errors: Mapping[str, float]) -> str:
     times = "no better"
     if not 0.95 < ratio < 1.05:
         times = f"{ratio:.1f} times better" if ratio > 1 else f"{1 / ratio:.1f} times worse"
-    told = f"the centroid ({BASELINE_ESTIMATOR}) knows the path to {centroid:#.3g} slope units"
-    return f"{told}, its blur ({best}) to {known}, {times}"
+    said = f"the centroid ({BASELINE_ESTIMATOR}) gives the path to {centroid:#.3g} slope units"
+    return f"with the rig file's plant {said}, the blur ({best}) to {known}, {times}"
