@@ -44,8 +44,8 @@ def look(
     """Say what moves in a film, at what frequency, and whether to believe it.
 
     Spots on a dark ground or anything else that has edges: the blur inside the exposures tells frequencies above the
-    frame rate from their aliases. Writes a page with pictures, the path, the motion as a tone, a rig file to go on with,
-    and a recording with estimates.
+    frame rate from their aliases. Writes a page with pictures, the path, the motion as a tone, a rig file to go on
+    with, and a recording with estimates.
     """
     from aolink.importing.recording import import_film
     from aolink.jobs.look import ESTIMATORS
