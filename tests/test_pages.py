@@ -102,8 +102,6 @@ def code_blocks(page: Path) -> Iterator[CodeBlock]:
 
 BLOCKS = [block for page in PAGES for block in code_blocks(page)]
 NO_CODE = {
-    "Copyright (c)": "a licence",
-    "MIT License": "a licence",
     "aolink sim section-vi --real-time --listen": "test_the_block_of_a_tunnel_works",
     "dask ": "tests/jobs/test_cluster.py starts them",
     "make ": "tests/tools/test_device.py makes the reference device, tests/session/test_real_time.py runs it",
