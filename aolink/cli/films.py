@@ -35,7 +35,10 @@ _FILM = {
     "topic=NAME": ("topic", "channel of an MCAP file or a bag, wavefront sensor of AO telemetry"),
     "pixels=signed": ("pixels", "or unsigned, swapped: how whole numbers were meant"),
     "colour=red": ("colour", "or green, blue, all, which is the mean of a mosaic's colours"),
-    "row_time=S": ("row_time_s", "from the start of a row's exposure to the next row's, 0 for all at once"),
+    "row_time=S": (
+        "row_time_s", "from the start of a row's exposure to the next row's, 0 for all at once; `look` finds what is"
+        " unknown",
+    ),
     "sum=8": ("frames_per_exposure", "make one exposure of this many frames, the mean of their light"),
     "background": ("subtract_median", "subtract each frame's median"),
     "scale=COUNTS": (
@@ -92,6 +95,8 @@ def film_file(options: list[str] | None, command: str) -> FilmFile:
             raise ImportingError(f"--film {name}: there is no such option, but {', '.join(forms)}")
         if bool(equals) != ("=" in forms[name]):
             raise ImportingError(f"--film {each}: write --film {forms[name]}")
+        if each == "row_time=unknown" and command == "import":
+            raise ImportingError(f"--film {each} is for `aolink look`: leave it out, or measure the row time")
         found[_FILM[forms[name]][0]] = _value(name, value) if equals else True
     return FilmFile(found, found.pop("topic", None), found.pop("colour", None), found.pop("pixels", None))
 
@@ -105,6 +110,8 @@ def _value(name: str, text: str) -> Any:
         raise ImportingError(f"--film pixels={text}: give signed, unsigned or swapped")
     if name in ("topic", "colour", "pixels"):
         return text
+    if (name, text) == ("row_time", "unknown"):
+        return math.nan
     try:
         value = quantity(text, "s") if name == "row_time" else float(text)
     except ValueError as error:

@@ -52,7 +52,7 @@ class FilmSettings:
     frames_per_exposure: int = 1
     """Number of frames of a fast film whose mean becomes one exposure."""
     row_time_s: float | None = None
-    """As `BaseSensor.row_time_s`, where the rig file does not have it or is wrong."""
+    """As `BaseSensor.row_time_s`, where the rig file does not have it or is wrong; NaN: `look` is to find it."""
     places: tuple[tuple[float, float], ...] = ()
     """Places about which the windows of the rig's spots are cut out, (x, y) in pixels; empty: the frames are those of
     the rig's sensor."""

@@ -21,10 +21,12 @@ from aolink.films.film import Film
 from aolink.identification import FEWEST, Readings, bands, kinds_of, maxima, readings, space_of
 from aolink.identification.bands import BandsFound
 from aolink.identification.models import Process, ProcessSum
+from aolink.identification.row_time import Pair
+from aolink.identification.row_time import pairs as pairs_of
 from aolink.identification.vibration import MOST_LINES, SLOWEST, Found, Line, PathMoments, find
 from aolink.importing.frames import FilmLight, FilmSettings, film_times, nonlinear_note
 from aolink.jobs.look_follow import REACH, travels
-from aolink.jobs.look_rows import as_moments, assumed, bands_of, find_target, grade_of
+from aolink.jobs.look_rows import as_moments, assumed, bands_of, find_target, grade_of, of_pairs
 from aolink.jobs.look_scene import LEAST_MOTION, FastSteps, Scene, first_of, region_text
 from aolink.jobs.look_spots import Spots, find_spots
 from aolink.jobs.look_texture import Followed, Region, beside, lively, measured
@@ -125,6 +127,8 @@ class Looked:
     """What makes its recording."""
     rows: BandsFound | None = None
     """Of a target in a film that was exposed row by row."""
+    pairs: tuple[Pair, ...] = ()
+    """Of its first line, where the row time was to be found: frequencies with their row times, the first one shown."""
 
     @property
     def lines(self) -> tuple[Line, ...]:
@@ -389,20 +393,31 @@ def _of_rows(
     target = find_target(_shown(film, light, count, tell), at, size)
     if target is None:
         return None
-    rate, exposure_s = common["rate_hz"], common["exposure_s"]
-    cut, region = bands_of(_shown(film, light, count, tell, 1), target, times_s, settings.row_time_s, exposure_s, rate)
+    rate, exposure_s, row_time_s = common["rate_hz"], common["exposure_s"], settings.row_time_s
+    pairs = list[Pair]()
+    if math.isnan(row_time_s):
+        height = film.shape[0]
+        longest = 1 / (rate * height)
+        cut, _ = bands_of(_shown(film, light, count, tell, 1), target, times_s, longest, exposure_s, rate)
+        pairs = pairs_of(bands.BandFit(cut), cut.delays_s.mean(axis=1) / longest, height)
+        if not pairs:
+            return None
+        row_time_s = pairs[0].row_time_s
+    cut, region = bands_of(_shown(film, light, count, tell, 1), target, times_s, row_time_s, exposure_s, rate)
     rows = bands.find(cut, tell=lambda done, of: tell("frequencies", done, of))
     seen, found = as_moments(rows, exposure_s, rate)
     moved, sure = _moved(seen)
     blurs = [abs(a) ** 2 / 2 * (1 - float(np.sinc(hz * exposure_s)) ** 2) for a, hz in rows.tones]
     grade, because = grade_of(rows, exposure_s, rate)
+    if pairs and rows.tones:
+        found, grade, because = of_pairs(found, pairs, grade, because)
     of_film, *others = _assumed(film, settings, common, None, None, math.nan)
     return Looked(
         **common, seen=seen, found=found, moved=moved if moved > max(LEAST_MOTION, _CERTAIN * sure) else 0.0,
         blur=math.sqrt(sum(blurs)), grade=grade, because=because, plain_hz=_plain(seen, found), sd=math.nan, spots=None,
         scene=None, together=False, regions=(region,), picture=target.mean, cut=cut.images, camera=False,
-        assumed=(of_film, *assumed(rows, settings.row_time_s, exposure_s), *others[1:]), doubts=tuple(_of_film(film)),
-        rows=rows,
+        assumed=(of_film, *assumed(rows, row_time_s, exposure_s), *others[1:]), doubts=tuple(_of_film(film)),
+        rows=rows, pairs=tuple(pairs),
     )  # fmt: skip
 
 

@@ -7,14 +7,15 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import ndimage
 
 from aolink.identification.bands import Bands, BandsFound
-from aolink.identification.vibration import Found, Line, PathMoments
+from aolink.identification.row_time import Pair
+from aolink.identification.vibration import Found, Line, Part, PathMoments
 from aolink.jobs.look_texture import Region
 from aolink.numerics.arrays import BoolArray, FloatArray
 
@@ -37,6 +38,8 @@ _LEAST_GAIN = 35.0
 """Chi-square of a vibration that is seen."""
 _MISFIT = 2.0
 """Mean square of what is left of the places, over their noise, from which on the path is not believed."""
+_MOST_NAMED = 6
+"""Pairs of a frequency and a row time that are named."""
 _STEEP = 1.0
 """Columns that a target may go aside within a band."""
 
@@ -186,6 +189,20 @@ def grade_of(found: BandsFound, exposure_s: float, rate_hz: float) -> tuple[int,
     if found.misfit > _MISFIT:
         why.append("the places move in another way too")
     return int(bool(why)), "; ".join(why)
+
+
+def of_pairs(found: Found, pairs: Sequence[Pair], grade: int, because: str) -> tuple[Found, int, str]:
+    """What was found with the first pair, its grade and why it is no better, where a row time was not known."""
+    if len(pairs) == 1:
+        return found, grade, because
+    k = min(range(len(found.lines)), key=lambda k: abs(found.lines[k].hz - pairs[0].hz))
+    best = found.sets[k][0]
+    reach = best.high - best.best
+    parts = tuple(Part(pair.hz - reach, pair.hz, pair.hz + reach) for pair in pairs[1:])
+    named = ", ".join(f"{pair.hz:.5g} Hz and {1e6 * pair.row_time_s:.4g} us" for pair in pairs[:_MOST_NAMED])
+    said = f"the row time is not known, and these go together: {named}{' and so on' * (len(pairs) > _MOST_NAMED)}"
+    sets = (*found.sets[:k], (best, *parts), *found.sets[k + 1 :])
+    return replace(found, sets=sets), max(grade, 1), "; ".join(filter(None, (said, because)))
 
 
 def assumed(found: BandsFound, row_time_s: float, exposure_s: float) -> Iterator[str]:

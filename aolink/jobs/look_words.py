@@ -98,6 +98,7 @@ def as_json(looked: Looked) -> dict[str, Any]:
         "frames": looked.frames, "moved_pixels": looked.moved, "left_pixels": looked.rest,
         "spots": None if spots is None else spots.corners.tolist(), "kernel_sd": _number(looked.sd),
         "rows": None if looked.rows is None else [looked.regions[0].y, looked.regions[0].y + looked.regions[0].rows],
+        "pairs": [[pair.hz, pair.row_time_s] for pair in looked.pairs],
         "together": looked.together, "camera": looked.camera,
         "regions": [[each.x, each.y, each.columns, each.rows] for each in looked.regions],
         "assumed": list(looked.assumed), "doubts": list(looked.doubts),

@@ -346,6 +346,22 @@ def test_rows_that_are_exposed_one_after_the_other_are_a_clock(aolink: Run, tmp_
 
 
 @pytest.mark.slow
+def test_without_the_row_time_a_frequency_goes_with_one(aolink: Run, tmp_path: Path) -> None:
+    np.save(tmp_path / "line.npy", line_film())
+    options = ("--rate", "30", "--exposure", "1ms", "--film", "row_time=unknown", "--json")
+    done = aolink("look", "line.npy", *options)
+    assert done.returncode == 0, done.stderr
+    said = json.loads(done.stdout)
+    assert said["grade"] == "believe the frequency, not the path"
+    assert "row time" in said["because"]
+    ((row_time,),) = [[each] for hz, each in said["pairs"] if abs(hz - 437) < 1]
+    assert row_time == pytest.approx(1e-4, rel=2e-3)
+    assert any(low < 437 < high for low, high in said["lines"][0]["set"])
+    refused = aolink("import", "line.npy", "-o", "line.mcap", "--rig", "no.toml", *options[:-1])
+    assert "row_time" in refused.stderr
+
+
+@pytest.mark.slow
 def test_a_tone_at_a_multiple_of_the_frame_rate_is_told_from_no_bent_line() -> None:
     settings = FilmSettings(rate_hz=30.0, exposure_s=1e-3, row_time_s=1e-4)
     looked = look(array_film(line_film(600.0), "line"), settings, "line")
