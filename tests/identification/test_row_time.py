@@ -34,7 +34,7 @@ def test_one_tone_goes_with_many_row_times_and_the_true_one_is_among_them() -> N
 @pytest.mark.slow
 def test_two_tones_leave_few() -> None:
     those = found(seen((431.7, 0.6), (709.3, 0.6j), exposure=0.6e-3, readout=0.02, frames=90))
-    assert len(those) < 6
+    assert len(those) < 10  # of some 90
     assert min(abs(pair.hz - 431.7) for pair in those) < 0.05
     assert min(abs(pair.row_time_s - 0.02 / 120) for pair in those) < 1e-3 * 0.02 / 120
 
