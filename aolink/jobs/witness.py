@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from scipy import interpolate
+from scipy import interpolate, signal
 
 from aolink.errors import ExportError
 from aolink.exposure import Exposure, Truth
@@ -100,7 +100,7 @@ class Aligned:
         """An exposure with the witness's path as its truth; its states are not known."""
         first_step, fast_step_s = self.clock
         steps = np.arange(exposure.n_steps, dtype=np.float64) + (exposure.first_step - first_step)
-        path = self.path(steps * fast_step_s)
+        path = self.path((steps + 0.5) * fast_step_s)
         states = np.full((len(path), 1), np.nan)
         return replace(exposure, truth=Truth(start_state=states, end_state=states, path=path))
 
@@ -185,7 +185,7 @@ def align(recording: Series, log: Log, estimator: str | None = None) -> Aligned:
             continue
         first = step.exposure.first_step if first is None else first
         some = np.unique(np.linspace(0, estimate.path.shape[1] - 1, _POINTS).astype(int))
-        times.append((step.exposure.first_step - first + some) * recording.rig.timing.fast_step_s)
+        times.append((step.exposure.first_step - first + some + 0.5) * recording.rig.timing.fast_step_s)
         paths.append(estimate.path[:, some])
     if len(times) < 8:
         raise ExportError(f"{recording.path} has {len(times)} estimates of {name}: 8 are needed to align a witness")
@@ -216,16 +216,31 @@ def aligned(
     if max(others) >= top and len(peaks) < 2:
         raise ExportError(
             f"{log.name} does not show the motion of this recording: at the best offset it explains {top:.0%}, and one"
-            " in a hundred random logs does as well"
+            f" in a hundred random logs does as well. {_frequencies(t, moved, log.times_s, columns)}"
         )
     also = -coarse.grid[peaks[peaks != best]]
     found = _refined(replace(log, columns=columns), t, p, count, float(coarse.grid[best]), exposures)
     if found.explained < _LEAST_EXPLAINED:
         raise ExportError(
             f"{log.name} explains {found.explained:.0%} of the motion of this recording, and {_LEAST_EXPLAINED:.0%} are"
-            " needed to trust its offset: integrals of noisy rates or accelerations explain little"
+            " needed to trust its offset: integrals of noisy rates or accelerations explain little."
+            f" {_frequencies(t, moved, log.times_s, columns)}"
         )
     return replace(found, also_s=also + found.offset_s + float(coarse.grid[best]), clock=clock, estimator=name)
+
+
+def _frequencies(t: FloatArray, moved: FloatArray, own: FloatArray, columns: FloatArray) -> str:
+    """Frequencies at which both move most, in words, as of two runs of one thing."""
+    step = float(own[1] - own[0])
+    hz = np.arange(1, 0.5 / max(step, float(np.diff(t).min())), 0.5 / t[-1])
+    recorded = sum(abs(np.exp(-2j * np.pi * hz[:, None] * t) @ row) ** 2 for row in moved)
+    said, spectrum = signal.periodogram(columns, 1 / step, "hann", nfft=4 * columns.shape[1])
+    logged = said[int(spectrum.sum(axis=0).argmax())]
+    reach = 1 / t[-1]
+    return (
+        f"If it is another run of the same thing, compare frequencies: the recording moves most at"
+        f" {hz[int(np.argmax(recorded))]:.5g} Hz, the log at {logged:.5g} Hz, told to some {reach:.2g} Hz"
+    )
 
 
 def _without_slow(log: Log, length: float) -> FloatArray:

@@ -256,14 +256,8 @@ def fork(summed: int, opened: int) -> tuple[NDArray[np.uint8], NDArray[np.uint8]
     return np.rint(slow).astype(np.uint8), frames
 
 
-@pytest.mark.slow
-def test_the_path_of_a_fork_is_that_of_its_single_frames(aolink: Run, tmp_path: Path) -> None:
-    """What `look` records of a real film of 25 frames/s, against the frames at 1000 frames/s that it was made of."""
-    slow, frames = fork(40, 40)
-    np.savez(tmp_path / "fork.npz", frames=slow, rate_hz=25.0, exposure_s=0.04)
-    done = aolink("look", "fork.npz", "-o", "fork")
-    assert done.returncode == 0, done.stderr
-    recording = Recording(tmp_path / "fork" / "film.mcap")
+def single_frames(recording: Recording, frames: NDArray[np.uint8]) -> NDArray[np.float64]:
+    """Where the region of a recording is in each frame, pixels, (frames, 2)."""
     sensor = recording.rig.sensor
     assert isinstance(sensor, RegionSensor)
     # Where the region is: where the mean of the frames is most like its reference.
@@ -273,7 +267,18 @@ def test_the_path_of_a_fork_is_that_of_its_single_frames(aolink: Run, tmp_path: 
     y, x = places[int(np.argmax(like))]
     cut = frames[:, y : y + side, x : x + side] * (256 / sensor.counts_per_density)
     seen = [sensor.texture.seen(each) for each in cut]
-    truth = np.array([each.mean @ sensor.texture.axes for each in seen if each]).reshape(-1, 40, 2)
+    return np.array([each.mean @ sensor.texture.axes for each in seen if each])
+
+
+@pytest.mark.slow
+def test_the_path_of_a_fork_is_that_of_its_single_frames(aolink: Run, tmp_path: Path) -> None:
+    """What `look` records of a real film of 25 frames/s, against the frames at 1000 frames/s that it was made of."""
+    slow, frames = fork(40, 40)
+    np.savez(tmp_path / "fork.npz", frames=slow, rate_hz=25.0, exposure_s=0.04)
+    done = aolink("look", "fork.npz", "-o", "fork")
+    assert done.returncode == 0, done.stderr
+    recording = Recording(tmp_path / "fork" / "film.mcap")
+    truth = single_frames(recording, frames).reshape(-1, 40, 2)
     at = (np.arange(40) + 0.5) / 40 * recording.rig.timing.exposure_steps - 0.5
     for name in ("o3", "moments"):
         made = reestimate(recording, [name])[name]

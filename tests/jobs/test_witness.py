@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 from collections.abc import Callable
 from pathlib import Path
@@ -15,6 +16,7 @@ from aolink.estimation.score import Scorer
 from aolink.jobs.witness import Aligned, align, aligned, read_log
 from aolink.numerics.arrays import FloatArray
 from aolink.recording.reader import Recording
+from tests.jobs.test_look import fork, single_frames
 from tests.needs import needed
 
 RECORDINGS = Path(__file__).parents[2] / "recordings"
@@ -80,6 +82,42 @@ def test_a_log_of_another_motion_is_refused(hz: tuple[float, float], tmp_path: P
     log = written(tmp_path / "log.csv", motion(1, hz), "um", offset=0.0, drift=0.0, begin=3.0)
     with pytest.raises(ExportError, match="explain"):
         aligned(*exposed(motion(2, hz), 3.0), EXPOSURES, read_log(log))
+
+
+@pytest.mark.slow
+def test_a_log_of_another_run_is_compared_in_frequency(tmp_path: Path) -> None:
+    log = written(tmp_path / "log.csv", motion(1, (32.0, 32.4)), "um", offset=0.0, drift=0.0, begin=3.0)
+    with pytest.raises(ExportError, match="frequencies") as refused:
+        aligned(*exposed(motion(2, (31.0, 31.4)), 3.0), EXPOSURES, read_log(log))
+    ours, theirs = (float(text) for text in re.findall(r"at ([0-9.]+) Hz", str(refused.value)))
+    assert 30.5 < ours < 32
+    assert 31.5 < theirs < 33
+
+
+@pytest.mark.slow
+def test_single_frames_of_a_fork_are_a_witness_of_their_sums(
+    aolink: Callable[..., subprocess.CompletedProcess[str]], tmp_path: Path
+) -> None:
+    """A real film of 1000 frames/s, of which 40 make an exposure; the log begins .4 s before the recording."""
+    slow, frames = fork(40, 40)
+    np.savez(tmp_path / "fork.npz", frames=slow[10:75], rate_hz=25.0, exposure_s=0.04)
+    done = aolink("look", "fork.npz", "-o", "fork")
+    assert done.returncode == 0, done.stderr
+    recording = Recording(tmp_path / "fork" / "film.mcap")
+    moved = single_frames(recording, frames)
+    table = np.column_stack([(np.arange(len(moved)) + 0.5) * 1e-3, moved])
+    np.savetxt(tmp_path / "log.csv", table, delimiter=",", header="time_s,x_pixels,y_pixels", comments="")
+    found, score = align(recording, read_log(tmp_path / "log.csv")), Scorer()
+    half_periods = (found.offset_s + 0.4) * 2 * 31.97
+    assert "whole periods" in found.text
+    assert abs(half_periods - round(half_periods)) < 0.02
+    assert found.explained > 0.95
+    for step in recording.steps([found.estimator]):
+        score.add(found.seen(step.exposure), step.estimates[found.estimator])
+    result = score.result()
+    assert result.path_rmse < 0.13
+    assert result.coverage is not None
+    assert result.coverage > 0.93
 
 
 @pytest.mark.slow
