@@ -15,6 +15,7 @@ from aolink.cli.terminal import ask, progress_bar
 from aolink.errors import AolinkError, CalibrationError
 from aolink.files import check_target, writing
 from aolink.signals import stop_after
+from aolink.units import counted
 
 if TYPE_CHECKING:
     from aolink.rig import Rig
@@ -207,7 +208,7 @@ def _write_interaction(
     largest, smallest = measured.singular_values[0], measured.singular_values[-1]
     off = ": a sign, the order of the inputs or a scale is wrong" if found.difference > 0.3 + 3 * found.noise else ""
     stdout.print(
-        f"{outputs} slopes for {inputs} inputs from {measured.exposures} exposures; singular values"
+        f"{outputs} slopes for {counted(inputs, 'input')} from {measured.exposures} exposures; singular values"
         f" {largest:.4g} to {smallest:.4g}, condition {measured.condition:.3g}; residual {measured.residual_rms:.3g}"
         f" slope units (rms)\nthe rig file's plant is off by {100 * found.difference:.3g} % of the matrix, noise"
         f" explains {100 * found.noise:.3g} %{off}"

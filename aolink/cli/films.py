@@ -9,7 +9,7 @@ import typer
 
 from aolink.cli.common import OutputOption, OverwriteOption, app, as_rate, as_seconds, progress, stdout
 from aolink.errors import ImportingError
-from aolink.units import quantity
+from aolink.units import counted, quantity
 
 if TYPE_CHECKING:
     from aolink.films.film import Film
@@ -216,4 +216,4 @@ def import_(
             " dark level was subtracted: --film background puts the ground at the rig's black level",
             markup=False,
         )
-    stdout.print(f"{output}: {account.exposures} exposures of {account.said}", markup=False)
+    stdout.print(f"{output}: {counted(account.exposures, 'exposure')} of {account.said}", markup=False)

@@ -20,6 +20,7 @@ from aolink.cli.common import (
     stdout,
 )
 from aolink.errors import RecordingError
+from aolink.units import counted
 
 if TYPE_CHECKING:
     from aolink.recording.reader import Recording
@@ -169,7 +170,7 @@ def copy(
     for loss in edited.losses:
         stdout.print(f"lost: {loss.text()}", markup=False)
     stdout.print(
-        f"written: {edited.path}: {edited.messages} messages, {edited.exposures} exposures"
+        f"written: {edited.path}: {counted(edited.messages, 'message')}, {counted(edited.exposures, 'exposure')}"
         + (f"; {sum(loss.count for loss in edited.losses)} part(s) of the source lost" if edited.losses else ""),
         markup=False,
     )

@@ -15,6 +15,7 @@ from aolink.cli.common import EstimatorOption, JsonOption, app, get_ready, progr
 from aolink.cli.terminal import progress_bar
 from aolink.errors import EstimatorError
 from aolink.signals import Interrupted, StopRequest
+from aolink.units import counted
 
 if TYPE_CHECKING:
     import numpy as np
@@ -194,8 +195,8 @@ def _print_session(report: "Report", output: Path, as_json: bool) -> None:
             return
         written = report.files[0]
         parts = f" in {len(report.files)} files" if len(report.files) > 1 else ""
-        text = f"{written}: {report.exposures} exposures{parts}, {report.ended}; view it: {program()} view {written}"
-        stdout.print(text, markup=False)
+        what = f"{counted(report.exposures, 'exposure')}{parts}, {report.ended}"
+        stdout.print(f"{written}: {what}; view it: {program()} view {written}", markup=False)
 
 
 def _live_view(

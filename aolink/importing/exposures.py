@@ -38,6 +38,7 @@ from aolink.optics.centroid import weighted_centroid
 from aolink.optics.sensor import RegionSensor
 from aolink.rig import Rig
 from aolink.series import Series, in_memory
+from aolink.units import counted
 from aolink.wire.messages_pb2 import Applied
 
 _FASTER = 0.75
@@ -261,11 +262,13 @@ class _Inputs:
         unknown = int(np.count_nonzero(held < 0))
         notes = []
         if early or late:
-            notes.append(f"{early} commands before the first exposure and {late} after the last are left out")
+            notes.append(f"{counted(early, 'command')} before the first exposure and {late} after the last left out")
         if replaced := int(np.count_nonzero(np.diff(first) < 1)):
-            notes.append(f"{replaced} commands are left out: the next one came in the same fast step")
+            notes.append(f"{counted(replaced, 'command')} left out: the next one came in the same fast step")
         if unknown:
-            notes.append(f"the first command comes {unknown} fast steps after the first exposure: parked until then")
+            notes.append(
+                f"the first command comes {counted(unknown, 'fast step')} after the first exposure: parked until then"
+            )
         return known, tuple(notes)
 
     def until(self, end: int) -> FloatArray:

@@ -45,7 +45,7 @@ def import_film(
     if first is None:
         raise ImportingError(f"{film.name} has {film.count} frames: not enough for {settings.frames_per_exposure}")
     none = (
-        f"; {film.left_out} of its {film.count + film.left_out} frames are none: {film.account}" if film.account else ""
+        f"; {film.left_out} of {film.count + film.left_out} frames are missing: {film.account}" if film.account else ""
     )
     facts = {
         "aolink_version": version("aolink"),

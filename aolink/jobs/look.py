@@ -334,7 +334,7 @@ def _of_regions(
         lines = [line for _, _, found in relative for line in found.lines[:1]]
         if travelling := any(_shown_by(line, common["exposure_s"]) > LEAST_MOTION for line in lines):
             results = relative
-            doubts.append("what travels with the whole picture, as by a camera in the hand, is taken out")
+            doubts.append("the motion of the whole picture, as of a camera in the hand, is taken out")
     best, seen, found = strongest = max(results, key=lambda one: _strength(*one[1:]))
     if found.lines and (quarter := best.livelier_quarter(found.lines[0].hz)):
         doubts.append("parts of this region move in different ways: the quarter that moves most is described")
@@ -346,7 +346,7 @@ def _of_regions(
     if camera:
         doubts.append("all of the picture moves alike: it is the camera that moves")
     elif rest is None:
-        doubts.append("nothing else in the picture has edges: whether the camera moves is not seen")
+        doubts.append("nothing else in the picture has edges, so a camera that moves would not show")
     flicker = signal.detrend(best.windows.mean(axis=(1, 2))).std() / abs(best.windows.mean())
     if flicker > _FLICKER:
         doubts.append(f"the light flickers by {flicker:.1%} rms, as lamps on mains do: that is taken out")
@@ -599,7 +599,7 @@ def _graded(looked: Looked) -> Looked:
         if abs(whole / looked.rate_hz - 1) > 0.02:
             multiple += f" or of {whole:.4g} Hz, whole swings in an exposure"
         wanders = f"it wanders by {looked.moved:.2g} pixels rms, and no frequency stands out of that"
-        return replace(looked, grade=2, because=wanders if looked.moved else f"all frames have one shape: {multiple}")
+        return replace(looked, grade=2, because=wanders if looked.moved else f"all frames look alike: {multiple}")
     line, parts = found.lines[0], found.sets[0]
     if len(looked.lines) == MOST_LINES and looked.lines[-1].ellipse[0] > _COMPARABLE * line.ellipse[0]:
         return replace(looked, grade=2, because="the motion is more than three vibrations")
@@ -615,7 +615,7 @@ def _graded(looked: Looked) -> Looked:
     if left > _UNEXPLAINED * max(shown, LEAST_MOTION) and left > LEAST_MOTION:
         why.append(f"the places move by {left:.2g} pixels rms that no vibration explains")
     if found.spread_misfit > _MISFIT:
-        why.append("the blur is not all explained")
+        why.append("a part of the blur is not explained")
     if any(abs(each.growth) > 0.9 for each in found.lines):
         why.append("it grows or dies within the film")
     return replace(looked, grade=1 if why else 0, because="; ".join(why))
@@ -644,12 +644,12 @@ def _assumed(
     if spots is not None and spots.left_out:
         yield f"{spots.left_out} fainter spot(s) are left out: they may move in another way"
     if common["frames"] < film.count:
-        yield f"the first {common['frames']:g} of {film.count} frames are looked at: later motion may be another"
+        yield f"the first {common['frames']:g} of {film.count} frames are used: later motion may differ"
 
 
 def _of_film(film: Film) -> Iterator[str]:
     if film.account:
-        yield f"{film.left_out} of {film.count + film.left_out} frames are none: {film.account}"
+        yield f"{film.left_out} of {film.count + film.left_out} frames are missing: {film.account}"
 
 
 def _doubts(spots: Spots) -> Iterator[str]:

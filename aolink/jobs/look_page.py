@@ -129,7 +129,7 @@ def _numbers(looked: Looked) -> dict[str, str]:
         rows["region"] = ", ".join(f"{each.columns} x {each.rows} at {each.x},{each.y}" for each in looked.regions[:1])
     for line, parts, n in zip(looked.found.lines, looked.found.sets, looked.harmonics, strict=True):
         rows[f"{line.hz:.4g} Hz"] = f"{in_set(parts)}; {size_of(line, looked)}{'' if n == 1 else f'; harmonic {n}'}"
-    rows["places"] = f"move by {looked.moved:.3g} pixels rms from frame to frame; {looked.rest:.2g} are left"
+    rows["places"] = f"move by {looked.moved:.3g} pixels rms from frame to frame; {looked.rest:.2g} are not explained"
     return rows
 
 

@@ -197,8 +197,8 @@ def test_commands_are_held_by_their_times(tmp_path: Path) -> None:
     recording, account = imported(path, rig)
     inputs = np.concatenate([each.inputs for each in recording.exposures()])
     np.testing.assert_array_equal(inputs, np.repeat(commands[[0, 2]], [30, 110], axis=0))
-    assert "1 commands before the first exposure and 1 after the last are left out" in account.notes
-    assert "1 commands are left out: the next one came in the same fast step" in account.notes
+    assert "1 command before the first exposure and 1 after the last left out" in account.notes
+    assert "1 command left out: the next one came in the same fast step" in account.notes
 
 
 def test_commands_by_their_loops_rate(tmp_path: Path) -> None:
