@@ -16,6 +16,7 @@ from aolink.cli.common import JsonOption, app, load_checked, program, stdout
 from aolink.cli.terminal import input_ended
 from aolink.errors import AolinkError, RigError
 from aolink.signals import StopRequest
+from aolink.units import counted
 
 if TYPE_CHECKING:
     from aolink.rig import Rig
@@ -77,7 +78,7 @@ def _print_findings(loaded: "Rig", as_json: bool) -> None:
         for finding in findings:
             stdout.print(f"{finding.severity:>7}  {escape(finding.key)}: {escape(finding.message)}")
         counts = Counter(finding.severity for finding in findings)
-        found = ", ".join(f"{counts[kind]} {kind}(s)" for kind in ("error", "warning") if counts[kind])
+        found = ", ".join(counted(counts[kind], kind) for kind in ("error", "warning") if counts[kind])
         stdout.print(f"{loaded.name}: {found or 'the rig file is good'}")
     if any(finding.severity == "error" for finding in findings):
         raise typer.Exit(RigError.exit_code)
