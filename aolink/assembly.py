@@ -215,7 +215,7 @@ class InputHistory:
 
     def is_known_until(self, end: int) -> bool:
         """Whether no report of a step before ``end`` is still to come."""
-        return end <= self._reported_until and all(first >= end for first, _ in self._awaited)
+        return end <= self._reported_until and min(self._awaited, default=(end, end))[0] >= end
 
     def add_command(self, message: pb.CommandBlock | Run) -> None:
         if self._add(self._commanded, message):

@@ -24,10 +24,8 @@ from aolink.devices.simple import Held, SimpleMirror
 from aolink.errors import AolinkError, DeviceError
 from aolink.rig import Rig
 from aolink.rig.device_tables import Delay
+from aolink.timeouts import TIMEOUTS
 from aolink.wire import messages_pb2 as pb
-
-_PATIENCE_NS = 1_000_000_000
-"""How long reports that are awaited may take, from the newest report on."""
 
 
 class AdaptedMirror(Adapted):
@@ -146,7 +144,7 @@ class AdaptedMirror(Adapted):
             return []
         events = self._give_up(first_step)
         begin, end = self._next, int(end)
-        self._next, self._deadline_ns = end, self.now_ns() + _PATIENCE_NS
+        self._next, self._deadline_ns = end, self.now_ns() + round(TIMEOUTS.report_s * 1e9)
         for (block_id, source), run in groupby(
             range(begin, end), lambda step: self._what_held(step, u[step - first_step], bool(late[step - first_step]))
         ):
@@ -186,7 +184,7 @@ class AdaptedMirror(Adapted):
     def await_reports(self, end_step: int, now_ns: int) -> list[Event]:
         if self._next is not None and end_step > self._awaited:
             if self._next >= self._awaited:  # until now nothing was awaited
-                self._deadline_ns = now_ns + _PATIENCE_NS
+                self._deadline_ns = now_ns + round(TIMEOUTS.report_s * 1e9)
             self._awaited = end_step
         return []
 

@@ -90,7 +90,8 @@ class ClockRegression:
         self._trips: deque[int] = deque(maxlen=_WINDOW)
         """Round trips of samples, ns: they are kept after a step of the clock, because the serial line has not
         changed."""
-        self._reference: ClockExchange | None = None
+        self._reference_ns: tuple[int, int] | None = None
+        """Host time and device time of the newest sample."""
         self._solution = np.zeros(2)
         self._covariance = np.full((2, 2), np.nan)
         self._asymmetry_ns = math.nan
@@ -105,7 +106,7 @@ class ClockRegression:
     @property
     def ready(self) -> bool:
         """Whether there is an estimate."""
-        return self._reference is not None
+        return self._reference_ns is not None
 
     @property
     def suspected(self) -> bool:
@@ -179,37 +180,34 @@ class ClockRegression:
             excess = float(residual @ weight @ residual) / (len(self._samples) - 2)
             self._covariance = self._covariance * max(1.0, excess)
         self._asymmetry_ns = shortest / 2 / math.sqrt(3)
-        self._reference = reference
+        self._reference_ns = reference.host_ns, reference.device_ns
 
     def _by_line(self, host_ns: int) -> tuple[int, float]:
         """Device time at a host time by the regression, and its standard deviation if the clock has not been set,
         ns."""
-        assert self._reference is not None, "ask `ready` first"
-        elapsed = host_ns - self._reference.host_ns
+        assert self._reference_ns is not None, "ask `ready` first"
+        reference_ns, device_ns = self._reference_ns
+        elapsed = host_ns - reference_ns
         row = np.array([1.0, float(elapsed)])
         walked = 1e9 * _FREQUENCY_WALK * math.sqrt(abs(elapsed / 1e9) ** 3 / 3)
         sigma = math.hypot(math.sqrt(float(row @ self._covariance @ row)), self._asymmetry_ns, walked)
-        return self._reference.device_ns + elapsed + round(float(row @ self._solution)), sigma
+        return device_ns + elapsed + round(float(row @ self._solution)), sigma
 
     def device_ns(self, host_ns: int) -> tuple[int, float]:
         """Device time at a host time, and its standard deviation, ns."""
-        device_ns, sigma = self._by_line(host_ns)
-        return device_ns, math.hypot(sigma, self._doubt_at(host_ns))
-
-    def _doubt_at(self, host_ns: int) -> float:
-        """The addition to sigma from a step of the clock, ns: a suspected step, or one that was found only after this
-        time."""
-        if self._doubt_ns or self.step is None or host_ns >= self.step.before_ns:
-            return self._doubt_ns
-        return float(abs(self.step.size_ns))
+        (device_ns, sigma), doubt_ns = self._by_line(host_ns), self._doubt_ns
+        if not doubt_ns and self.step is not None and host_ns < self.step.before_ns:
+            doubt_ns = abs(self.step.size_ns)  # the clock had been set, which was found only after this time
+        return device_ns, math.hypot(sigma, doubt_ns)
 
     def host_ns(self, device_ns: int) -> tuple[int, float]:
         """Host time at a device time, and its standard deviation, ns."""
-        assert self._reference is not None, "ask `ready` first"
-        elapsed = device_ns - self._reference.device_ns
+        assert self._reference_ns is not None, "ask `ready` first"
+        reference_ns, reference_device_ns = self._reference_ns
+        elapsed = device_ns - reference_device_ns
         host = (elapsed - float(self._solution[0])) / (1 + float(self._solution[1]))
         # elapsed may be hours: keep the integer part exact, the correction is small.
-        host_ns = self._reference.host_ns + elapsed + round(host - elapsed)
+        host_ns = reference_ns + elapsed + round(host - elapsed)
         return host_ns, self.device_ns(host_ns)[1]
 
     @property

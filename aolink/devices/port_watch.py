@@ -9,13 +9,11 @@ from aolink.devices.gate import MOST_RATE_ERROR
 from aolink.devices.identity import check_identity, new_nonce
 from aolink.devices.interfaces import Returned, Vanished
 from aolink.errors import DeviceError, PortError
+from aolink.timeouts import TIMEOUTS
 from aolink.wire import messages_pb2 as pb
-from aolink.wire.hub import ANSWER_S
 from aolink.wire.link import Link
 from aolink.wire.port import Reopening, Transport
 
-_SILENT_S = 2.0
-"""A device that has not answered a clock query for this long counts as disconnected, s."""
 _STEPS_OFF_S = 0.25
 """The most by which a device's count of fast steps may differ from the prediction by its clock, s; a restart makes the
 count begin anew."""
@@ -54,7 +52,7 @@ class PortWatch:
             self._unanswered_ns = None
         elif self._unanswered_ns is None:
             self._unanswered_ns = now_ns
-        elif (silent_s := (now_ns - self._unanswered_ns) / 1e9) > _SILENT_S:
+        elif (silent_s := (now_ns - self._unanswered_ns) / 1e9) > TIMEOUTS.silent_s:
             link.lose(PortError(f"the {link.name} has said nothing for {silent_s:.1f} s, though it was asked"))
         events = []
         if link.lost is not None and self._reopening is None:
@@ -75,7 +73,7 @@ class PortWatch:
             silent = f"nothing answers on the {link.name}'s port"
             last = silent if reopening is None else reopening.failed or "it cannot be opened yet"
             raise PortError(f"{self._why}; it did not return within {self._within_s:g} s: {last}")
-        if link.lost is None and (self._asked_ns is None or now_ns - self._asked_ns > ANSWER_S * 1e9):
+        if link.lost is None and (self._asked_ns is None or now_ns - self._asked_ns > TIMEOUTS.answer_s * 1e9):
             self._asked_ns, self._nonce = now_ns, new_nonce()
             link.send(pb.Identify(nonce=self._nonce))
 

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from aolink.timeouts import TIMEOUTS
 from aolink.wire import messages_pb2 as pb
-
-_LEAST_TRIES = 3
-"""Least queries before a report is given up: a host that was held up has not read the answers yet."""
 
 
 @dataclass(slots=True)
@@ -102,7 +100,7 @@ class AppliedReports:
         queries, given_up, gaps = [], [], []
         for gap in self._gaps:
             if _due_ns(gap, interval_ns) <= now_ns:
-                if now_ns - gap.since_ns > self._patience_ns and gap.tries >= _LEAST_TRIES:
+                if now_ns - gap.since_ns > self._patience_ns and gap.tries >= TIMEOUTS.least_report_tries:
                     n_steps = gap.end - gap.first
                     given_up.append(pb.Applied(first_step=gap.first, n_steps=n_steps, source=pb.Applied.NOT_REPORTED))
                     continue

@@ -29,13 +29,12 @@ from aolink.recording.lead import Lead
 from aolink.recording.mcap_file import McapFile, WriteOptions, schema_of
 from aolink.recording.messages import first_facts
 from aolink.rig import Rig
+from aolink.timeouts import TIMEOUTS
 
 _QUEUE_BYTES = 256 << 20
 """Most bytes that may wait for the disk."""
 _POLL_S = 0.005
 """Time between two checks of the queue, s: waking the thread for each message would cost more than the writing."""
-_END_S = 60.0
-"""How long the end of a recording waits for one write."""
 _LOOK_S = 1.0
 """Time between two comparisons of the open file with its path, s."""
 _LOOK_BYTES = 16 << 10
@@ -151,7 +150,7 @@ class RecordingWriter:
         if self._error:
             raise self._error
         data = message.SerializeToString()  # fields by their numbers: without maps always the same bytes
-        if self._is_full():
+        if self.waiting_bytes > _QUEUE_BYTES:
             self._wait_for_room()
         if topic not in self._classes:
             self._classes[topic] = type(message)
@@ -159,15 +158,12 @@ class RecordingWriter:
         self._queue.append((topic, None if self._lead is None else message, data, time_ns))
 
     def _wait_for_room(self) -> None:
-        while self._is_full():
+        while self.waiting_bytes > _QUEUE_BYTES:
             if self._error:
                 raise self._error
             if not self._deterministic:  # a caller that has time to wait, waits
                 raise RecordingError(f"the disk of {self.path} is too slow for this session: record to a faster one")
             time.sleep(0.01)
-
-    def _is_full(self) -> bool:
-        return self.waiting_bytes > _QUEUE_BYTES
 
     @property
     def waiting_bytes(self) -> int:
@@ -187,7 +183,7 @@ class RecordingWriter:
         self._closed = True
         self._end_metadata = end_metadata or {}
         self._ending.set()
-        while self._thread.is_alive() and self.held_up_s < _END_S:
+        while self._thread.is_alive() and self.held_up_s < TIMEOUTS.disk_end_s:
             self._thread.join(0.1)
         if self._thread.is_alive():
             raise RecordingError(f"the disk of {self.path} does not answer: the end of the recording may be missing")

@@ -17,13 +17,12 @@ from aolink.recording import schemas_pb2 as pb
 from aolink.recording import topics
 from aolink.recording.writer import RecordingWriter
 from aolink.session.report import Report
+from aolink.timeouts import TIMEOUTS
 
 _COUNTS = {each.name for each in pb.ConnectionStatistics.DESCRIPTOR.fields} - {"device"}
 """What a device may count."""
 _NUMBER = re.compile(r"(?<![\w.:=-])[-+]?\d[\d.e+-]*")
 """A number, but not one that is part of a name, as in ``o3`` or ``theirs:order=10``."""
-_DISK_S = 2.0
-"""Of a disk that takes longer over one write, a warning says how long."""
 _AT_ONCE = 5
 _MINUTE_NS = 60_000_000_000
 
@@ -120,7 +119,7 @@ class Journal:
 
     def disk(self) -> None:
         """Warn of a disk that is held up: what ends the session is a full queue."""
-        if not self._time.virtual and (held_up_s := self._writer.held_up_s) > _DISK_S:
+        if not self._time.virtual and (held_up_s := self._writer.held_up_s) > TIMEOUTS.disk_s:
             self.warn(
                 f"the disk of {self._writer.path} has not taken a write for {held_up_s:.1f} s:"
                 f" {self._writer.waiting_bytes} bytes wait"

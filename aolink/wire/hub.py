@@ -17,15 +17,11 @@ from google.protobuf.message import Message
 
 from aolink.errors import DeviceError
 from aolink.polling import wait_readable
+from aolink.timeouts import TIMEOUTS
 from aolink.wire import messages_pb2 as pb
 from aolink.wire.link import Link, Received
 from aolink.wire.port import Served, Transport, is_local
 
-ANSWER_S = 1.0
-"""How long an answer may take before a request is sent again, and the longest wait for an answer after a stop, s."""
-TRIES = 3
-_VIRTUAL_SILENCE_S = 20.0
-"""A rig on virtual time that sends nothing for this long counts as gone, s."""
 _BUDGET_BYTES = 64 << 20
 """Most bytes that may come before the session takes them, besides the frames that the camera was asked for."""
 _MESSAGE_BYTES = 512
@@ -33,12 +29,6 @@ _MESSAGE_BYTES = 512
 _MOST_HOST_NS = 1 << 62
 _CLOCK = getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC)
 """A steady clock that goes on while the computer sleeps, as the devices' clocks do."""
-_MOST_TRIES = 200
-"""Most tries of a request that is insisted on, while anything at all is heard of the device."""
-_LAST_PATIENCE_S = 0.2
-"""How long to wait for a device that has already delayed the session's end, s."""
-_SLICE_S = 0.1
-"""Longest sleep, s: a request to stop is noticed within this time."""
 
 AnyMessage = TypeVar("AnyMessage", bound=Message)
 
@@ -52,7 +42,7 @@ class Hub:
     def __init__(self, stop: Callable[[], bool] = lambda: False) -> None:
         self._stop = stop
         self._hurried = False
-        self._patience_s = ANSWER_S
+        self._patience_s = TIMEOUTS.answer_s
         """How long the rig on virtual time may take to handle a message once the session is to end, s."""
         self.links: list[Link] = []
         self.virtual = False
@@ -124,7 +114,9 @@ class Hub:
         elif not pending:
             beside = [each for each in self.beside if each.alive]
             lines = [link.transport for link in self.links if link.lost is None]
-            wait_readable([*lines, *beside], min(timeout_s, _SLICE_S), [each for each in beside if each.has_to_send])
+            wait_readable(
+                [*lines, *beside], min(timeout_s, TIMEOUTS.slice_s), [each for each in beside if each.has_to_send]
+            )
             pending = [(link, r) for link in self.links for r in link.receive()]
             for each in beside:
                 each.serve()
@@ -134,7 +126,7 @@ class Hub:
 
     def request(
         self, link: Link, request: Message, answers: type[AnyMessage], is_it: Callable[[AnyMessage, int], bool],
-        answer_s: float = ANSWER_S, tries: int = TRIES, *, insist_s: float = 0.0,
+        answer_s: float = TIMEOUTS.answer_s, tries: int = TIMEOUTS.tries, *, insist_s: float = 0.0,
     ) -> AnyMessage | None:  # fmt: skip
         """Send a request until its answer comes; None if it never does. Other messages wait for `wait`.
 
@@ -145,7 +137,7 @@ class Hub:
         before = self._memory_bytes()
         sequences: list[int] = []
         heard_ns = self.now_ns()
-        for attempt in range(_MOST_TRIES if insist_s else tries):
+        for attempt in range(TIMEOUTS.most_tries if insist_s else tries):
             if attempt and not insist_s and (self._hurried or self._stop() or link.foreign_version is not None):
                 break
             heard_ns = max(heard_ns, link.last_heard_ns)
@@ -212,12 +204,12 @@ class Hub:
                 stop_since = min(stop_since, now)
             ended = now - stop_since > self._patience_s
             if ended:
-                self._patience_s = _LAST_PATIENCE_S
-            if (silence := now - last_heard) > (_LAST_PATIENCE_S if ended else _VIRTUAL_SILENCE_S):
+                self._patience_s = TIMEOUTS.last_patience_s
+            if (silence := now - last_heard) > (TIMEOUTS.last_patience_s if ended else TIMEOUTS.virtual_silence_s):
                 raise DeviceError(f"the rig on virtual time has said nothing for {silence:.1f} s: is it stopped?")
             if ended:
                 raise DeviceError("the rig on virtual time sends messages without handling those it was sent")
-            wait_readable(waiting, _SLICE_S)
+            wait_readable(waiting, TIMEOUTS.slice_s)
 
     def _memory_bytes(self) -> int:
         """The memory that all messages so far took, bytes."""

@@ -18,16 +18,11 @@ import serial
 
 from aolink.errors import PortError
 from aolink.polling import HasFileno, wait_readable
+from aolink.timeouts import TIMEOUTS
 
 BAUD_RATE = 921_600
 """The baud rate of ports that have one; USB and pseudo terminals ignore it."""
-_WRITE_TIMEOUT_S = 5.0
-_STOPPED_TIMEOUT_S = 1.0
-"""The write time-out once a stop is requested, s."""
-_SLICE_S = 0.1
 _MOST_READ = 65_536
-_REOPEN_S = 0.05
-"""Time between two tries to open a port that has vanished, s."""
 
 
 class Transport(Protocol):
@@ -64,11 +59,11 @@ class SerialPort:
         try:
             if url.lower().startswith("socket://"):
                 address = urlsplit(url)
-                self._port = socket.create_connection((address.hostname, address.port), timeout=_WRITE_TIMEOUT_S)
+                self._port = socket.create_connection((address.hostname, address.port), timeout=TIMEOUTS.write_s)
                 self._port.setblocking(False)
             else:
                 self._port = serial.serial_for_url(
-                    url, baudrate=baud_rate, timeout=0, write_timeout=_WRITE_TIMEOUT_S, exclusive=True
+                    url, baudrate=baud_rate, timeout=0, write_timeout=TIMEOUTS.write_s, exclusive=True
                 )
         except Exception as error:  # pyserial raises errors of many kinds for an address that it cannot read
             raise _open_error(url, error) from None
@@ -109,9 +104,9 @@ class SerialPort:
                     continue
                 self._full_since_s = self._full_since_s or time.monotonic()
                 waited_s = time.monotonic() - self._full_since_s
-                if waited_s > (_STOPPED_TIMEOUT_S if self._stop() else _WRITE_TIMEOUT_S):
+                if waited_s > (TIMEOUTS.stopped_write_s if self._stop() else TIMEOUTS.write_s):
                     raise PortError(f"{self.url} took no data for {waited_s:.0f} s; is the device running?")
-                wait_readable([], _SLICE_S, [descriptor])
+                wait_readable([], TIMEOUTS.slice_s, [descriptor])
         except (OSError, ValueError) as error:
             raise self._lost(error) from None
 
@@ -160,7 +155,7 @@ class Reopening:
                 opened = self._reopen()
             except PortError as error:
                 self.failed = error
-                self._given_up.wait(_REOPEN_S)
+                self._given_up.wait(TIMEOUTS.reopen_s)
                 continue
             with self._lock:
                 if self._given_up.is_set():

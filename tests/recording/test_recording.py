@@ -37,6 +37,7 @@ from aolink.recording.reader import Recording
 from aolink.recording.reestimate import write_reestimated
 from aolink.recording.writer import RecordingWriter, begin_recording
 from aolink.rig import load_rig
+from aolink.timeouts import Timeouts
 from tests.conftest import ESTIMATORS, EXPOSURES, Session
 
 
@@ -292,7 +293,7 @@ def test_a_disk_that_does_not_answer_is_an_error_when_the_queue_is_full(
 
     with pytest.raises(RecordingError, match="slow"):
         record_much()
-    monkeypatch.setattr("aolink.recording.writer._END_S", 0.5)
+    monkeypatch.setattr("aolink.recording.writer.TIMEOUTS", Timeouts(disk_end_s=0.5))
     with pytest.raises(RecordingError, match="answer"):
         writer.close()
     assert writer.held_up_s > 0.5

@@ -173,7 +173,7 @@ def test_a_slow_line_is_not_flooded(tmp_path: Path) -> None:
     run = run_session(hub, RIG, tmp_path / "a.mcap", 20)
     assert run.report.commands.applied == 4000
     assert run.report.blocks_retransmitted <= 2
-    assert run.mirror.round_trip_s == pytest.approx(0.06, rel=0.02)
+    assert run.mirror.flights.round_trip_s == pytest.approx(0.06, rel=0.02)
 
 
 def test_no_block_is_sent_again_before_its_answer_is_due(tmp_path: Path) -> None:

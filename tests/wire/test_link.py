@@ -15,6 +15,7 @@ import pytest
 
 from aolink.errors import PortError
 from aolink.polling import wait_readable
+from aolink.timeouts import Timeouts
 from aolink.wire import messages_pb2 as pb
 from aolink.wire.hub import Hub
 from aolink.wire.link import Link
@@ -158,7 +159,7 @@ def test_a_port_that_takes_nothing_is_waited_for_once(peer: Peer, monkeypatch: p
         return wait_readable(*arguments)
 
     monkeypatch.setattr("aolink.wire.port.wait_readable", counted)
-    monkeypatch.setattr("aolink.wire.port._WRITE_TIMEOUT_S", 0.3)
+    monkeypatch.setattr("aolink.wire.port.TIMEOUTS", Timeouts(write_s=0.3))
     with closing(SerialPort(peer.path)) as port:
         for first in (True, False):
             with pytest.raises(PortError, match="took no data"):
