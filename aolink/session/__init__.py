@@ -1,6 +1,6 @@
 """Live sessions: devices, recorder and estimators joined. The page is `aolink/pages/first_session.md`.
 
-`SessionLoop._take` is the one place that tells the events of devices apart. A new count of a session is a field of
+`received.Received` is the one place that tells the events of devices apart. A new count of a session is a field of
 `report.Report`; where it counts losses, its name in ``_LOSSES`` of `aolink.recording.facts` shows it in `aolink info`.
 A new kind of ``--input`` has its numbers in ``_NUMBERS`` of `excitation`, and its shape in ``_signal``.
 """
@@ -35,17 +35,13 @@ from aolink.session.controlling import Controlling, facts, served
 from aolink.session.estimating import BesideTheLoop
 from aolink.session.excitation import Excitation
 from aolink.session.journal import Sink, View
-from aolink.session.loop import ESTIMATES_S, SessionLoop
+from aolink.session.loop import SessionLoop
 from aolink.session.report import EstimatorReport, Report
 from aolink.session.waiting import Aside
 from aolink.signals import Interrupted
+from aolink.timeouts import TIMEOUTS
 
 __all__ = ["EstimatorReport", "Report", "Sink", "View", "record"]
-
-_PROGRESS_S = 0.1
-"""In real time: time between two reports of the progress, s."""
-_ASIDE_S = 2.0
-"""In real time: how long the end of a session waits for the function that is told its progress, s."""
 
 
 def controller(rig: Rig, control: str, estimators: Sequence[str], *, force: bool) -> tuple[Controlling, dict[str, str]]:
@@ -225,7 +221,7 @@ def record(
             with contextlib.suppress(Exception):
                 loop.close_account()
             with contextlib.suppress(Exception):
-                loop.finish_estimates(ESTIMATES_S if isinstance(error, PortError | DeviceError) else 0.0)
+                loop.finish_estimates(TIMEOUTS.estimates_s if isinstance(error, PortError | DeviceError) else 0.0)
             if not (isinstance(error, PortError | DeviceError) and stop()):
                 with contextlib.suppress(AolinkError):
                     writer.close(report.counts())
@@ -288,13 +284,13 @@ def _progress_aside(progress: Callable[[int], None], report: Report) -> Iterator
     def report_progress(exposures: int) -> None:
         nonlocal next_s
         if (now_s := time.monotonic()) >= next_s:
-            next_s = now_s + _PROGRESS_S
+            next_s = now_s + TIMEOUTS.progress_s
             aside.give(exposures)
 
     try:
         yield report_progress
     finally:
         aside.give(report.exposures)
-        aside.close(_ASIDE_S)
+        aside.close(TIMEOUTS.last_progress_s)
         if aside.failed is not None:
             report.warnings.append(f"the progress of this session could not be shown: {aside.failed}")

@@ -10,18 +10,17 @@ from pathlib import Path
 
 import numpy as np
 
-from aolink.devices.clock import WARM_UP_QUERIES
 from aolink.devices.interfaces import ClockSampled, Device, Time
 from aolink.devices.opening import open_devices
-from aolink.errors import ControlError, DeviceError, RecordingError
+from aolink.errors import ControlError, RecordingError
 from aolink.estimation import Driver
 from aolink.files import check_target
 from aolink.rig import Rig
 from aolink.session import at_rest, controller
+from aolink.session.clocks import ClockQueries
 from aolink.session.commanding import Inputs
 from aolink.session.controlling import served
 from aolink.session.excitation import Excitation, check_inputs
-from aolink.session.loop import ANSWER_NS
 
 _RECORD_BYTES = 3000
 """The most bytes that an exposure takes in a recording beside its picture and inputs."""
@@ -61,7 +60,7 @@ def dry_run(
         if control and not mirror.commanded:
             raise ControlError("there is no mirror to close the loop with: give --mirror PORT, or [devices.mirror]")
         devices: list[Device] = [camera, mirror] if mirror.commanded else [camera]
-        _ask_clocks(devices, clock, stop)
+        ClockQueries(clock, devices).warm_up(partial(_answered, clock), stop)
         for device in devices:
             offset_s, sigma = device.clock.offset_ns(clock.now_ns()) / 1e9, device.clock.device_ns(clock.now_ns())[1]
             text = f"{device.description}; its clock minus the host's {offset_s:.6f} s, sd {sigma / 1e3:.0f} us"
@@ -81,16 +80,9 @@ def dry_run(
     return DryRun(facts=facts, warnings=warnings)
 
 
-def _ask_clocks(devices: Sequence[Device], time: Time, stop: Callable[[], bool]) -> None:
-    for device in [each for _ in range(WARM_UP_QUERIES) for each in devices]:
-        device.query_clock(time.now_ns())
-        deadline_ns, answered = time.now_ns() + ANSWER_NS, False
-        while not (answered or stop() or time.now_ns() >= deadline_ns):
-            came = [event for happened in time.events(0.05) for event in happened.events]
-            answered = time.virtual or any(isinstance(event, ClockSampled) for event in came)
-    for device in devices:
-        if not (device.clock.ready or stop()):
-            raise DeviceError(f"the {device.name} does not answer clock queries: is it still connected?")
+def _answered(time: Time, timeout_s: float) -> int:
+    """The number of clock queries that are answered in the next ``timeout_s``."""
+    return sum(isinstance(event, ClockSampled) for came in time.events(timeout_s) for event in came.events)
 
 
 def _check_played(rig: Rig, inputs: Inputs | None, exposures: int) -> str:

@@ -31,17 +31,9 @@ from aolink.recording import schemas_pb2 as pb
 from aolink.rig import Rig
 from aolink.session.estimator_process import LENGTH, NICENESS, READY, packed
 from aolink.session.waiting import Waiting, most_waiting
+from aolink.timeouts import TIMEOUTS
 
-_SLICE_S = 0.1
-"""Longest single wait for processes that start, so that a request to stop is noticed within it."""
 _READ_BYTES = 1 << 20
-_HANGS_S = 5.0
-"""An estimator that has not answered for this long, and for `_HANGS_FACTOR` times as long as it ever took, hangs."""
-_HANGS_FACTOR = 10.0
-_END_S = 1.0
-"""Longest wait for a process that was asked to end."""
-_REAP_S = 0.01
-"""Longest wait for a process whose end of the socket is closed, s: the loop stands still meanwhile."""
 NO_TIME = "no time: the estimator was busy with earlier exposures"
 _OVER = "no time: the session was over before its estimate was there"
 
@@ -161,7 +153,7 @@ class BesideTheLoop:
 
     def get_ready(self, stop: Callable[[], bool]) -> None:
         while not stop() and not all(each.ready for each in self.processes):
-            self.serve(_SLICE_S)
+            self.serve(TIMEOUTS.slice_s)
             for name, why in self.failures.items():
                 raise EstimatorError(f"the estimator {name} does not start: {why}")
 
@@ -176,7 +168,7 @@ class BesideTheLoop:
     def finish(self, patience_s: float) -> list[Outcome]:
         deadline = time.monotonic() + patience_s
         while any(each.busy for each in self.processes) and (left_s := deadline - time.monotonic()) > 0:
-            self.serve(min(left_s, _SLICE_S))
+            self.serve(min(left_s, TIMEOUTS.slice_s))
         for each in self.processes:
             each.give_up(_OVER)
         return self.outcomes()
@@ -242,7 +234,7 @@ class EstimatorProcess:
     @property
     def hangs(self) -> str:
         """How long it has not answered, in words; empty where that is not too long."""
-        if self._exposure is None or self._busy_s < max(_HANGS_S, _HANGS_FACTOR * self._longest_s):
+        if self._exposure is None or self._busy_s < max(TIMEOUTS.hangs_s, TIMEOUTS.hangs_factor * self._longest_s):
             return ""
         return f"it has not answered for {self._busy_s:.0f} s, since it got frame {self._exposure.frame_id}"
 
@@ -269,7 +261,7 @@ class EstimatorProcess:
     def serve(self) -> None:
         """Send and receive as much as goes without waiting."""
         before_s, self._served_s = self._served_s, time.monotonic()
-        self._busy_s += min(self._served_s - before_s, 2 * _SLICE_S)
+        self._busy_s += min(self._served_s - before_s, 2 * TIMEOUTS.slice_s)
         self._flush()
         ended = False
         try:
@@ -307,7 +299,7 @@ class EstimatorProcess:
 
     def wait(self) -> None:
         with contextlib.suppress(subprocess.TimeoutExpired):
-            self._process.wait(_END_S)
+            self._process.wait(TIMEOUTS.process_end_s)
 
     def _take(self, message: Any) -> None:
         if message is READY:
@@ -359,6 +351,6 @@ class EstimatorProcess:
 
 def _how(process: subprocess.Popen[bytes]) -> str:
     with contextlib.suppress(subprocess.TimeoutExpired):
-        code = process.wait(_REAP_S)
+        code = process.wait(TIMEOUTS.reap_s)
         return f" by signal {-code}" if code < 0 else f" with exit code {code}"
     return ""

@@ -1,18 +1,18 @@
-"""The journal of a session: the messages that it records, and among them its log and facts about the devices' clocks
-and connections."""
+"""The journal of a session: the stream of its messages, and among them its log and facts about the devices'
+connections."""
 
 from __future__ import annotations
 
 import re
 from collections import deque
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
-from typing import Protocol, cast
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Protocol
 
 from foxglove_schemas_protobuf.Log_pb2 import Log
 from google.protobuf.message import Message
 
-from aolink.devices.interfaces import Camera, ClockSampled, CommandAnswered, Device, Mirror, Time
+from aolink.devices.interfaces import Device, Time
 from aolink.recording import schemas_pb2 as pb
 from aolink.recording import topics
 from aolink.recording.writer import RecordingWriter
@@ -59,21 +59,32 @@ class Journal:
 
     def __init__(self, writer: RecordingWriter, report: Report, time: Time) -> None:
         self.report = report
-        self.sinks: list[Sink] = []
-        """The recorder comes before those that have more to record of a message."""
+        self._sinks: list[tuple[Sink, tuple[str, ...]]] = []
+        """Sinks in the order in which they get a message, and the topics that each wants; none stands for all."""
+        self._takers: dict[str, list[Callable[[str, int, Message], None]]] = {}
+        """What takes the messages of a topic, by topic."""
         self._writer, self._time = writer, time
         self._said: dict[str, _Said] = {}
         """The warnings by their kind."""
 
     def take(self, topic: str, time_ns: int, message: Message) -> None:
-        """Hand a message to all sinks."""
-        for sink in self.sinks:
-            sink.take(topic, time_ns, message)
+        """Hand a message to the sinks that want it."""
+        if (takers := self._takers.get(topic)) is None:
+            takers = [sink.take for sink, wanted in self._sinks if not wanted or topic in wanted]
+            self._takers[topic] = takers
+        for take in takers:
+            take(topic, time_ns, message)
 
-    def shown_by(self, view: View) -> Sink:
-        """A view as a sink of this session, which gets no more when it has failed."""
+    def add(self, sink: Sink, *wanted: str) -> None:
+        """Hand a sink the messages of some topics (of all, if none is named), after the sinks that were added before:
+        the recorder comes before those that have more to record of a message."""
+        self._sinks.append((sink, wanted))
+        self._takers.clear()
+
+    def show(self, view: View) -> None:
+        """Hand a view all messages, until it fails."""
         view.may_wait = self._time.virtual
-        return _Guarded(view, self)
+        self.add(_Guarded(view, self))
 
     def log(self, text: str, level: Log.Level.ValueType = Log.INFO) -> None:
         """Record a sentence about the session."""
@@ -96,27 +107,6 @@ class Journal:
             said.left_out += 1
             warnings[said.place] = f"{said.newest} (and {said.left_out} more of this kind)"
 
-    def clock(self, device: Device, sampled: ClockSampled) -> None:
-        """Record the comparison of a device's clock with the host's."""
-        clock, exchange, report = device.clock, sampled.exchange, self.report
-        sample = pb.ClockSample(
-            device=device.name, round_trip_ns=exchange.round_trip_ns, accepted=sampled.accepted, **asdict(exchange)
-        )
-        if clock.ready:
-            _, sigma_ns = clock.device_ns(exchange.host_receive_ns)
-            sample.offset_ns = clock.offset_ns(exchange.host_receive_ns)
-            sample.frequency_ppm, sample.sigma_ns = clock.frequency_ppm, sigma_ns
-            report.clock_offset_ns, report.clock_frequency_ppm = sample.offset_ns, sample.frequency_ppm
-            report.clock_sigma_ns = sigma_ns
-        self.take(topics.CLOCK, exchange.host_receive_ns, sample)
-        if sampled.step is not None:
-            size_s, period_s = sampled.step.size_ns / 1e9, (sampled.step.before_ns - sampled.step.after_ns) / 1e9
-            direction = "forward" if size_s > 0 else "back"
-            self.warn(
-                f"the {device.name}'s clock was set {direction} by {abs(size_s):.6f} s: host times of its stamps"
-                f" in the {period_s:.3f} s from {sampled.step.after_ns} ns on may be off by as much"
-            )
-
     def disk(self) -> None:
         """Warn of a disk that is held up: what ends the session is a full queue."""
         if not self._time.virtual and (held_up_s := self._writer.held_up_s) > TIMEOUTS.disk_s:
@@ -125,7 +115,7 @@ class Journal:
                 f" {self._writer.waiting_bytes} bytes wait"
             )
 
-    def statistics(self, devices: Sequence[Camera | Mirror], now: int) -> None:
+    def statistics(self, devices: Sequence[Device], now: int) -> None:
         """Record what each connection has counted."""
         counts = {device.name: device.statistics() for device in devices}
         for fault in topics.CONNECTION_FAULTS:
@@ -153,19 +143,3 @@ class _Guarded:
             except Exception as error:
                 self._view = None
                 self._journal.warn(f"a sink of this session's messages failed, and gets no more: {error}")
-
-
-def command_answer(mirror: Mirror, answered: CommandAnswered, receive_ns: int) -> pb.CommandAnswer:
-    """The mirror's answer to a command block as it is recorded, or that none came."""
-    block, ack, kind = answered.block, answered.ack, pb.CommandAnswer
-    message = kind(
-        block_id=block.block_id, first_step=block.first_step, n_steps=block.n_steps, answer=kind.NONE,
-        tries=answered.tries, times_full=answered.times_full, sent_ns=answered.sent_ns,
-    )  # fmt: skip
-    if ack is not None:
-        message.answer = cast(pb.CommandAnswer.Answer, ack.code)
-        message.text, message.answered_ns = ack.text, receive_ns
-        message.late_steps, message.superseded_steps = ack.late_steps, ack.superseded_steps
-        message.queue_end_step = ack.queue_end_step
-        message.device_ns = mirror.clock.device_ns(receive_ns)[0] if mirror.clock.ready else 0
-    return message

@@ -35,7 +35,7 @@ def test_a_count_that_recordings_have_no_field_for_is_named_once_and_left_out(tm
     rig, report, now = load_rig("section-vi"), Report(), [0]
     with RecordingWriter(tmp_path / "a.mcap", rig, {}, 0, deterministic=True) as writer:
         journal = Journal(writer, report, Host())
-        journal.sinks.append(writer)
+        journal.add(writer)
         for _ in range(2):
             journal.statistics([Counting(rig, lambda: now[0])], 0)
     text = "the mirror counts packets_sent, which recordings have no field for: not recorded"
@@ -57,7 +57,7 @@ def test_warnings_of_one_kind_are_limited_in_their_rate_and_the_others_counted(t
     rig, report, time = load_rig("section-vi"), Report(), Seconds()
     with RecordingWriter(tmp_path / "a.mcap", rig, {}, 0, deterministic=True) as writer:
         journal = Journal(writer, report, time)
-        journal.sinks.append(writer)
+        journal.add(writer)
         for frame in range(512):
             journal.warn(f"the model no longer fits (frame {frame}): NIS {frame / 7:.2f}, correlation {frame / 9:+.2g}")
         for name in ("o1", "o3", "theirs:order=10", "theirs:order=20"):
@@ -77,7 +77,7 @@ def test_a_warning_with_another_number_is_said(tmp_path: Path) -> None:
     report = Report()
     with RecordingWriter(tmp_path / "a.mcap", load_rig("section-vi"), {}, 0, deterministic=True) as writer:
         journal = Journal(writer, report, Host())
-        journal.sinks.append(writer)
+        journal.add(writer)
         said = [f"the camera's clock was set forward by {step} s" for step in ("0.000120", "3600.000000")]
         for text in said:
             journal.warn(text)
@@ -98,7 +98,7 @@ def test_a_disk_that_is_held_up_is_a_warning_not_the_end(tmp_path: Path, monkeyp
         tmp_path / "a.mcap", load_rig("section-vi"), {}, 0, options=WriteOptions(fsync_s=0.01)
     ) as writer:
         journal = Journal(writer, report, Host())
-        journal.sinks.append(writer)
+        journal.add(writer)
         monkeypatch.setattr(os, "fsync", slow)
         held_up.wait()
         monkeypatch.setattr(time, "monotonic", lambda: begin + clock[0])
