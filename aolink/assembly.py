@@ -192,14 +192,14 @@ class InputHistory:
         self._last = mirror.park
         self._reported_until = 0
         """First step that no report covers yet."""
-        self._known_until: int | None = None
-        """End of the steps that any command, report or frame is about, exclusive; None before the first."""
+        self.known_until = 0
+        """End of the steps that any command, report or frame is about, exclusive; 0 before the first."""
 
     def add_applied(self, message: pb.Applied | Run) -> None:
         first, end = message.first_step, message.first_step + message.n_steps
         # A mirror reports steps that it was sent: accepting a report of steps far beyond them would make all later ones
         # late.
-        if self._known_until is not None and end > self._known_until + _MOST_LEAD_STEPS:
+        if self.known_until and end > self.known_until + _MOST_LEAD_STEPS:
             return
         source = message.source if isinstance(message, pb.Applied) else pb.Applied.COMMAND
         if source == pb.Applied.AWAITED:
@@ -211,7 +211,7 @@ class InputHistory:
             parts = [part for low, high in self._awaited for part in ((low, min(high, first)), (max(low, end), high))]
             self._awaited = [(low, high) for low, high in parts if low < high]
         self._reported_until = max(self._reported_until, end)
-        self.know(end)
+        self.known_until = max(self.known_until, end)
 
     def is_known_until(self, end: int) -> bool:
         """Whether no report of a step before ``end`` is still to come."""
@@ -219,11 +219,7 @@ class InputHistory:
 
     def add_command(self, message: pb.CommandBlock | Run) -> None:
         if self._add(self._commanded, message):
-            self.know(message.first_step + message.n_steps)
-
-    def know(self, end: int) -> None:
-        """Note that a command, report or frame is about the steps before ``end``."""
-        self._known_until = end if self._known_until is None else max(self._known_until, end)
+            self.known_until = max(self.known_until, message.first_step + message.n_steps)
 
     def _add(self, blocks: _Blocks, message: pb.Applied | pb.CommandBlock | Run) -> bool:
         """Take the inputs of a run of steps; False where their number is not the stated one."""
@@ -319,7 +315,7 @@ class Assembler:
     def add_frame(self, frame: Frame) -> list[Exposure]:
         """Take a frame; gives the exposures that are complete with it."""
         self._frames.append(frame)
-        self._history.know(frame.last_step + 1 + self._delay)
+        self._history.known_until = max(self._history.known_until, frame.last_step + 1 + self._delay)
         return self._ready()
 
     def flush(self) -> list[Exposure]:

@@ -107,6 +107,8 @@ class _Block:
 
     block_id: int
     first: int
+    end: int
+    """First step after it."""
     steps: NDArray[np.int8]
     """State of each step: one of the four above."""
     answer: CommandAnswer | None = None
@@ -116,10 +118,6 @@ class _Block:
     """Whether the mirror has applied some of it."""
     instead: str = ""
     """What it held instead."""
-
-    @property
-    def end(self) -> int:
-        return self.first + len(self.steps)
 
 
 class Account:
@@ -151,7 +149,7 @@ class Account:
         """Note that a block is sent for the first time."""
         steps = np.full(block.n_steps, _OPEN, dtype=np.int8)
         steps[: max(self._reported_until - block.first_step, 0)] = _PASSED
-        self._blocks[block.block_id] = _Block(block.block_id, block.first_step, steps)
+        self._blocks[block.block_id] = _Block(block.block_id, block.first_step, block.first_step + block.n_steps, steps)
         self.counts.commanded += block.n_steps
         if len(self._blocks) > _MOST_OPEN:
             self._close(next(iter(self._blocks.values())))

@@ -150,7 +150,7 @@ class RecordingWriter:
         if self._error:
             raise self._error
         data = message.SerializeToString()  # fields by their numbers: without maps always the same bytes
-        if self.waiting_bytes > _QUEUE_BYTES:
+        if self._put_bytes - self._taken_bytes > _QUEUE_BYTES:
             self._wait_for_room()
         if topic not in self._classes:
             self._classes[topic] = type(message)

@@ -53,7 +53,7 @@ class Commanding:
         self._rig, self._time, self._mirror, self._controlling = rig, time, mirror, controlling
         self._inputs = inputs or partial(rig.drive.inputs, fast_step_s=rig.timing.fast_step_s)
         self._journal, self._latencies = journal, latencies
-        self._step_ns = rig.timing.fast_step_ns
+        self._step_ns, self._lead = rig.timing.fast_step_ns, lead_steps(rig.mirror)
         self._first_step = 0
         self._end_step: int | None = None
         self.queued_until = 0
@@ -66,8 +66,8 @@ class Commanding:
         step after the session, None if it goes on until it is stopped."""
         self._first_step = self.queued_until = first_step
         self._end_step = end_step
-        reach = self._rig.mirror.queue_steps - lead_steps(self._rig.mirror)
-        self._send(min(first_step, self.device_step() + reach), 0)
+        reach = self._rig.mirror.queue_steps - self._lead
+        self.send(0, min(first_step, self.device_step() + reach))
 
     def device_step(self) -> int:
         """The fast step that the device is in by its clock; on virtual time, the step that it waits at."""
@@ -79,7 +79,7 @@ class Commanding:
         """In how many fast steps the next command is due; None where there is none."""
         if not self._mirror.commanded or (self._end_step is not None and self.queued_until >= self._end_step):
             return None
-        return max(self.queued_until - self.device_step() - lead_steps(self._rig.mirror), 0) + 1
+        return max(self.queued_until - self.device_step() - self._lead, 0) + 1
 
     def go_back_to(self, step: int) -> None:
         """Send the inputs from a fast step on anew."""
@@ -101,20 +101,19 @@ class Commanding:
             self._mirror.go_on_from(step, step)
             self.queued_until = step
 
-    def send(self, newest_frame: int) -> None:
-        """Send what is due; the inputs can depend on the exposures up to ``newest_frame``."""
-        self._send(self.device_step(), newest_frame)
-
     def _reached_step(self) -> int:
         """The first fast step that a command which is sent now reaches in time."""
         margin = 0 if self._time.virtual else round(MARGIN_S * 1e9) // self._step_ns + 1
         return self.device_step() + margin
 
-    def _send(self, device_step: int, newest_frame: int) -> None:
+    def send(self, newest_frame: int, device_step: int | None = None) -> None:
+        """Send what is due in a fast step, by default in the one that the device is in; the inputs can depend on the
+        exposures up to ``newest_frame``."""
         if not self._mirror.commanded:
             return
+        device_step = self.device_step() if device_step is None else device_step
         block_steps, end_step = self._rig.mirror.block_steps, self._end_step
-        lead, control, cause = lead_steps(self._rig.mirror), self._controlling, newest_frame
+        lead, control, cause = self._lead, self._controlling, newest_frame
         if control is not None:  # queued inputs are sent anew after each exposure
             lead, cause = LEAD_BLOCKS * block_steps, control.cause_frame
         horizon = device_step + lead

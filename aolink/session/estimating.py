@@ -109,10 +109,8 @@ class InTheLoop:
         pass
 
     def offer(self, exposure: Exposure) -> list[Outcome]:
-        return [
-            Outcome(estimator=each.estimator, exposure=exposure, message=convert.estimate_message(each))
-            for each in self._driver.step(exposure)
-        ]
+        made = self._driver.step(exposure) if self.names else ()
+        return [Outcome(estimator=e.estimator, exposure=exposure, message=convert.estimate_message(e)) for e in made]
 
     def outcomes(self) -> list[Outcome]:
         return []

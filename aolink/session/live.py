@@ -39,14 +39,17 @@ class LiveExposures:
         self._estimating, self._control, self._serves = estimating, control, serves
         self.newest_frame = 0
         """The newest frame that commands can depend on."""
-        self._unsettled: dict[int, list[Outcome]] = {}
-        """Outcomes so far of the exposures that some estimators are still working on, by frame."""
+        self._working: dict[int, int] = {}
+        """How many estimators are still working on an exposure, by frame."""
+        self._unknown: set[int] = set()
+        """Frames of these that have no estimate yet."""
         self._hanging: set[str] = set()
         """The estimators that hang."""
 
     def take(self, topic: str, time_ns: int, message: Message) -> None:
         """Take the next message of the session; a report or a frame may complete exposures."""
-        self._take_exposures(self._assembly.take(topic, message), time_ns)
+        if exposures := self._assembly.take(topic, message):
+            self._take_exposures(exposures, time_ns)
 
     def flush(self, now_ns: int) -> None:
         """Take the exposures that are still incomplete at the session's end."""
@@ -56,12 +59,14 @@ class LiveExposures:
         for exposure in exposures:
             self._report.exposures += 1
             self._assembly.number(exposure)  # it keeps the number until then
-            self._unsettled[exposure.frame_id] = []
+            self._unknown.add(exposure.frame_id)
+            if names := self._estimating.names:
+                self._working[exposure.frame_id] = len(names)
             outcomes = self._estimating.offer(exposure)
             if self._control is not None and not self._serves:
                 self._control(exposure, None, log_time_ns)
-            if not self._estimating.names:
-                self._settle(exposure.frame_id)
+            if not names:
+                self._know(exposure.frame_id, self._time.now_ns())
             self._take_outcomes(outcomes, log_time_ns)
 
     def take_estimates(self) -> None:
@@ -88,14 +93,15 @@ class LiveExposures:
             if name in self._report.estimation:
                 self._report.estimation[name].add(outcome)
                 self._journal.take(topics.estimation_topic(name), log_time_ns, outcome.account())
-            outcomes_so_far = self._unsettled[frame_id]
-            if message is not None and all(each.message is None for each in outcomes_so_far):
+            if message is not None and frame_id in self._unknown:
                 self._know(frame_id, self._time.now_ns())
-            outcomes_so_far.append(outcome)
             if message is None:
                 self._note_failures()
-            if len(outcomes_so_far) == len(self._estimating.names):
-                self._settle(frame_id)
+            self._working[frame_id] -= 1
+            if not self._working[frame_id]:
+                del self._working[frame_id]
+                if frame_id in self._unknown:  # all have skipped it
+                    self._know(frame_id, 0)
 
     def _say_verdict(self, name: str, message: pb.Estimate) -> None:
         """Say that the model no longer fits, or that it does."""
@@ -111,13 +117,8 @@ class LiveExposures:
                 text = f"the estimator {name} failed, the recording goes on without it: {why}"
                 self._journal.warn(text, Log.ERROR)
 
-    def _settle(self, frame_id: int) -> None:
-        """Finish an exposure that all estimators have estimated or skipped."""
-        outcomes = self._unsettled.pop(frame_id)
-        if all(each.message is None for each in outcomes):
-            self._know(frame_id, 0 if outcomes else self._time.now_ns())
-
     def _know(self, frame_id: int, estimated_ns: int) -> None:
         """Note that commands from now on depend on a frame: its first estimate is there, or there will be none."""
+        self._unknown.discard(frame_id)
         self.newest_frame = max(self.newest_frame, frame_id)
         self._latencies.estimated(frame_id, estimated_ns, self._time.now_ns())

@@ -26,7 +26,7 @@ from aolink.session.estimating import Estimating, InTheLoop
 from aolink.session.interruptions import Interruptions
 from aolink.session.journal import Journal, View
 from aolink.session.live import LiveExposures
-from aolink.session.received import Received
+from aolink.session.received import Received, command_answer
 from aolink.session.report import EstimatorReport, LatencyBook, Report
 from aolink.session.schedule import Schedule
 from aolink.timeouts import TIMEOUTS
@@ -113,7 +113,7 @@ class SessionLoop:
             if self._parked_from is not None:
                 every.callback(self._account.parked_from, self._parked_from)
             for each in reversed(list(self._mirror.last_answers())):
-                every.callback(self._journal.take, topics.ANSWER, now, self._received.answer_message(each, now))
+                every.callback(self._journal.take, topics.ANSWER, now, command_answer(self._mirror, each, now))
 
     def finish_estimates(self, patience_s: float = TIMEOUTS.estimates_s) -> None:
         """Wait for the estimates under way, and record exposures without an estimate as skipped."""

@@ -123,7 +123,7 @@ class Received:
         self._journal.take(topics.APPLIED, receive_ns, applied)
 
     def _answer(self, device: Device, answer: CommandAnswered, receive_ns: int) -> None:
-        ack, message = answer.ack, self.answer_message(answer, receive_ns)
+        ack, message = answer.ack, command_answer(self._mirror, answer, receive_ns)
         self._journal.take(topics.ANSWER, receive_ns, message)
         if ack is None:
             return
@@ -133,21 +133,6 @@ class Received:
                 f"the mirror refused command block {ack.block_id} from fast step {answer.block.first_step}:"
                 f" {ack.text or wire.Code.Name(ack.code)}"
             )
-
-    def answer_message(self, answered: CommandAnswered, receive_ns: int) -> pb.CommandAnswer:
-        """The mirror's answer to a command block as it is recorded, or that none came."""
-        block, ack, kind, clock = answered.block, answered.ack, pb.CommandAnswer, self._mirror.clock
-        message = kind(
-            block_id=block.block_id, first_step=block.first_step, n_steps=block.n_steps, answer=kind.NONE,
-            tries=answered.tries, times_full=answered.times_full, sent_ns=answered.sent_ns,
-        )  # fmt: skip
-        if ack is not None:
-            message.answer = cast(pb.CommandAnswer.Answer, ack.code)
-            message.text, message.answered_ns = ack.text, receive_ns
-            message.late_steps, message.superseded_steps = ack.late_steps, ack.superseded_steps
-            message.queue_end_step = ack.queue_end_step
-            message.device_ns = clock.device_ns(receive_ns)[0] if clock.ready else 0
-        return message
 
     def _clock(self, device: Device, sampled: ClockSampled, receive_ns: int) -> None:
         """The comparison of a device's clock with the host's."""
@@ -175,3 +160,19 @@ class Received:
     def _text(self, device: Device, event: wire.Event, receive_ns: int) -> None:
         level = {wire.Event.INFO: Log.INFO, wire.Event.WARNING: Log.WARNING}.get(event.level, Log.ERROR)
         self._journal.log(f"{device.name}: {event.text}", level)
+
+
+def command_answer(mirror: Mirror, answered: CommandAnswered, receive_ns: int) -> pb.CommandAnswer:
+    """The mirror's answer to a command block as it is recorded, or that none came."""
+    block, ack, kind, clock = answered.block, answered.ack, pb.CommandAnswer, mirror.clock
+    message = kind(
+        block_id=block.block_id, first_step=block.first_step, n_steps=block.n_steps, answer=kind.NONE,
+        tries=answered.tries, times_full=answered.times_full, sent_ns=answered.sent_ns,
+    )  # fmt: skip
+    if ack is not None:
+        message.answer = cast(pb.CommandAnswer.Answer, ack.code)
+        message.text, message.answered_ns = ack.text, receive_ns
+        message.late_steps, message.superseded_steps = ack.late_steps, ack.superseded_steps
+        message.queue_end_step = ack.queue_end_step
+        message.device_ns = clock.device_ns(receive_ns)[0] if clock.ready else 0
+    return message

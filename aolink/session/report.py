@@ -232,8 +232,9 @@ class LatencyBook:
         self._known.clear()
 
     def acknowledged(self, block_id: int, receive_ns: int) -> None:
-        for frame_id in [frame_id for frame_id, block in self._blocks.items() if block == block_id]:
-            self._open[frame_id].command_acknowledged_ns = receive_ns
+        for frame_id, block in self._blocks.items():
+            if block == block_id:
+                self._open[frame_id].command_acknowledged_ns = receive_ns
 
     def applied(self, block_id: int, applied_ns: int, receive_ns: int) -> None:
         """Note that the device reports the first steps of a block, which ends the latency of its frames."""

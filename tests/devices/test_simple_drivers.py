@@ -28,7 +28,7 @@ from aolink.extensions import installed
 from aolink.recording.account import Account
 from aolink.rig import Rig, load_rig
 from aolink.rig.device_tables import Delay, DeviceTable
-from aolink.session.journal import command_answer
+from aolink.session.received import command_answer
 from aolink.wire import messages_pb2 as pb
 from tests.packages import package
 
