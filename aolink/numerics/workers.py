@@ -11,6 +11,7 @@ import multiprocessing
 import os
 import select
 import signal
+import subprocess
 import sys
 import threading
 import time
@@ -97,6 +98,30 @@ def end_with(parent: int) -> None:
         _LIBC.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() != parent:  # it ended before this
         os._exit(1)
+
+
+def beside(module: str, *arguments: int, niceness: int, **streams: Any) -> subprocess.Popen[bytes]:
+    """Run ``main(*arguments)`` of a module in a process of its own, for as long as this process lives.
+
+    Its linear algebra has one thread, because the cores are for this process as well. It imports modules from where
+    this process has found them, except the current folder, and gets no signal from a terminal. ``streams`` are those
+    of `subprocess.Popen`.
+    """
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(os.path.isabs, sys.path))}
+    environment |= dict.fromkeys(THREAD_VARIABLES, "1")
+    begin = f"from aolink.numerics.workers import begin_beside; begin_beside({os.getpid()}, {niceness})"
+    program = f"{begin}; from {module} import main; main(*{arguments})"
+    command = [sys.executable, "-P", "-c", program]
+    return subprocess.Popen(command, start_new_session=True, env=environment, **streams)
+
+
+def begin_beside(parent: int, niceness: int) -> None:
+    """Begin a process of `beside`: it ends with its parent, and comes after it where all cores are busy."""
+    end_with(parent)
+    if sys.platform == "linux":  # a session runs at real-time priority for its loop's sake only
+        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+    os.nice(niceness)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def _begin_to_watch() -> None:

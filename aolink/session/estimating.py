@@ -9,11 +9,9 @@ estimator by itself. It predicts over skipped exposures with the inputs that the
 from __future__ import annotations
 
 import contextlib
-import os
 import pickle
 import socket
 import subprocess
-import sys
 import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
@@ -24,11 +22,12 @@ from aolink.errors import EstimatorError
 from aolink.estimation import Driver, Estimate, exposure_model
 from aolink.estimation.driver import SkippedInputs
 from aolink.exposure import Exposure
-from aolink.numerics.workers import THREAD_VARIABLES
+from aolink.numerics.workers import beside
 from aolink.polling import wait_readable
 from aolink.recording import convert
 from aolink.recording import schemas_pb2 as pb
 from aolink.rig import Rig
+from aolink.session import estimator_process
 from aolink.session.estimator_process import LENGTH, NICENESS, READY, packed
 from aolink.session.waiting import Waiting, most_waiting
 from aolink.timeouts import TIMEOUTS
@@ -206,16 +205,10 @@ class EstimatorProcess:
         self._to_send: deque[memoryview] = deque()
         self._received = bytearray()
         self._connection, theirs = socket.socketpair()
-        # It imports modules from where this process has found them, except the current folder. Its linear algebra has
-        # one thread, as in all processes of a pool: the cores are for the loop as well.
-        environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(os.path.isabs, sys.path))}
-        environment |= dict.fromkeys(THREAD_VARIABLES, "1")
-        main = f"from aolink.session.estimator_process import main; main({theirs.fileno()}, {os.getpid()}, {niceness})"
         with theirs:
-            # It has a process group of its own: Ctrl-C goes to the session, which waits for estimates under way.
-            self._process = subprocess.Popen(
-                [sys.executable, "-P", "-c", main], pass_fds=[theirs.fileno()], stdin=subprocess.DEVNULL,
-                stdout=subprocess.DEVNULL, start_new_session=True, env=environment,
+            self._process = beside(
+                estimator_process.__name__, theirs.fileno(), niceness=niceness, pass_fds=[theirs.fileno()],
+                stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL,
             )  # fmt: skip
         self._connection.setblocking(False)
         self._send((rig, name))

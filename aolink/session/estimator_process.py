@@ -9,12 +9,9 @@ from __future__ import annotations
 
 import contextlib
 import gc
-import os
 import pickle
-import signal
 import socket
 import struct
-import sys
 import time
 from typing import Any
 
@@ -23,7 +20,6 @@ import numpy as np
 from aolink.errors import AolinkError
 from aolink.estimation import make_estimator
 from aolink.exposure import Exposure
-from aolink.numerics.workers import end_with
 from aolink.recording import convert
 from aolink.rig import Rig
 
@@ -45,13 +41,8 @@ def packed(message: object) -> bytes:
     return LENGTH.pack(len(data)) + data
 
 
-def main(fileno: int, parent: int, niceness: int) -> None:
+def main(fileno: int) -> None:
     """Estimate the exposures that come over the socket until it is closed."""
-    end_with(parent)
-    if sys.platform == "linux":  # a session runs at real-time priority for its loop's sake only
-        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
-    os.nice(niceness)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
     with socket.socket(fileno=fileno) as connection, connection.makefile("rb") as stream:
         try:
             _serve(connection, stream)

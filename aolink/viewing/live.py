@@ -6,22 +6,19 @@ messages become bytes, which a thread writes to the other process.
 
 from __future__ import annotations
 
-import os
 import pickle
 import subprocess
-import sys
 import tempfile
 import threading
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
-from functools import partial
 from typing import IO, TYPE_CHECKING, Any
 
 from google.protobuf.message import Message
 
 from aolink.errors import ViewerError
-from aolink.numerics.workers import THREAD_VARIABLES, end_with
+from aolink.numerics.workers import beside
 from aolink.recording.messages import RawMessage
 from aolink.viewing.process import check_display, window
 
@@ -131,21 +128,15 @@ def drawn(
 
     Raises `ViewerError` at the end where the process has failed.
     """
-    main = "from aolink.viewing.live_process import main; main()"
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(os.path.isabs, sys.path))}
-    environment |= dict.fromkeys(THREAD_VARIABLES, "1")
+    main = "aolink.viewing.live_process"  # not imported here: Rerun takes a second
     with (
         tempfile.TemporaryFile() as said,
-        # In a session of its own: Ctrl-C goes to the session, which ends it.
-        subprocess.Popen(
-            [sys.executable, "-P", "-c", main], stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=said,
-            start_new_session=True, env=environment, preexec_fn=partial(end_with, os.getpid()),
-        ) as process,
-    ):  # fmt: skip
+        beside(main, niceness=_NICENESS, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=said) as process,
+    ):
         pipe: Any = process.stdin
         answers: Any = process.stdout
         try:
-            pickle.dump((address, rig, list(estimators), true_scene, _NICENESS), pipe)
+            pickle.dump((address, rig, list(estimators), true_scene), pipe)
             pipe.flush()
             answers.readline()  # it is ready, or has ended
             live = LiveView(pipe)

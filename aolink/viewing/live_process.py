@@ -3,9 +3,7 @@ standard input."""
 
 from __future__ import annotations
 
-import os
 import pickle
-import signal
 import sys
 import time
 from collections.abc import Sequence
@@ -103,12 +101,8 @@ class LiveSender(Sender):
 
 def main() -> None:
     """Draw the messages that come until there are no more."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
     coming = sys.stdin.buffer
-    address, rig, estimators, true_scene, niceness = pickle.load(coming)
-    if sys.platform == "linux":  # a session runs at real-time priority for its loop's sake only
-        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
-    os.nice(niceness)
+    address, rig, estimators, true_scene = pickle.load(coming)
     stream = rr.RecordingStream(APPLICATION)
     if address.startswith("rerun+http"):
         stream.connect_grpc(address)
