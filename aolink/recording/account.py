@@ -17,8 +17,19 @@ REFUSALS = (CommandAnswer.OUT_OF_RANGE, CommandAnswer.WRONG_SHAPE, CommandAnswer
 """Answers by which the mirror refuses a whole block."""
 STEPS = ("commanded", "applied", "superseded", "late", "refused", "not_reported", "clipped")
 """The fields of `Commands` that count steps."""
-_OPEN, _PASSED, _UNKNOWN, _ENDED = range(4)
+OPEN, PASSED, UNKNOWN, ENDED = range(4)
 """State of a commanded step: not reported yet; reported without the command; held input unknown; counted."""
+QUEUED, LATE, REFUSED, UNANSWERED = range(4)
+"""What the mirror has said of a step's command: it was in time; the step had gone by; it refused the whole block; it
+said nothing, and is not waited for any more."""
+ENDS = {
+    QUEUED: {PASSED: "superseded", UNKNOWN: "not_reported"},
+    LATE: {PASSED: "late", UNKNOWN: "late"},
+    REFUSED: {OPEN: "refused", PASSED: "refused", UNKNOWN: "refused"},
+    UNANSWERED: {PASSED: "late", UNKNOWN: "not_reported"},
+}
+"""The count with which a step ends, by what the mirror has said of it and by its state; a step that is not here stays
+open. A step that is reported with its own command ends at once, as applied or as late."""
 _MOST_OPEN = 10_000
 """Most blocks of which some steps have not ended: in a recording reports may be missing."""
 _NAMES = {value: name for name, value in CommandAnswer.Answer.items()}
@@ -147,8 +158,8 @@ class Account:
 
     def commanded(self, block: CommandBlock) -> None:
         """Note that a block is sent for the first time."""
-        steps = np.full(block.n_steps, _OPEN, dtype=np.int8)
-        steps[: max(self._reported_until - block.first_step, 0)] = _PASSED
+        steps = np.full(block.n_steps, OPEN, dtype=np.int8)
+        steps[: max(self._reported_until - block.first_step, 0)] = PASSED
         self._blocks[block.block_id] = _Block(block.block_id, block.first_step, block.first_step + block.n_steps, steps)
         self.counts.commanded += block.n_steps
         if len(self._blocks) > _MOST_OPEN:
@@ -177,21 +188,21 @@ class Account:
             part = block.steps[max(first - block.first, 0) : end - block.first]
             if applied.block_id == block.block_id and applied.source != Applied.LATE:
                 block.applied = True
-                n_steps = self._count("applied", part, part != _ENDED)
+                n_steps = self._count("applied", part, part != ENDED)
                 self.counts.clipped += n_steps if applied.source == Applied.CLIPPED else 0
             else:
                 if not block.instead or applied.source == Applied.NOT_REPORTED:
                     block.instead = _INSTEAD.get(applied.source, "")
                 if applied.block_id == block.block_id:
-                    self._count("late", part, part != _ENDED)
-                part[part == _OPEN] = _UNKNOWN if applied.source == Applied.NOT_REPORTED else _PASSED
+                    self._count("late", part, part != ENDED)
+                part[part == OPEN] = UNKNOWN if applied.source == Applied.NOT_REPORTED else PASSED
             self._settle(block)
 
     def parked_from(self, step: int) -> None:
         """Note that the mirror was asked to park: the inputs queued for ``step`` and later are dropped."""
         for block in list(self._blocks.values()):
             part = block.steps[max(step - block.first, 0) :]
-            self._count("superseded", part, part == _OPEN)
+            self._count("superseded", part, part == OPEN)
             self._settle(block)
 
     def close(self) -> Commands:
@@ -202,24 +213,24 @@ class Account:
         return self.counts
 
     def _close(self, block: _Block) -> None:
-        block.steps[block.steps == _OPEN] = _UNKNOWN
+        block.steps[block.steps == OPEN] = UNKNOWN
         block.closed = True
         self._settle(block)
 
     def _settle(self, block: _Block) -> None:
         """Count the steps that have ended, as far as the answer to their block is known."""
         steps, answer = block.steps, block.answer
-        if answer is not None and answer.answer in REFUSALS:
-            self._count("refused", steps, steps != _ENDED)
-        elif answer is not None and answer.answer != CommandAnswer.NONE:
-            late = steps[: answer.late_steps]
-            self._count("late", late, (late == _PASSED) | (late == _UNKNOWN))
-            self._count("superseded", steps, steps == _PASSED)
-        elif answer is not None or block.closed:
-            self._count("late", steps, steps == _PASSED)
-        if answer is not None or block.closed:
-            self._count("not_reported", steps, steps == _UNKNOWN)
-        if (steps == _ENDED).all():
+        parts: dict[int, NDArray[np.int8]]
+        if answer is None or answer.answer == CommandAnswer.NONE:
+            parts = {UNANSWERED: steps} if answer is not None or block.closed else {}
+        elif answer.answer in REFUSALS:
+            parts = {REFUSED: steps}
+        else:
+            parts = {LATE: steps[: answer.late_steps], QUEUED: steps[answer.late_steps :]}
+        for said, part in parts.items():
+            for state, name in ENDS[said].items():
+                self._count(name, part, part == state)
+        if (steps == ENDED).all():
             del self._blocks[block.block_id]
             if not block.applied:
                 self._count_without_effect(block)
@@ -227,7 +238,7 @@ class Account:
     def _count(self, name: str, steps: NDArray[np.int8], ended: NDArray[np.bool_]) -> int:
         """Add steps to a count, and mark them as counted; gives how many."""
         n_steps = int(np.count_nonzero(ended))
-        steps[ended] = _ENDED
+        steps[ended] = ENDED
         setattr(self.counts, name, getattr(self.counts, name) + n_steps)
         return n_steps
 

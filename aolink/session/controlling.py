@@ -22,6 +22,13 @@ from aolink.wire import messages_pb2 as wire
 MARGIN_S = 0.003
 """Real time: how long a block may take to the mirror, at least, before its first step begins."""
 
+_SAID = {
+    State.CLOSED: "the loop is closed again from frame {frame} on",
+    State.HELD: "the loop is open from frame {frame} on, the mirror holds its input: {reason}",
+    State.PARKED: "the loop is open from frame {frame} on, the mirror goes to its safe input: {reason}",
+}
+"""What is said when the loop comes into a state."""
+
 
 def served(rig: Rig, controller: str, estimators: Sequence[str]) -> list[str]:
     """A session's estimators, each once; the default one where a controller needs one and none is named."""
@@ -84,9 +91,7 @@ class Controlling:
     def _news(self, act: Act) -> list[str]:
         news, frame = [], act.frame_id
         if act.state is not self._state:
-            held = "the mirror holds its input" if act.state is State.HELD else "the mirror goes to its safe input"
-            lost = f"the loop is open from frame {frame} on, {held}: {act.reason}"
-            news.append(f"the loop is closed again from frame {frame} on" if act.state is State.CLOSED else lost)
+            news.append(_SAID[act.state].format(frame=frame, reason=act.reason))
         if act.acting != self._acting:
             pays = f"{act.acting} would have left {100 * act.gained:.0f} % less of the slopes (rms) than {self._acting}"
             tried = f"{act.acting} is tried again"

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from aolink.devices.reports import AppliedReports
 from aolink.errors import DeviceError
 from aolink.recording import topics
-from aolink.recording.account import Account, Commands
+from aolink.recording.account import STEPS, Account, Commands
 from aolink.recording.editing import cut
 from aolink.recording.facts import recording_facts
 from aolink.recording.reader import Recording
@@ -400,3 +400,47 @@ def test_a_piece_of_a_recording_has_the_same_exposures(tmp_path: Path) -> None:
         for exposure in Recording(tmp_path / "b.mcap").exposures():
             assert np.array_equal(exposure.inputs, whole[exposure.frame_id].inputs)
             assert exposure.inputs_assumed == 0
+
+
+SAID = {
+    "in time": CommandAnswer(answer=CommandAnswer.OK),
+    "too late": CommandAnswer(answer=CommandAnswer.OK, late_steps=1),
+    "refused": CommandAnswer(answer=CommandAnswer.OUT_OF_RANGE),
+    "nothing": CommandAnswer(answer=CommandAnswer.NONE),
+}
+HELD = {
+    "no report yet": None,
+    "another command": pb.Applied(block_id=2, n_steps=1, source=pb.Applied.COMMAND),
+    "its safe input": pb.Applied(n_steps=1, source=pb.Applied.PARKED),
+    "no report at all": pb.Applied(n_steps=1, source=pb.Applied.NOT_REPORTED),
+    "this command": pb.Applied(block_id=1, n_steps=1, source=pb.Applied.COMMAND),
+    "this command, clipped": pb.Applied(block_id=1, n_steps=1, source=pb.Applied.CLIPPED),
+    "this command, too late": pb.Applied(block_id=1, n_steps=1, source=pb.Applied.LATE),
+}
+ENDS = {
+    # what the mirror held         in time         too late        refused     nothing: how the step ends, "" while open
+    "no report yet":             ("",             "",             "refused",  ""),
+    "another command":           ("superseded",   "late",         "refused",  "late"),
+    "its safe input":            ("superseded",   "late",         "refused",  "late"),
+    "no report at all":          ("not_reported", "late",         "refused",  "not_reported"),
+    "this command":              ("applied",      "applied",      "applied",  "applied"),
+    "this command, clipped":     ("applied",      "applied",      "applied",  "applied"),
+    "this command, too late":    ("late",         "late",         "late",     "late"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("said", SAID)
+@pytest.mark.parametrize("held", HELD)
+def test_what_is_said_and_held_decides_how_a_step_ends(said: str, held: str) -> None:
+    """Whichever comes first, unless the mirror refuses: then the step has ended. What is open ends with the session."""
+    answer, report, end = CommandAnswer(block_id=1, n_steps=1), HELD[held], ENDS[held][list(SAID).index(said)]
+    answer.MergeFrom(SAID[said])
+    for messages, expected in (([answer, report], "refused" if said == "refused" else end), ([report, answer], end)):
+        account = Account()
+        account.commanded(pb.CommandBlock(block_id=1, n_steps=1))
+        for message in messages:
+            if message is not None:
+                account.take("", 0, message)
+        ended = [name for name in STEPS[1:-1] if getattr(account.counts, name)]
+        assert ended == ([expected] if expected else [])
+        assert account.close().ended == account.counts.commanded == 1
