@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -137,15 +137,15 @@ def record(
         exposures = exposures or played.exposures or None
     names = served(loaded, control or "", estimator or [])
     get_ready(loaded, names)
+    asked: dict[str, Any] = {
+        "estimators": names, "exposures": exposures or 0, "calibration": calibration or "", "inputs": played,
+        "control": control or "", "force": force, "overwrite": overwrite,
+    }  # fmt: skip
     if dry_run:
         from aolink.session.dry_run import dry_run as checked
 
         with StopRequest().installed() as stop:
-            found = checked(
-                loaded, camera, mirror, output, estimators=names, exposures=exposures or 0,
-                calibration=calibration or "", inputs=played, control=control or "", force=force,
-                overwrite=overwrite, stop=stop,
-            )  # fmt: skip
+            found = checked(loaded, camera, mirror, output, **asked, stop=stop)
         stop.raise_if_asked()
         _print_dry_run(found, as_json)
         return
@@ -157,10 +157,8 @@ def record(
     with _live_view(loaded, names, shown=view) as live:
         with StopRequest().installed() as stop, progress("exposures", exposures) as tell:
             session.record(
-                loaded, camera, mirror, output, estimators=names, exposures=exposures or 0, note=note,
-                calibration=calibration or "", inputs=played, control=control or "", force=force,
-                sinks=[live] if live else (), overwrite=overwrite,
-                options=options, reconnect_s=reconnect, stop=stop, progress=on_progress, report=report,
+                loaded, camera, mirror, output, **asked, note=note, sinks=[live] if live else (), options=options,
+                reconnect_s=reconnect, stop=stop, progress=on_progress, report=report,
             )  # fmt: skip
         if live and live.left_out:
             warn(f"the view was too slow for this session: {live.left_out} messages were not shown")

@@ -10,7 +10,7 @@ from __future__ import annotations
 import contextlib
 import gc
 import io
-import time
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from importlib.metadata import version
@@ -37,7 +37,6 @@ from aolink.session.excitation import Excitation
 from aolink.session.journal import Sink, View
 from aolink.session.loop import SessionLoop
 from aolink.session.report import EstimatorReport, Report
-from aolink.session.waiting import Aside
 from aolink.signals import Interrupted
 from aolink.timeouts import TIMEOUTS
 
@@ -199,13 +198,13 @@ def record(
         report.warnings += warnings
         beside = None
         if not clock.virtual:
-            progress = aside.enter_context(_progress_aside(progress, report))
+            aside.enter_context(_progress_aside(progress, report))
             beside = aside.enter_context(BesideTheLoop(rig, estimators, controlling.estimator if controlling else ""))
             clock.beside = beside.processes
             aside.enter_context(_spared_collections())
         loop = SessionLoop(rig, clock, camera, mirror, writer, driver, inputs, sinks, beside, report, controlling)
         try:
-            loop.run(exposures, stop, progress)
+            loop.run(exposures, stop, progress if clock.virtual else lambda exposures: None)
         except BaseException as error:
             report.ended = f"error: {error}" if isinstance(error, AolinkError) else f"error: {error!r}"
             clock.hurry()
@@ -277,20 +276,23 @@ def _spared_collections() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _progress_aside(progress: Callable[[int], None], report: Report) -> Iterator[Callable[[int], None]]:
+def _progress_aside(progress: Callable[[int], None], report: Report) -> Iterator[None]:
     """Report the progress on a thread of its own: a terminal that takes no output would hold up the loop."""
-    aside, next_s = Aside[int](progress, 1), 0.0
+    ended, failed = threading.Event(), list[Exception]()
 
-    def report_progress(exposures: int) -> None:
-        nonlocal next_s
-        if (now_s := time.monotonic()) >= next_s:
-            next_s = now_s + TIMEOUTS.progress_s
-            aside.give(exposures)
+    def run() -> None:
+        try:
+            while not ended.wait(TIMEOUTS.progress_s):
+                progress(report.exposures)
+            progress(report.exposures)
+        except Exception as error:  # a session must not end because its picture fails
+            failed.append(error)
 
+    thread = threading.Thread(target=run, name="aolink-progress", daemon=True)
+    thread.start()
     try:
-        yield report_progress
+        yield
     finally:
-        aside.give(report.exposures)
-        aside.close(TIMEOUTS.last_progress_s)
-        if aside.failed is not None:
-            report.warnings.append(f"the progress of this session could not be shown: {aside.failed}")
+        ended.set()
+        thread.join(TIMEOUTS.last_progress_s)
+        report.warnings += [f"the progress of this session could not be shown: {error}" for error in failed]

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import math
-import threading
 from collections import deque
-from collections.abc import Callable
 from typing import Generic, TypeVar
 
 from aolink.rig import Timing
@@ -47,56 +45,3 @@ class Waiting(Generic[Item]):
         items = list(self._items)
         self._items.clear()
         return items
-
-
-class Aside(Generic[Item]):
-    """Calls a function, item by item, on a thread of its own, so that the caller never waits for it.
-
-    Parameters
-    ----------
-    function:
-        Called with each item; when it raises, it is not called again.
-    most:
-        How many items may wait for it, as in `Waiting`.
-    """
-
-    def __init__(self, function: Callable[[Item], None], most: int) -> None:
-        self.skipped = 0
-        """Items that the function had no time for."""
-        self.failed: Exception | None = None
-        """The exception that the function raised."""
-        self._function = function
-        self._waiting = Waiting[Item](most)
-        self._changed = threading.Condition()
-        self._closed = False
-        self._thread = threading.Thread(target=self._run, name="aolink-aside", daemon=True)
-        self._thread.start()
-
-    def give(self, item: Item) -> None:
-        """Hand over the next item."""
-        with self._changed:
-            self.skipped += len(self._waiting.put(item))
-            self._changed.notify()
-
-    def close(self, patience_s: float) -> bool:
-        """Wait up to ``patience_s`` until the function has taken all waiting items; gives whether it has."""
-        with self._changed:
-            self._closed = True
-            self._changed.notify()
-        self._thread.join(patience_s)
-        return not self._thread.is_alive()
-
-    def _run(self) -> None:
-        while True:
-            with self._changed:
-                while (item := self._waiting.take()) is None:
-                    if self._closed:
-                        return
-                    self._changed.wait()
-            if self.failed is not None:
-                self.skipped += 1
-                continue
-            try:
-                self._function(item)
-            except Exception as error:  # a session must not end because its picture fails
-                self.failed = error

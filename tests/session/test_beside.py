@@ -34,7 +34,7 @@ from aolink.rig import load_rig, parse_rig
 from aolink.session import Report, record
 from aolink.session.estimating import BesideTheLoop, Outcome
 from aolink.session.report import LatencyBook
-from aolink.session.waiting import Aside, Waiting, most_waiting
+from aolink.session.waiting import Waiting, most_waiting
 from aolink.wire import messages_pb2 as wire
 from tests.commands import simulated_rig
 from tests.conftest import Session
@@ -425,26 +425,6 @@ def test_a_queue_keeps_order_and_when_it_is_full_goes_on_with_the_newest() -> No
     assert waiting.take() == 0
     assert [waiting.put(k) for k in (3, 4, 5)] == [[], [1, 2, 3], []]
     assert [waiting.take() for _ in range(3)] == [4, 5, None]
-
-
-def test_who_is_slow_misses_some_and_nobody_waits_for_him() -> None:
-    began, go_on, shown = threading.Event(), threading.Event(), list[int]()
-
-    def show(item: int) -> None:
-        began.set()
-        go_on.wait(60)
-        shown.append(item)
-
-    aside = Aside[int](show, 2)
-    aside.give(0)
-    assert began.wait(60)
-    for item in range(1, 8):
-        aside.give(item)
-    assert not aside.close(0.01)
-    go_on.set()
-    assert aside.close(60)
-    assert shown == [0, 7]
-    assert aside.skipped == 6
 
 
 def test_half_a_second_may_wait() -> None:
