@@ -11,7 +11,6 @@ from aolink.gathered import REFUSED
 from aolink.plotting.overview import Overview, need_exposures
 from aolink.plotting.session import TIME, thinned
 from aolink.plotting.style import axes_or_new, legend_above
-from aolink.recording.topics import LATENCY_VIEW
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -62,7 +61,7 @@ def plot_latency(view: Overview, axes: Axes | None = None) -> Axes:
     for name, points in lines.items():
         if len(points):
             axes.plot(*thinned(*points.T), "--" if name.endswith(" takes") else "-", linewidth=0.8, label=name)
-    axes.set(xlabel=TIME, ylabel=LATENCY_VIEW, yscale="log")
+    axes.set(xlabel=TIME, ylabel="latency since exposure end, or taken (ms)", yscale="log")
     axes.grid(alpha=0.3)
     legend_above(axes, 3)
     return axes

@@ -88,8 +88,8 @@ class Topic:
     the messages themselves, other ones the exposures, estimates and pictures that are made of them."""
 
 
-_LOST, _RESIDUAL = "Lost and faulty since start (count)", "Loop: residual (slope units)"
-LATENCY_VIEW = "Latency since exposure end, or taken (ms)"
+_LOST, _RESIDUAL = "Lost, faulty (count)", "Loop: residual (slope units)"
+_LATENCY = "Latency (ms)"
 _FAULTS = (*CONNECTION_FAULTS, "retransmits", "reports_asked")
 
 TOPICS = (
@@ -125,14 +125,14 @@ TOPICS = (
     Topic(
         LATENCY, pb.Latency, "exposure",
         curves=tuple(
-            Curve(field, label, LATENCY_VIEW, 1e-6, since="exposure_end_ns", zero=False)
+            Curve(field, label, _LATENCY, 1e-6, since="exposure_end_ns", zero=False)
             for field, label in (
                 ("first_byte_ns", "first byte"), ("complete_ns", "frame complete"), ("estimated_ns", "estimated"),
                 ("command_sent_ns", "command sent"), ("command_acknowledged_ns", "acknowledged"),
             )
         ),
     ),
-    Topic(ESTIMATION, pb.Estimation, "exposure", curves=(Curve("took_ns", "takes", LATENCY_VIEW, 1e-6, zero=False),)),
+    Topic(ESTIMATION, pb.Estimation, "exposure", curves=(Curve("took_ns", "takes", _LATENCY, 1e-6, zero=False),)),
     Topic(
         CONNECTION, pb.ConnectionStatistics, "time",
         curves=(

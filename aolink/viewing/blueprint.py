@@ -154,16 +154,17 @@ class _Layout:
 
     def devices(self) -> list[View]:
         """The devices, and the texts."""
-        views = self.legended({"Mirror input (mirror's units)": [f"{entities.COMMAND}/**", f"{entities.APPLIED}/**"]})
+        views = self.legended({"Input (mirror's units)": [f"{entities.COMMAND}/**", f"{entities.APPLIED}/**"]})
         owners: dict[str, str] = {}
         curves: dict[str, dict[str, list[str]]] = {}
         for row in topics.TOPICS:
+            place = "devices" if row.belongs_to == "time" else row.name
             for curve in row.curves:  # of a view's title, the first topic's tabs have it
-                tabs = curves.setdefault(owners.setdefault(curve.view, row.name), {})
+                tabs = curves.setdefault(owners.setdefault(curve.view, place), {})
                 tabs.setdefault(curve.view, []).append(f"{entities.of(row.name)}/{curve.field}/**")
         for tabs in curves.values():
             views += self.legended(tabs)
-        views.append(rrb.StateTimelineView(origin=entities.STATUS, name="Exposures, status of estimators and mirror"))
+        views.append(rrb.StateTimelineView(origin=entities.STATUS, name="Status"))
         return [*views, self.texts()]
 
     def texts(self) -> View:
@@ -206,10 +207,11 @@ class _Layout:
         return rrb.TimeSeriesView(name=name, contents=expressions, time_ranges=ranges, plot_legend=corner)
 
     def room_above(self, shown: list[str]) -> rrb.ScalarAxis | None:
-        """An axis with room above the lines for a legend of them all; None where their extents are not known yet."""
+        """An axis with room above the lines for a legend of them all; None where their extents are not known yet,
+        or still grow."""
         chosen = tuple(path.removesuffix("**") for path in shown)
         found = [ends for path, ends in self.drawn.extents.items() if f"{path}/".startswith(chosen)]
-        if not found:
+        if not found or self.drawn.live:
             return None
         low, high = min(ends[0] for ends in found), max(ends[1] for ends in found)
         span = high - low or abs(high) or 1.0

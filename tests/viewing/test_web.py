@@ -7,18 +7,24 @@ import signal
 import subprocess
 import threading
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from urllib.parse import parse_qs, urlsplit
 
 import psutil
 import pytest
+from PIL import Image
 
 from aolink.colours import estimator_colour
 from aolink.recording.reader import Recording
+from aolink.rig import load_rig
+from aolink.session import Report, record
+from aolink.viewing.live import drawn
 from aolink.viewing.palette import APPLIED, TRUTH
 from aolink.viewing.process import Server, serving
 from aolink.viewing.save import save_rrd
+from tests.commands import simulated_rig
 from tests.needs import missing
 from tests.recording.small import write_small
 from tests.viewing import browser
@@ -30,6 +36,8 @@ if browser.program() is None:
 
 SHOWN_S = 240.0
 """How long the page may take: a software renderer on a busy machine is slow."""
+LATE_S = 30.0
+"""By how much a software renderer may be behind the session."""
 Wanted = tuple[str, tuple[int, int, int]]
 """A view and a colour."""
 ELSEWHERE = ("fonts.googleapis.com", "api.github.com", "tel.rerun.io", "app.rerun.io")
@@ -150,3 +158,30 @@ def test_only_this_machine_is_listened_to_and_no_page_from_elsewhere(full: Serve
     own = asyncio.run(answers(targets[0]))
     assert own[0] == "answered 200"
     assert own[1].startswith("answered")
+
+
+@pytest.mark.rare
+def test_a_session_that_goes_on_is_shown_in_a_browser(tmp_path: Path) -> None:
+    """It leaves the picture of the gallery behind, live.png."""
+    rig, names, best = load_rig("section-vi-lively"), ["o1", "moments"], estimator_colour("moments")
+    wanted = [("profile", best), ("path", best), ("errors", best), ("nis", best), ("input", APPLIED)]
+
+    async def seen_after(session: Future[Report]) -> browser.Picture:
+        async with browser.browser(1600, 1000) as tab:
+            await tab.open(f"{server.address}&renderer=webgl")
+            # Without a picture to take it draws nothing, and gets behind.
+            await tab.once(lambda seen: session.done() and not lacking(seen, wanted), SHOWN_S)
+            return await tab.once(lambda seen: False, LATE_S)
+
+    with serving() as server:
+        server.listen()
+        with (
+            simulated_rig("section-vi-lively", "--real-time", "--fault", "missing=0.1") as ports,
+            drawn(server.data_address, rig, names) as live,
+            ThreadPoolExecutor(1) as beside,
+        ):
+            path = tmp_path / "a.mcap"
+            session = beside.submit(record, rig, *ports, path, estimators=names, exposures=20, sinks=[live])
+            picture = asyncio.run(seen_after(session))
+    assert lacking(picture, wanted) == []
+    Image.fromarray(picture).quantize(64).save(tmp_path / "live.png", optimize=True)
