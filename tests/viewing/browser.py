@@ -24,7 +24,7 @@ OPTIONS = (
     "--headless=new", "--no-sandbox", "--disable-dev-shm-usage", "--no-first-run", "--disable-extensions",
     "--disable-background-networking", "--disable-component-update", "--mute-audio",
     "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist",
-    "--remote-debugging-port=0",
+    "--remote-debugging-port=0", "--window-size=1100,800",
     "--host-resolver-rules=MAP elsewhere.example 127.0.0.1, MAP * ~NOTFOUND, EXCLUDE 127.0.0.1",
 )  # fmt: skip
 """WebGL without a graphics card; no network, but another name for this machine, as a page from elsewhere would have."""
@@ -106,12 +106,12 @@ class Tab:
 
 
 @asynccontextmanager
-async def browser(width: int = 1100, height: int = 800) -> AsyncIterator[Tab]:
-    """A new browser with an empty page, of so many pixels; it ends with the block."""
+async def browser() -> AsyncIterator[Tab]:
+    """A new browser with an empty page; it ends with the block."""
     name = program()
     assert name is not None
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
-        command = [name, *OPTIONS, f"--window-size={width},{height}", f"--user-data-dir={folder}", "about:blank"]
+        command = [name, *OPTIONS, f"--user-data-dir={folder}", "about:blank"]
         process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         try:
             port = await _port(Path(folder) / "DevToolsActivePort", process)
