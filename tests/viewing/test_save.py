@@ -382,7 +382,7 @@ def test_what_a_session_lacks_has_no_view(tmp_path: Path) -> None:
     assert "/profile/measured" in entities
     assert not [p for p in entities if p.startswith(("/error", "/path", "/nis", "/latency", "/state"))]
     layout = str(read_blueprint(path))
-    assert "Mirror input " in layout
+    assert "Input " in layout
     for absent in ("error", "NIS", "Latency", "state"):
         assert f"{absent} " not in layout
 
