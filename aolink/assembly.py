@@ -218,6 +218,7 @@ class InputHistory:
         return end <= self._reported_until and min(self._awaited, default=(end, end))[0] >= end
 
     def add_command(self, message: pb.CommandBlock | Run) -> None:
+        """Take a command: it stands in where the mirror's report is lost."""
         if self._add(self._commanded, message):
             self.known_until = max(self.known_until, message.first_step + message.n_steps)
 
@@ -295,6 +296,7 @@ class Assembler:
 
     def __init__(self, rig: Rig) -> None:
         self._history = InputHistory(rig.mirror)
+        self.add_command = self._history.add_command
         self._rig, self._no_lead = rig, np.empty((0, rig.n_inputs))
         self._delay = rig.input_delay
         self._kept, self._kept_until = self._no_lead, 0
@@ -307,10 +309,6 @@ class Assembler:
         """Take a report of the mirror; gives the exposures that are complete with it."""
         self._history.add_applied(message)
         return self._ready()
-
-    def add_command(self, message: pb.CommandBlock | Run) -> None:
-        """Take a command: it stands in where the mirror's report is lost."""
-        self._history.add_command(message)
 
     def add_frame(self, frame: Frame) -> list[Exposure]:
         """Take a frame; gives the exposures that are complete with it."""
