@@ -51,6 +51,8 @@ _LARGE = 0.5
 """Amplitude, pixels, from which on the blur hides the target's profile, so that several amplitudes are tried."""
 _SIZES = 2.0 ** np.arange(-1, 2.25, 0.25)
 """Those, over what the scan says."""
+_EVERY = 4
+"""Of so many frames one tells the profile for each of them."""
 _DARKEST = 0.1
 """Contrast of a band, over the usual one's, from which on it is used."""
 _FRAMES_AT_ONCE = 64
@@ -211,8 +213,9 @@ class BandFit:
         ramp = state.profile[1] * (self.x - at[..., None])
         return state.profile[0] + ramp + (S @ self.wave).real, state.profile[1] + ((1j * self.q * S) @ self.wave).real
 
-    def normal(self, state: State) -> tuple[FloatArray, FloatArray, float]:
-        """Normal matrix and right side of Gauss and Newton's step, and the weighted sum of squares of what is left."""
+    def normal(self, state: State, every: int = 1) -> tuple[FloatArray, FloatArray, float]:
+        """Normal matrix and right side of Gauss and Newton's step, and the weighted sum of squares of what is left, of
+        one in so many frames."""
         G = self.transfer(state)
         image, D = self.shown(state, G)
         steps = []
@@ -227,7 +230,7 @@ class BandFit:
         N, y, total = np.zeros((size, size)), np.zeros(size), 0.0
         root = np.sqrt(self.weight)[None, :, None]
         for first in range(0, len(image), _FRAMES_AT_ONCE):
-            part = slice(first, first + _FRAMES_AT_ONCE)
+            part = slice(first, first + _FRAMES_AT_ONCE, every)
             waves = G[part, :, :, None] * self.wave
             columns = [each[part] for each in steps]
             columns += [-D[part] * each[:, None] for each in bend]
@@ -241,9 +244,9 @@ class BandFit:
             total += float(left @ left)
         return N, y, total
 
-    def profiled(self, state: State) -> State:
-        """With the likeliest profile, all else as it is."""
-        N, y, _ = self.normal(replace(state, profile=np.zeros_like(state.profile)))
+    def profiled(self, state: State, every: int = 1) -> State:
+        """With the likeliest profile of one in so many frames, all else as it is."""
+        N, y, _ = self.normal(replace(state, profile=np.zeros_like(state.profile)), every)
         P = len(state.profile)
         return replace(state, profile=_solved(N[-P:, -P:], y[-P:], _RIDGE))
 
@@ -252,7 +255,7 @@ class BandFit:
         narrow one that moves far are two of them. Beside a line the profile is known."""
         if state.tones or abs(a) < _LARGE:
             return [replace(state, tones=(*state.tones, (a, hz)))]
-        tried = [self.profiled(replace(state, tones=(*state.tones, (a * size, hz)))) for size in _SIZES]
+        tried = [self.profiled(replace(state, tones=((a * size, hz),)), _EVERY) for size in _SIZES]
         left = np.array([math.inf, *map(self.misfit, tried), math.inf])
         lowest = np.flatnonzero((left[1:-1] < left[:-2]) & (left[1:-1] < left[2:]))
         return [tried[k] for k in lowest[np.argsort(left[1:-1][lowest])][:2]]
