@@ -23,6 +23,8 @@ _SHORTEST = 0.1
 """Readout, in the time from frame to frame, below which none is."""
 _WIDER = 4.0
 """Amplitude, in widths of the target as it is seen, beyond which none is."""
+_DRIFT = 1.5
+"""Turns from the first row to the last below which slow motion is a drift."""
 _LEAST_SECOND = 0.05
 """Size of a second vibration over the first one's; what is smaller may be left of that."""
 _AS_WELL = stats.chi2.ppf(0.999, 1)
@@ -76,23 +78,33 @@ def _shared(found: Sequence[Sequence[Pair]]) -> list[Pair]:
     return [one for one, good in zip(found[0], (apart < _AS_WELL).any(axis=1), strict=True) if good]
 
 
-def _tones(fit: BandFit, place: FloatArray, weight: FloatArray, rows: FloatArray) -> list[tuple[float, ...]]:
+def _tones(
+    fit: BandFit, place: FloatArray, weight: FloatArray, rows: FloatArray, *, bent: bool = False
+) -> list[tuple[float, ...]]:
     """Of up to two vibrations the frequency that frames alone would say, Hz, turns from row to row, amplitude as
-    exposures leave it, and the standard deviation of the turns."""
+    exposures leave it, and the standard deviation of the turns. A target that is not ``bent`` is a parabola at rest."""
     rate, t, at = fit.of.rate_hz, fit.t, rows - rows.mean()
-    shared = (place * weight).sum(axis=0) / np.maximum(weight.sum(axis=0), 1e-300)
-    place = place - shared
-    hz = np.arange(rate / SLOWEST, rate / 2, 1 / (_OVERSAMPLED * fit.span_s))
+    across, counts = at / np.ptp(rows), weight.sum(axis=0)
+
+    def pattern(left: FloatArray) -> FloatArray:
+        """What all frames share."""
+        return np.asarray((left * weight).sum(axis=0) / np.maximum(counts, 1e-300))
+
+    shared = pattern(place)
+    place = place - (shared if bent else np.polyval(np.polyfit(across, shared, 2, w=np.sqrt(counts)), across))
+    original = place
+    hz = np.arange(rate / SLOWEST if bent else 0.0, rate / 2, 1 / (_OVERSAMPLED * fit.span_s))
     step = float(np.abs(np.diff(rows)).mean())
     turns = np.arange(-0.5 / step, 0.5 / step, 1 / (_OVERSAMPLED * np.ptp(rows)))
-    across = np.exp(-2j * np.pi * turns[:, None] * at)  # (G, B)
-    along = np.exp(-2j * np.pi * hz[:, None] * t)  # (F, K)
+    along, turned = np.exp(-2j * np.pi * hz[:, None] * t), np.exp(-2j * np.pi * turns[:, None] * at)  # (F, K), (G, B)
+    drift = (hz[:, None] < rate / SLOWEST) & (np.abs(turns) < _DRIFT / np.ptp(rows))
     scale = np.array([1 / fit.span_s, 1 / np.ptp(rows)])
     total, found = float(weight.sum()), list[tuple[float, ...]]()
     for _ in range(2):
         y = place * weight
-        power = 2 * np.abs(along @ y @ across.T) ** 2 / total
+        power = 2 * np.abs(along @ y @ turned.T) ** 2 / total
         noise = max(1.0, float(np.median(power)) / float(stats.chi2.median(2)))
+        power[drift] = 0.0
         k, m = np.unravel_index(int(power.argmax()), power.shape)
         if power[k, m] < 2 * noise * math.log(power.size / _OVERSAMPLED**2 / CHANCE):
             break
@@ -107,6 +119,9 @@ def _tones(fit: BandFit, place: FloatArray, weight: FloatArray, rows: FloatArray
         spread = float((weight.sum(axis=0) * at**2).sum())
         found.append((float(x[0]), float(x[1]), abs(a), math.sqrt(2 * noise / spread) / (2 * np.pi * abs(a))))
         place = place - (a * wave).real
+    left = float((pattern(place) ** 2 * counts).sum())
+    if not bent and left > float(stats.chi2.ppf(1 - CHANCE, int((counts > 0).sum()))) * noise:
+        return _tones(fit, original, weight, rows, bent=True)
     return found
 
 
