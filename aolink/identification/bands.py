@@ -24,6 +24,7 @@ from scipy import ndimage, special, stats
 
 from aolink.identification.vibration import CHANCE, MOST_LINES, SLOWEST, Part
 from aolink.numerics.arrays import ComplexArray, FloatArray
+from aolink.numerics.single_thread import by_one_thread
 
 Tones = tuple[tuple[complex, float], ...]
 """Amplitude at the film's middle, pixels, and frequency, Hz, of each line."""
@@ -391,6 +392,7 @@ def _solved(N: FloatArray, y: FloatArray, damping: float) -> FloatArray:
     return np.asarray(np.linalg.solve(N * scale[:, None] * scale + damping * np.eye(len(N)), y * scale) * scale)
 
 
+@by_one_thread
 def find(bands: Bands, most: int = MOST_LINES, tell: Callable[[int, int], None] = lambda done, of: None) -> BandsFound:
     """The lines of a target, at most so many, the strongest first; none where chance explains what is seen.
 

@@ -32,6 +32,7 @@ from aolink.jobs.look_spots import Spots, find_spots
 from aolink.jobs.look_texture import Followed, Region, beside, lively, measured
 from aolink.limits import check_room
 from aolink.numerics.arrays import BoolArray, FloatArray
+from aolink.numerics.single_thread import by_one_thread
 from aolink.optics.texture import MARGIN, turned_covariances
 
 FRAMES = 500
@@ -183,6 +184,7 @@ class Looked:
         return bool(self.found.lines) or self.moved > 0
 
 
+@by_one_thread  # its many small problems take several times as long on a busy machine otherwise
 def look(
     film: Film, settings: FilmSettings, name: str, *, kernel: float | None = None, frames: int = FRAMES,
     at: tuple[float, float] | None = None, size: int = 40, tell: Tell = lambda what, done, of: None,

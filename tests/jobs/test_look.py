@@ -143,7 +143,7 @@ def test_a_part_of_a_picture_of_anything_is_measured_by_its_texture() -> None:
     assert line.ellipse[0] == pytest.approx(1.2, rel=0.1)
     assert np.degrees(line.ellipse[2]) == pytest.approx(20, abs=3)
     assert not looked.camera
-    assert looked.text == ""
+    assert parse_rig(looked.text).sensor.shape == (48, 48)
     settings = FilmSettings(rate_hz=25.0, exposure_s=0.04)
     chosen = look(array_film(scene(32.0, 1.2), "plate"), settings, "plate", at=(64, 48), size=32)
     assert chosen.lines[0].hz == pytest.approx(32.0, abs=0.02)
@@ -302,7 +302,7 @@ def test_the_path_of_a_fork_is_that_of_its_single_frames(aolink: Run, tmp_path: 
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("summed", "opened"), [(40, 40), (40, 20), (30, 30), (20, 20), (25, 20)])
+@pytest.mark.parametrize(("summed", "opened"), [(40, 40), (40, 20), (30, 30)])
 def test_a_fork_of_32_hz_is_found_in_films_of_slow_cameras(summed: int, opened: int) -> None:
     """25 exposures a second see 32 Hz as 7."""
     slow, _ = fork(summed, opened)
