@@ -157,6 +157,10 @@ class RecordingWriter:
         self._put_bytes += len(data)
         self._queue.append((topic, None if self._lead is None else message, data, time_ns))
 
+    def write(self, topic: str, message: Message, time_ns: int) -> None:
+        """Record a message, for who is no stream: as `take`."""
+        self.take(topic, time_ns, message)
+
     def _wait_for_room(self) -> None:
         while self.waiting_bytes > _QUEUE_BYTES:
             if self._error:
