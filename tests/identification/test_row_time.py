@@ -7,9 +7,10 @@ import pytest
 
 from aolink.identification.bands import BandFit, Bands
 from aolink.identification.row_time import Pair, pairs
+from aolink.numerics.arrays import FloatArray
 from tests.identification.test_bands import seen
 
-ROWS = (np.arange(120).reshape(60, 2) + 0.0).mean(axis=1)
+ROWS: FloatArray = 0.5 + 2 * np.arange(60.0)
 
 
 def found(bands: Bands) -> list[Pair]:
