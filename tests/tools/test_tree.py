@@ -27,5 +27,5 @@ def test_the_readme_of_the_wheel_has_no_link_into_this_repository() -> None:
     needed("hatchling")
     command = [sys.executable, "-m", "hatchling", "metadata", "readme"]
     made = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
-    assert "To use it: estimators, calibrate" in made.stdout
+    assert "To use it: " in made.stdout
     assert not re.search(r"\]\((?!https?:)", made.stdout)
