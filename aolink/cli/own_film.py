@@ -2,6 +2,7 @@
 
 import json
 import math
+from contextlib import ExitStack
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Annotated
@@ -66,6 +67,7 @@ def look(
     page, path, tone, rig_file, recording = (folder / each for each in names)
     if not overwrite and (there := [folder / each for each in names if (folder / each).exists()]):
         raise RecordingError(f"{there[0]} exists already: give another -o DIR, or --overwrite")
+    made = not folder.exists()
     try:  # before anything is computed
         folder.mkdir(parents=True, exist_ok=True)
         with TemporaryDirectory(dir=folder, prefix=".look-"):
@@ -73,11 +75,14 @@ def look(
     except OSError as error:
         raise ImportingError(f"{folder} cannot be written: {error.strerror}") from None
     place = None if at is None else _place(at)
-    with progress("look", None) as tell:
+    with ExitStack() as failing, progress("look", None) as tell:
+        if made:
+            failing.callback(folder.rmdir)
         looked = look_at(
             shown, settings, source.stem, kernel=kernel, at=place, size=size,
             tell=lambda what, done, of: tell(done, f"{what}: {done} of {of}"),
         )  # fmt: skip
+        failing.pop_all()
     if not as_json:
         stdout.print(paragraph(looked), markup=False)
     commands, written = [], {"page": page, "path": None, "tone": None, "rig": None, "recording": None}
@@ -95,10 +100,13 @@ def look(
             else:
                 imported.replace(recording)
         written |= {"rig": rig_file, "recording": recording}
+        about = ",".join(f"{each:g}" for each in looked.recorded[1].places[0]) if looked.recorded[1].places else ""
+        again = f"{program()} import {source} --rig {rig_file} --at {about} -o again.mcap"
         commands = [
             f"{program()} view {recording}",
             f"{program()} info {recording}",
             f"{program()} report {recording} -o {folder / 'report.html'}",
+            *([again] if about else []),
         ]
     if looked.found.lines:
         write_path(looked, path, overwrite=overwrite)

@@ -253,11 +253,13 @@ def score_table(by_name: Mapping[str, Score], only: Container[str] = ()) -> Scor
         columns["gated"] = lambda each: f"{each.gated} of {each.estimated}"
     columns = {name: column for name, column in columns.items() if not only or name in only}
     notes = []
+    rows = {name: [column(each) for column in columns.values()] for name, each in by_name.items()}
+    marked = any("!" in value for row in rows.values() for value in row)
     if bounds := _bounds(by_name):
         of_states = "RMSE start" in columns and any(math.isfinite(each.start_rmse) for each in scores)
         norm = "RMSE of states: norm over the states. " if of_states else ""
-        notes += [f"{norm}! outside the 95 % bounds of a consistent filter:", bounds]
-    rows = {name: [column(each) for column in columns.values()] for name, each in by_name.items()}
+        what = "Marked !: outside the" if marked else "Inside the"
+        notes += [f"{norm}{what} 95 % bounds of a consistent filter:", bounds]
     verdicts = [
         f"{name}: {each.verdict.text}" for name, each in by_name.items() if each.verdict and each.verdict.exposures
     ]

@@ -51,9 +51,10 @@ def meaning(name: str, unit: str = "") -> tuple[str, str, float | None]:
     name, unit = (re.sub("[\N{MICRO SIGN}\N{GREEK SMALL LETTER MU}]", "u", each) for each in (name, unit))
     size = _SIZES.get(unit.strip(" []()\\").lower(), math.nan) if unit else None
     plain = re.sub(r"[\W_]", "", name).lower()
-    if plain not in _FACTS and (found := _UNIT.search(name)) and found[0].strip(" _-.()[]").lower() in _SIZES:
-        plain = re.sub(r"[\W_]", "", name[: found.start()]).lower()
-        size = _SIZES[found[0].strip(" _-.()[]").lower()]
+    if (found := _UNIT.search(name)) and found[0].strip(" _-.()[]").lower() in _SIZES:
+        before = re.sub(r"[\W_]", "", name[: found.start()]).lower()
+        if before in _FACTS or plain not in _FACTS:  # exposure_s is no plural
+            plain, size = before, _SIZES[found[0].strip(" _-.()[]").lower()]
     return _FACTS.get(plain, ""), plain, size
 
 

@@ -128,7 +128,7 @@ def _windows(
     rows, columns = (pixels // windows for pixels, windows in zip(sensor.shape, sensor.grid, strict=True))
     cuts = []
     for x, y in places:
-        left, top = round(x - (columns - 1) / 2), round(y - (rows - 1) / 2)
+        left, top = (math.floor(at - (side - 1) / 2 + 0.5) for at, side in ((x, columns), (y, rows)))
         if not (0 <= left <= width - columns and 0 <= top <= height - rows):
             window = f"window of {columns} x {rows} pixels about --at {x:g},{y:g}"
             raise ImportingError(f"{film.name}: the {window} is not inside its pictures of {width} x {height} pixels")

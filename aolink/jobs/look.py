@@ -378,9 +378,9 @@ def _with_rig(looked: Looked, region: Followed, film: Film, settings: FilmSettin
     known = np.isfinite(seen.spread_variance[:, 0]).any(axis=0)
     blur = turned_covariances(seen.axes[0].T) @ np.where(known, -found.constant[0], 0.0)
     film, steps = first_of(film, looked.frames), FastSteps.of(looked.rate_hz, looked.exposure_s)
-    text = region_text(name, film, steps, _models(found, 1.0, seen), reference, noise, blur)
     side, first = len(reference), region.region
     middle = (first.x - MARGIN + (side - 1) / 2, first.y - MARGIN + (side - 1) / 2)
+    text = region_text(name, film, steps, _models(found, 1.0, seen), reference, noise, blur, middle)
     return replace(looked, text=text, recorded=(film, replace(settings, places=(middle,))))
 
 

@@ -19,6 +19,7 @@ from aolink.files import writing
 from aolink.identification.vibration import Vibration
 from aolink.jobs.look import Looked
 from aolink.jobs.look_rows_page import draw_bands, draw_scan, rows_figures
+from aolink.jobs.look_texture import Region
 from aolink.jobs.look_words import in_set, paragraph, size_of
 from aolink.numerics.arrays import FloatArray
 from aolink.optics.sensor import PIXEL
@@ -59,7 +60,7 @@ def write_page(looked: Looked, path: Path, name: str, commands: Sequence[str], *
         if looked.moves and looked.rows is None:
             figures.append(picture_in_page(_places(looked), "The mean place in each frame, and the vibrations in it."))
             figures.append(picture_in_page(_spectrum(looked), "Spectrum of the places, which aliases share, and what"
-                                           " the blur says of each frequency: the higher, the likelier."))  # fmt: skip
+                                           " the blur says of each frequency, each over its highest."))  # fmt: skip
         parts += [
             "<h2>Pictures</h2>",
             f'<div class="row pairs">{"".join(f"<div>{each}</div>" for each in figures)}</div>',
@@ -126,11 +127,16 @@ def _numbers(looked: Looked) -> dict[str, str]:
         rows["spots"] = ", ".join(f"at {x},{y}" for x, y in looked.spots.corners + half)
         rows["kernel"] = f"{looked.sd:.3g} pixels (standard deviation)"
     else:
-        rows["region"] = ", ".join(f"{each.columns} x {each.rows} at {each.x},{each.y}" for each in looked.regions[:1])
+        rows["region"] = ", ".join(_about(each) for each in looked.regions[:1])
     for line, parts, n in zip(looked.found.lines, looked.found.sets, looked.harmonics, strict=True):
         rows[f"{line.hz:.4g} Hz"] = f"{in_set(parts)}; {size_of(line, looked)}{'' if n == 1 else f'; harmonic {n}'}"
     rows["places"] = f"move by {looked.moved:.3g} pixels rms from frame to frame; {looked.rest:.2g} are not explained"
     return rows
+
+
+def _about(region: Region) -> str:
+    x, y = region.x + region.columns // 2, region.y + region.rows // 2
+    return f"{region.columns} x {region.rows} pixels about {x},{y}"
 
 
 def _whole(looked: Looked) -> Figure:
@@ -170,7 +176,7 @@ def _draw_places(looked: Looked, axes: Axes) -> None:
         angle = looked.found.lines[0].ellipse[2]
         along = np.array([math.cos(angle), math.sin(angle)])
     times = looked.seen.times_s
-    axes.plot(times, places @ along, ".", markersize=3, color="black", label="mean place of a frame")
+    axes.plot(times, places @ along, ".", markersize=3, color="black", label="mean of a frame")
     if looked.found.lines:
         inside = (np.arange(STEPS) + 0.5) / STEPS - 0.5
         fine = times[:, None] + inside * looked.exposure_s
@@ -178,7 +184,7 @@ def _draw_places(looked: Looked, axes: Axes) -> None:
         path = (looked.path(fine) + (drift - drift.mean(axis=0))[:, None]) @ along
         joined = np.concatenate([path, np.full((len(path), 1), np.nan)], axis=1)
         at = np.concatenate([fine, fine[:, -1:]], axis=1)
-        axes.plot(at.ravel(), joined.ravel(), color="tab:orange", linewidth=0.8, label="path in the exposures, 95 %")
+        axes.plot(at.ravel(), joined.ravel(), color="tab:orange", linewidth=0.8, label="path, 95 %")
         band = _BAND * looked.rest / math.sqrt(2)
         axes.fill_between(
             at.ravel(), joined.ravel() - band, joined.ravel() + band, color="tab:orange", alpha=0.25, linewidth=0
@@ -201,7 +207,7 @@ def _spectrum(looked: Looked) -> Figure:
 
 
 def _draw_evidence(looked: Looked, axes: Axes) -> None:
-    """How much each frequency explains of the places and of the blur, in standard deviations."""
+    """How much each frequency explains of the places and of the blur, over what the best one does."""
     of = Vibration(looked.seen)
     means, spreads, constants, _ = of.scan(())
     none, off, constant = of.chi_squares(())
@@ -209,13 +215,14 @@ def _draw_evidence(looked: Looked, axes: Axes) -> None:
     top = max([1.2 * part.high for part in parts] + [2 * looked.rate_hz])
     shown = of.hz < top
     places, blur = none - means, off + constant - spreads - constants
-    for name, gained, color in (("places", places, "black"), ("blur", blur, "tab:blue")):
-        axes.plot(of.hz[shown], np.sqrt(np.maximum(gained[shown], 0.0)), color=color, linewidth=0.5, label=name)
+    for name, gained, color, width in (("places", places, "0.6", 0.5), ("blur", blur, "tab:blue", 1.2)):
+        found = np.sqrt(np.maximum(gained[shown], 0.0))
+        axes.plot(of.hz[shown], found / max(float(found.max()), 1e-12), color=color, linewidth=width, label=name)
     for part in parts:
         axes.axvline(part.best, color="tab:orange", linewidth=2.5, alpha=0.35, zorder=0)
     for k in range(1, math.ceil(2 * top / looked.rate_hz)):
         axes.axvline(k * looked.rate_hz / 2, color="tab:gray", linewidth=0.4, linestyle=":")
-    axes.set(xlabel="frequency, Hz (with the blur)", xlim=(0, top), ylim=(0, None), ylabel="evidence")
+    axes.set(xlabel="frequency, Hz", xlim=(0, top), ylim=(0, 1.05), ylabel="evidence / highest")
     legend_above(axes)
 
 

@@ -98,14 +98,16 @@ def first_of(film: Film, count: int) -> Film:
 
 def region_text(
     name: str, film: Film, steps: FastSteps, models: Sequence[ProcessSum | None], reference: FloatArray,
-    noise: float, blur: FloatArray,
+    noise: float, blur: FloatArray, middle: tuple[float, float],
 ) -> str:  # fmt: skip
     """The rig file of a region: its reference and a pixel's noise, in light of the film, the covariance of the path in
     the reference, xx, xy and yy, pixels squared."""
     scale = default_scale(film, _FULL_SCALE)
     reference, noise = scale * reference, scale * noise
     rows = "".join(f"    {json.dumps(row)},\n" for row in np.rint(reference).astype(int).tolist())
-    text = f"""{resting(name, film.name, 1, 2, _REST, steps)}
+    place = ",".join(f"{each:g}" for each in middle)
+    text = f"""# Its place in that film: `aolink import {film.name} --at {place}` makes the recording.
+{resting(name, film.name, 1, 2, _REST, steps)}
 [sensor]              # slope unit: a pixel
 kind = "region"
 read_noise_counts = {max(noise, 0.3):.4g}

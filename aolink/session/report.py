@@ -9,6 +9,7 @@ from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 from aolink.control import Act, State
+from aolink.estimation.estimate import Status
 from aolink.recording import schemas_pb2 as pb
 from aolink.recording.account import STEPS, Commands
 from aolink.recording.topics import CONNECTION_FAULTS
@@ -29,6 +30,8 @@ class EstimatorReport:
     """Exposures that the estimator had no time for, or that came after it had failed."""
     failed: str = ""
     """The reason of its failure; empty where it did not fail."""
+    unmeasured: int = 0
+    """Exposures in which it could measure nothing."""
     took_ms: list[float] = field(default_factory=list)
     """Durations of its estimates, one after the other; the newest ones, `_KEPT_LATENCIES` at most."""
 
@@ -38,6 +41,7 @@ class EstimatorReport:
             self.skipped += 1
             return
         self.estimated += 1
+        self.unmeasured += outcome.message.status == Status.INPUT_INVALID
         self.took_ms.append(outcome.took_ns / 1e6)
         del self.took_ms[:-_KEPT_LATENCIES]
 

@@ -116,6 +116,8 @@ def _estimation(report: EstimatorReport) -> str:
     text = f"{report.estimated} of {report.estimated + report.skipped} exposures"
     if report.skipped:
         text += f", {report.skipped} skipped" + (": it failed" if report.failed else " for want of time")
+    if report.unmeasured:
+        text += f", {report.unmeasured} without a measurement: `aolink info` says why"
     if report.took_ms:
         p50, p99 = np.percentile(report.took_ms, [50, 99])
         text += f"; one takes p50 {p50:.2f} ms, p99 {p99:.2f} ms"
