@@ -114,3 +114,16 @@ def test_a_start_that_is_not_known_is_said(header, start_ns, says, tmp_path):
     film = open_film(others.write_fits(tmp_path / "a.fits", FRAMES, **header))
     assert film.start_ns == start_ns
     assert not film.notes if says is None else film.notes[0].startswith(says)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "seconds"),
+    [
+        ("exposure_s", 0.04, 0.04), ("exposure_time_s", 0.05, 0.05), ("exposure_ms", 12.0, 0.012),
+        ("exposureTimeUs", 900.0, 9e-4),
+    ],
+)  # fmt: skip
+def test_the_unit_of_an_exposure_that_its_name_has_is_taken(name, value, seconds, tmp_path):
+    """Also where it does not fit between the frames: that is said and not mended by another unit."""
+    np.savez(tmp_path / "film.npz", frames=FRAMES, rate_hz=30.0, **{name: value})
+    assert open_film(tmp_path / "film.npz").exposure_s == pytest.approx(seconds)

@@ -410,3 +410,14 @@ def test_the_row_time_of_a_film_is_known_or_said(tmp_path):
     assert estimate.alignment.steps == pytest.approx(possible_skew_ns(rig).max() / rig.timing.fast_step_ns)
     none, _ = made(tmp_path, frames, rig)
     assert next(iter(none.exposures())).row_sigma_ns is None  # a mirror that rests has the same inputs at any time
+
+
+@pytest.mark.parametrize("side", [8, 9])
+def test_a_window_moves_by_a_pixel_where_its_place_does(side, tmp_path):
+    rig = parse_rig(load_rig("single-lenslet").toml.replace("window = [16, 16]", f"window = [{side}, {side}]"))
+    frames = np.tile(np.arange(40, dtype=np.uint16), (12, 40, 1))
+    first = []
+    for x in range(10, 16):
+        recording, _ = made(tmp_path, frames, rig, FilmSettings(places=((x, 20),), row_time_s=0.0))
+        first.append(int(next(iter(recording)).pixels[0, 0]))
+    assert np.diff(first).tolist() == [1] * 5

@@ -203,6 +203,8 @@ def test_the_command_writes_a_rig_file_a_recording_a_page_the_path_and_a_tone(ao
     again = aolink("look", "film.npz")
     assert again.returncode != 0
     assert "exists already" in again.stderr
+    assert aolink("look", "film.npz", "--exposure", "1", "-o", "none").returncode != 0
+    assert not (tmp_path / "none").exists()
 
 
 @pytest.mark.slow
