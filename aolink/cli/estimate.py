@@ -170,4 +170,6 @@ def _estimate_one(
             if recording.estimators and not recording.rig_is_recorded:
                 beside = "; the recording's own estimates were made with another rig file and are left out"
             stdout.print(f"written: {output}{beside}", markup=False)
+        else:
+            stdout.print("These estimates are not kept: -o FILE writes them.")
     common.check_measured(recording.path, scores)
