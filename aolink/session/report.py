@@ -9,7 +9,6 @@ from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 from aolink.control import Act, State
-from aolink.estimation.estimate import Status
 from aolink.recording import schemas_pb2 as pb
 from aolink.recording.account import STEPS, Commands
 from aolink.recording.topics import CONNECTION_FAULTS
@@ -41,7 +40,7 @@ class EstimatorReport:
             self.skipped += 1
             return
         self.estimated += 1
-        self.unmeasured += outcome.message.status == Status.INPUT_INVALID
+        self.unmeasured += outcome.message.status == pb.Estimate.INPUT_INVALID
         self.took_ms.append(outcome.took_ns / 1e6)
         del self.took_ms[:-_KEPT_LATENCIES]
 
