@@ -49,7 +49,6 @@ def look(
     with, and a recording with estimates.
     """
     from aolink.importing.recording import import_film
-    from aolink.jobs.look import ESTIMATORS
     from aolink.jobs.look import look as look_at
     from aolink.jobs.look_page import write_page, write_path, write_tone
     from aolink.jobs.look_words import as_json as numbers
@@ -94,9 +93,10 @@ def look(
             imported = Path(temporary) / recording.name
             import_film(looked.recorded[0], rig, looked.recorded[1], imported, sources=[source])
             if looked.moves:
-                of = ESTIMATORS[looked.spots is not None]
                 with progress("estimate", looked.frames) as tell:
-                    write_reestimated(Recording(imported), [of], recording, overwrite=overwrite, progress=tell)
+                    write_reestimated(
+                        Recording(imported), [looked.estimator], recording, overwrite=overwrite, progress=tell
+                    )
             else:
                 imported.replace(recording)
         written |= {"rig": rig_file, "recording": recording}

@@ -37,8 +37,6 @@ from aolink.optics.texture import MARGIN, turned_covariances
 
 FRAMES = 500
 """Frames that are looked at, from the first on."""
-ESTIMATORS = {True: "profile", False: "moments"}
-"""The estimator of the paths of spots, and that of a region's."""
 _CERTAIN = 2.0
 """Motion that chance does not show, in standard deviations."""
 _KERNEL_KNOWN = 0.25
@@ -177,6 +175,11 @@ class Looked:
         """Whether the motion is seen in all directions."""
         known = np.isfinite(self.seen.mean_variance).any(axis=0)
         return bool((known.sum(axis=1) == known.shape[1]).any())
+
+    @property
+    def estimator(self) -> str:
+        """The estimator of the path in the recording."""
+        return "moments" if self.spots is None else "profile"
 
     @property
     def moves(self) -> bool:

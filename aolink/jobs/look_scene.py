@@ -106,9 +106,8 @@ def region_text(
     reference, noise = scale * reference, scale * noise
     rows = "".join(f"    {json.dumps(row)},\n" for row in np.rint(reference).astype(int).tolist())
     place = ",".join(f"{each:g}" for each in middle)
-    text = f"""# Its place in that film: `aolink import {film.name} --at {place}` makes the recording.
-{resting(name, film.name, 1, 2, _REST, steps)}
-[sensor]              # slope unit: a pixel
+    text = f"""{resting(name, film.name, 1, 2, _REST, steps)}
+[sensor]              # slope unit: a pixel; in the film --at {place}
 kind = "region"
 read_noise_counts = {max(noise, 0.3):.4g}
 bit_depth = 16

@@ -77,3 +77,11 @@ def test_something_else_or_too_far_is_not_taken_for_it() -> None:
     assert texture.seen(other) is None
     assert texture.seen(exposed(scene(), arc(0.1, 0.0, (MARGIN + 2.0, 0.0)))) is None
     assert texture.seen(np.full((48, 48), 0.5)) is None
+
+
+def test_a_fit_beside_the_mean_gives_the_same_moments() -> None:
+    texture, path = Texture(scene(2.5)[INSIDE]), arc(0.3, 1.0, (0.4, -0.3))
+    image = ndimage.gaussian_filter(exposed(scene(2.5), path), texture.smooth)
+    beside, about = texture.fit(image, np.zeros(2)), texture.fit(image, path.mean(axis=1))
+    assert beside.mean == pytest.approx(about.mean, abs=0.02)
+    assert beside.spread == pytest.approx(about.spread, abs=0.03)

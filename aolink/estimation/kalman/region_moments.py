@@ -31,13 +31,14 @@ class RegionMoments:
         if self._of_model is None or self._of_model[0] is not model:
             rows = model.basis if self.models_noise else model.state_rows
             after = model.rows_after[:, : rows.shape[2]]
-            rows = np.concatenate([rows, after[:, None]], axis=1)  # (outputs, steps, coefficients)
-            share = np.append(np.full(model.n_steps, 1 / model.n_steps), model.moved)
+            rows = np.concatenate([model.seen(rows), after[:, None]], axis=1)  # (outputs, steps, coefficients)
+            share = np.append(np.full(model.exposed_steps, 1 / model.exposed_steps), model.moved)
             share[0] -= model.moved
             self._of_model = model, rows, share
         _, rows, share = self._of_model
         (z,), P = prior.mean, prior.covariance[0]
-        path = np.concatenate([response.path, model.last_response(response.end)[..., None]], axis=2)[0] + rows @ z
+        known = np.concatenate([model.seen_path(response.path), model.last_response(response.end)[..., None]], axis=2)
+        path = known[0] + rows @ z
         mean, mean_rows = path @ share, np.einsum("osn,s->on", rows, share)
         away, R = path - mean[:, None], rows - mean_rows[:, None]
         pairs = ((0, 0), (0, 1), (1, 1))
